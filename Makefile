@@ -1,0 +1,35 @@
+# Two commands: `make demo` (watch it work) and `make test` (everything CI runs).
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test lint layers unit smoke clean
+
+demo: $(STAMP)
+	$(BIN)/python examples/quickstart.py --out runs/quickstart
+
+test: lint layers unit smoke
+
+# Exact versions come from constraints.txt. On a machine without a GPU,
+# `make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"` saves the CUDA download.
+$(STAMP): setup.py constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[examples,test]"
+	touch $@
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+layers: $(STAMP)
+	$(BIN)/lint-imports
+
+unit: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+smoke: $(STAMP)
+	for example in examples/*.py; do echo "== $$example --smoke" && $(BIN)/python $$example --smoke || exit 1; done
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info runs

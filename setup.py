@@ -1,0 +1,31 @@
+"""Metadata of torch_denkf; the build backend and the tools are configured in pyproject.toml."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+setup(
+    name="torch_denkf",
+    version="0.1.0",
+    description="Differentiable Bayesian filters for robots as TorchRL parts",
+    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license="MIT",
+    license_files=["LICENSE"],
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
+    install_requires=[
+        "torch>=2.13,<2.14",
+        "torchrl>=0.14.1,<0.15",
+        "tensordict>=0.14.3,<0.15",
+        # dm-control 1.0.50 fails with mujoco 4: MjModel lost flex_vertedge.
+        "mujoco>=3.17,<4",
+        "dm-control>=1.0.50",
+        "opencv-python-headless>=4.10",
+        "numpy",
+    ],
+    extras_require={
+        "examples": ["tqdm", "matplotlib"],
+        "test": ["pytest", "pytest-xdist", "ruff", "import-linter", "build", "wheel", "pre-commit"],
+    },
+)
