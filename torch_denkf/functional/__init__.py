@@ -1,1 +1,36 @@
-"""functional"""
+"""The mathematics: tensors in, tensors out, no state, any leading batch dimensions."""
+
+from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
+from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
+from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
+from torch_denkf.functional.moments import (
+    ensemble_anomalies,
+    ensemble_cov,
+    ensemble_mean,
+    ensemble_var,
+)
+from torch_denkf.functional.scores import crps_ensemble, energy_score
+
+__all__ = [
+    "Analysis",
+    "Scheme",
+    "Space",
+    "analyse",
+    "ensemble_mean",
+    "ensemble_anomalies",
+    "ensemble_var",
+    "ensemble_cov",
+    "inflate",
+    "relax_to_prior_spread",
+    "random_rotation",
+    "GaussianUpdate",
+    "kalman_predict",
+    "kalman_update",
+    "gaussian_log_prob",
+    "crps_ensemble",
+    "energy_score",
+    "cholesky",
+    "inverse_square_root",
+    "inverse_square_root_difference",
+]

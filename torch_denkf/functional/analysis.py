@@ -1,0 +1,236 @@
+"""The measurement update of an ensemble Kalman filter: four schemes, each in two equivalent spaces.
+
+With Y = R^-1/2 HA / sqrt(E − 1) the innovation covariance of eq. 9 is S = R^1/2 (I + YᵀY) R^1/2 (members
+are rows here), and every scheme needs only the O x O matrix I + YᵀY or, by Woodbury's identity, the E x E
+matrix I + YYᵀ. Nothing of size S x S is ever formed, and in ensemble space nothing of size O x O.
+
+Sources: the paper's eqs. 6 to 12 ("sensor"); Burgers et al. 1998 ("perturbed"); Bishop et al. 2001 and
+Hunt et al. 2007 ("etkf"); Sakov & Oke 2008, Tellus A 60 ("sakov").
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
+
+Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
+Space = Literal["auto", "observation", "ensemble"]
+
+
+class Analysis(NamedTuple):
+    """What :func:`analyse` returns.
+
+    Attributes:
+        ensemble: the analysis ensemble X_{t|t}, ``[*B, E, S]``, in the state's units.
+        innovation: mean observation minus mean predicted observation, ``[*B, O]``; 0 where unobserved.
+        nis: the normalised innovation squared, innovationᵀ S⁻¹ innovation over the observed components,
+            ``[*B, 1]``, no unit; its expectation is their number if the filter is consistent.
+        log_likelihood: log N(innovation; 0, S) over the observed components, ``[*B, 1]``; 0 where nothing
+            is observed.
+    """
+
+    ensemble: Tensor
+    innovation: Tensor
+    nis: Tensor
+    log_likelihood: Tensor
+
+
+def analyse(
+    forecast: Tensor,
+    predicted: Tensor,
+    observation: Tensor,
+    noise: Tensor,
+    *,
+    scheme: Scheme = "sensor",
+    observed: Tensor | None = None,
+    perturbation: Tensor | None = None,
+    rotation: Tensor | None = None,
+    space: Space = "auto",
+) -> Analysis:
+    """Condition a forecast ensemble on an observation.
+
+    With the gain K = AᵀHA S⁻¹ / (E − 1) (eq. 11) and d = mean observation − mean prediction:
+
+    * ``"sensor"``: xⁱ + K (ỹⁱ − Hxⁱ), with the sensor's own samples ỹⁱ (the paper's eq. 12);
+    * ``"perturbed"``: xⁱ + K (y + εⁱ − Hxⁱ) with εⁱ ~ N(0, R), the classical stochastic filter;
+    * ``"etkf"``: mean x̄ + K d, anomalies (I + YYᵀ)^-1/2 A, the symmetric square root: it has exactly the
+      covariance of the Kalman update;
+    * ``"sakov"``: mean x̄ + K d, anomalies A − K HA / 2, its approximation for small gains.
+
+    The last three use the mean of the observation if they are given samples.
+
+    Args:
+        forecast: X_{t|t-1}, ``[*B, E, S]`` with E >= 2, in the state's units.
+        predicted: the observation each member predicts, HX, ``[*B, E, O]``, in the sensor's units.
+        observation: samples of it, ``[*B, E, O]``, or one value, ``[*B, O]`` (told apart by their number
+            of dimensions), in the sensor's units.
+        noise: variances R, ``[*B, O]``, positive, in the sensor's units squared.
+        scheme: one of the four above.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False takes that component out of the update, and
+            its observation and noise may then be anything, NaN too. Where nothing is observed the
+            ensemble comes back as it went in. None: everything is observed.
+        perturbation: standard normal draws for ``"perturbed"``, ``[*B, E, O]``; they are centred over the
+            members and rescaled by sqrt(E / (E − 1)), which keeps their variance. None: drawn here.
+        rotation: orthogonal matrices that keep the vector of ones, ``[*B, E, E]``, applied to the
+            analysis anomalies of ``"etkf"`` (:func:`~torch_denkf.functional.random_rotation`).
+        space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
+            ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one.
+
+    Returns:
+        An :class:`Analysis`; all NaN for those batch elements whose system is not positive definite.
+
+    Raises:
+        ValueError: for shapes that do not fit, an unknown scheme or space, ``"sensor"`` without samples,
+            or a perturbation or rotation given to a scheme that has no use for it.
+
+    Examples:
+        Two members at -1 and 1, seen directly with variance 2, as much as their own: half-way.
+
+        >>> import torch
+        >>> ensemble = torch.tensor([[-1.0], [1.0]])
+        >>> result = analyse(ensemble, ensemble, torch.tensor([4.0]), torch.tensor([2.0]), scheme="etkf")
+        >>> print(f"{result.ensemble.mean():.2f} {result.ensemble.var():.2f}")
+        2.00 1.00
+    """
+    _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, space)
+    size, dim = predicted.shape[-2:]
+    has_samples = observation.ndim == forecast.ndim
+
+    if observed is not None:  # masked components: anomalies and innovation 0, variance 1
+        members_observed = observed.unsqueeze(-2)
+        predicted = torch.where(members_observed, predicted, 0)
+        observation = torch.where(members_observed if has_samples else observed, observation, 0)
+        noise = torch.where(observed, noise, 1)
+
+    samples = observation if has_samples else observation.unsqueeze(-2)
+    predicted_mean = predicted.mean(-2, keepdim=True)
+    innovation = samples.mean(-2, keepdim=True) - predicted_mean
+    scale = (noise * (size - 1)).rsqrt().unsqueeze(-2)
+    normalised = (predicted - predicted_mean) * scale  # Y
+    mean_shift = innovation * scale
+    mean = forecast.mean(-2, keepdim=True)
+    anomalies = forecast - mean
+
+    # What the gain acts on, one row a member (or one for all), in units of R^1/2 sqrt(E - 1).
+    if scheme == "sensor":
+        shift = (samples - predicted) * scale
+    elif scheme == "perturbed":
+        draws = torch.randn_like(predicted) if perturbation is None else perturbation
+        draws = (draws - draws.mean(-2, keepdim=True)) * (math.sqrt(size) / (size - 1))
+        if observed is not None:
+            draws = torch.where(members_observed, draws, 0)
+        shift = mean_shift - normalised + draws
+    elif scheme == "sakov":
+        shift = mean_shift - normalised / 2
+    else:
+        shift = mean_shift
+
+    in_observation_space = space == "observation" or (space == "auto" and dim < size)
+    solve = _observation_space if in_observation_space else _ensemble_space
+    increment, square_root, nis, log_det = solve(
+        normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf"
+    )
+    if scheme != "etkf":
+        ensemble = forecast + increment
+    elif rotation is None:
+        ensemble = mean + increment + square_root
+    else:
+        ensemble = mean + increment + rotation @ square_root
+
+    if observed is None:
+        count = dim
+    else:
+        observed = observed.expand(noise.shape)
+        count = observed.sum(-1, keepdim=True)
+        ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
+    nis = nis * (size - 1)
+    log_det = log_det + noise.log().sum(-1, keepdim=True)
+    log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
+    return Analysis(ensemble, innovation.squeeze(-2), nis, log_likelihood)
+
+
+def _observation_space(
+    normalised: Tensor, anomalies: Tensor, shift: Tensor, mean_shift: Tensor, *, square_root: bool
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Solve with I + YᵀY, O x O.
+
+    Returns:
+        The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
+        ``[*B, E, S]``, if asked for; mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ and log det (I + YᵀY), ``[*B, 1]``.
+    """
+    gram = normalised.mT @ normalised
+    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
+    cross = normalised.mT @ anomalies
+    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
+    increment = shift @ torch.cholesky_solve(cross, factor)
+    transformed = None
+    if square_root:
+        transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
+    return increment, transformed, whitened.square().sum(-2), _log_det(factor)
+
+
+def _ensemble_space(
+    normalised: Tensor, anomalies: Tensor, shift: Tensor, mean_shift: Tensor, *, square_root: bool
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s.
+
+    YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
+    free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
+    """
+    gram = normalised @ normalised.mT
+    size = gram.shape[-1]
+    free = gram.detach().diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)  # c
+    gram = gram + (free / size).unsqueeze(-1)
+    factor = cholesky(gram + torch.eye(size, dtype=gram.dtype, device=gram.device))
+    weights = torch.cholesky_solve(normalised @ shift.mT, factor).mT
+    mean_weights = weights.mean(-2, keepdim=True)
+    # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
+    residual = mean_shift - mean_weights @ normalised
+    nis = residual.square().sum(-1) + mean_weights.square().sum(-1)
+    transformed = inverse_square_root(gram) @ anomalies if square_root else None
+    return weights @ anomalies, transformed, nis, _log_det(factor) - free.log1p()
+
+
+def _log_det(factor: Tensor) -> Tensor:
+    return 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+
+
+def _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, space) -> None:
+    check_ensemble("forecast", forecast, min_size=2)
+    if predicted.ndim < 2:
+        raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
+    batch, size, dim = forecast.shape[:-2], forecast.shape[-2], predicted.shape[-1]
+    check_shape("predicted", predicted, (*batch, size, dim), "[*B, E, O]")
+    check_shape("noise", noise, (*batch, dim), "[*B, O]")
+    if observation.ndim == forecast.ndim:
+        check_shape("observation", observation, (*batch, size, dim), "[*B, E, O]")
+    else:
+        check_shape("observation", observation, (*batch, dim), "[*B, O]")
+    if scheme not in get_args(Scheme):
+        raise ValueError(f"scheme must be one of {', '.join(get_args(Scheme))}, got {scheme!r}")
+    if space not in get_args(Space):
+        raise ValueError(f"space must be one of {', '.join(get_args(Space))}, got {space!r}")
+    if scheme == "sensor" and observation.ndim != forecast.ndim:
+        raise ValueError(
+            f"scheme 'sensor' needs one observation a member, [*B, E, O], got {list(observation.shape)}; "
+            "use 'perturbed', 'etkf' or 'sakov' for a single observation"
+        )
+    if observed is not None:
+        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
+        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
+        if observed.dtype != torch.bool:
+            raise ValueError(f"observed must be boolean, got {observed.dtype}; pass observed.bool()")
+    if perturbation is not None:
+        if scheme != "perturbed":
+            raise ValueError(f"perturbation is for scheme 'perturbed', not {scheme!r}; leave it out")
+        check_shape("perturbation", perturbation, (*batch, size, dim), "[*B, E, O]")
+    if rotation is not None:
+        if scheme != "etkf":
+            raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")
+        check_shape("rotation", rotation, (*batch, size, size), "[*B, E, E]")

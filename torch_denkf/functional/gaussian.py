@@ -1,0 +1,179 @@
+"""The Kalman filter's two steps on a mean and a covariance: the oracle of the ensemble filters, and the
+linear algebra of the extended Kalman filter, whose matrices are Jacobians.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional._checks import check_shape
+from torch_denkf.functional.linalg import cholesky
+
+
+class GaussianUpdate(NamedTuple):
+    """What :func:`kalman_update` returns.
+
+    Attributes:
+        mean: posterior mean, ``[*B, S]``, in the state's units.
+        cov: posterior covariance, symmetric, ``[*B, S, S]``.
+        innovation: observation minus predicted observation, ``[*B, O]``; 0 where unobserved.
+        nis: innovationᵀ S⁻¹ innovation over the observed components, ``[*B, 1]``.
+        log_likelihood: log N(innovation; 0, S) over the observed components, ``[*B, 1]``; 0 where nothing
+            is observed.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    innovation: Tensor
+    nis: Tensor
+    log_likelihood: Tensor
+
+
+def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Forecast a Gaussian through a linear transition: F m and F P Fᵀ + Q (Särkkä 2013, eq. 4.20).
+
+    Args:
+        mean: m, ``[*B, S]``, in the state's units.
+        cov: P, ``[*B, S, S]``.
+        transition: F, ``[S, S]`` or ``[*B, S, S]``.
+        noise: covariance Q of the process noise, ``[S, S]`` or ``[*B, S, S]``.
+
+    Returns:
+        The mean ``[*B, S]`` and covariance ``[*B, S, S]`` of the forecast.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> mean, cov = torch.tensor([0.0, 1.0]), torch.eye(2)
+        >>> kalman_predict(mean, cov, torch.tensor([[1.0, 0.5], [0.0, 1.0]]), torch.zeros(2, 2))
+        (tensor([0.5000, 1.0000]), tensor([[1.2500, 0.5000],
+                [0.5000, 1.0000]]))
+    """
+    _check_moments(mean, cov)
+    dim = mean.shape[-1]
+    _check_matrix("transition", transition, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
+    _check_matrix("noise", noise, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
+    return _apply(transition, mean), transition @ cov @ transition.mT + noise
+
+
+def kalman_update(
+    mean: Tensor,
+    cov: Tensor,
+    observation: Tensor,
+    observation_matrix: Tensor,
+    noise: Tensor,
+    *,
+    observed: Tensor | None = None,
+) -> GaussianUpdate:
+    """Condition a Gaussian on a linear observation (Särkkä 2013, eq. 4.21).
+
+    The covariance in Joseph's form, (I − KH) P (I − KH)ᵀ + K R Kᵀ, which round-off leaves positive. For an
+    extended Kalman filter pass H = the Jacobian of h at the mean and ``observation - h(mean) + H @ mean``.
+
+    Args:
+        mean: prior mean m, ``[*B, S]``, in the state's units.
+        cov: prior covariance P, ``[*B, S, S]``.
+        observation: y, ``[*B, O]``, in the sensor's units.
+        observation_matrix: H, ``[O, S]`` or ``[*B, O, S]``.
+        noise: R: variances, ``[*B, O]``, or covariances, ``[*B, O, O]``.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False takes that component out of the update, and
+            its observation and noise may then be anything, NaN too. None: everything is observed.
+
+    Returns:
+        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> one = torch.ones(1)
+        >>> update = kalman_update(0 * one, torch.eye(1), 2 * one, torch.eye(1), one)
+        >>> update.mean, update.cov
+        (tensor([1.]), tensor([[0.5000]]))
+    """
+    _check_moments(mean, cov)
+    batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
+    check_shape("observation", observation, (*batch, dim), "[*B, O]")
+    _check_matrix("observation_matrix", observation_matrix, batch, (dim, state_dim), "[O, S] or [*B, O, S]")
+    if noise.ndim == mean.ndim:
+        check_shape("noise", noise, (*batch, dim), "variances [*B, O]")
+        noise = noise.diag_embed()
+    else:
+        check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
+    identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
+    count = dim
+    if observed is not None:
+        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
+        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
+        observed = observed.expand(observation.shape)
+        row, column = observed.unsqueeze(-1), observed.unsqueeze(-2)
+        observation = torch.where(observed, observation, 0)
+        observation_matrix = torch.where(row, observation_matrix, 0)
+        noise = torch.where(row & column, noise, identity)
+        count = observed.sum(-1, keepdim=True)
+
+    cross = observation_matrix @ cov  # HP
+    factor = cholesky(cross @ observation_matrix.mT + noise)
+    gain = torch.cholesky_solve(cross, factor).mT
+    innovation = observation - _apply(observation_matrix, mean)
+    nis, log_det = _whiten(innovation, factor)
+    keep = torch.eye(state_dim, dtype=mean.dtype, device=mean.device) - gain @ observation_matrix
+    cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
+    log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
+    return GaussianUpdate(
+        mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood
+    )
+
+
+def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
+    """Log-density of a Gaussian, log N(value; mean, cov), NaN where ``cov`` is not positive definite.
+
+    Unlike ``torch.distributions.MultivariateNormal`` it never waits for the device.
+
+    Args:
+        value: ``[*B, S]``.
+        mean: ``[*B, S]``, in the units of ``value``.
+        cov: ``[*B, S, S]``.
+
+    Returns:
+        The log-densities, ``[*B]``, in nats.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> gaussian_log_prob(torch.zeros(2), torch.zeros(2), torch.eye(2))
+        tensor(-1.8379)
+    """
+    _check_moments(mean, cov)
+    check_shape("value", value, mean.shape, "[*B, S], as mean,")
+    nis, log_det = _whiten(value - mean, cholesky(cov))
+    return -0.5 * (nis + log_det + mean.shape[-1] * math.log(2 * math.pi)).squeeze(-1)
+
+
+def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _whiten(residual: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared norm of L⁻¹ residual, and log det LLᵀ, both ``[*B, 1]``."""
+    whitened = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
+    return whitened.square().sum(-2), 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+
+
+def _check_moments(mean: Tensor, cov: Tensor) -> None:
+    if mean.ndim < 1:
+        raise ValueError("mean must be [*B, S], got a scalar; add the dimension with unsqueeze")
+    check_shape("cov", cov, (*mean.shape, mean.shape[-1]), "[*B, S, S]")
+
+
+def _check_matrix(name: str, matrix: Tensor, batch: torch.Size, shape: tuple[int, int], layout: str) -> None:
+    check_shape(name, matrix, shape if matrix.ndim == 2 else (*batch, *shape), layout)

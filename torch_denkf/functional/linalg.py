@@ -1,0 +1,112 @@
+"""Two decompositions of symmetric matrices that are safe to differentiate and never wait for the device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def cholesky(matrix: Tensor) -> Tensor:
+    """The lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
+
+    ``torch.linalg.cholesky`` raises and so waits for the device; ``torch.linalg.cholesky_ex`` returns a
+    half-finished factor. Here a failure shows: that matrix of the batch, and only that, becomes NaN.
+
+    Args:
+        matrix: ``[*B, N, N]``; only its lower triangle is read.
+
+    Returns:
+        L with ``L @ L.mT == matrix``, ``[*B, N, N]``.
+
+    Raises:
+        RuntimeError: (from torch) if the matrix is not square.
+
+    Examples:
+        >>> import torch
+        >>> cholesky(torch.tensor([[[4.0]], [[-1.0]]])).flatten()
+        tensor([2., nan])
+    """
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    return torch.where((info == 0)[..., None, None], factor, torch.nan)
+
+
+def inverse_square_root(matrix: Tensor) -> Tensor:
+    """(I + M)^-1/2 of a symmetric positive semi-definite M, differentiable at repeated eigenvalues.
+
+    The symmetric square root is the one that moves the members least (Ott et al. 2004; Hunt et al. 2007).
+
+    Args:
+        matrix: M, ``[*B, N, N]``; eigenvalues that round-off made negative count as zero.
+
+    Returns:
+        (I + M)^-1/2, symmetric, ``[*B, N, N]``.
+
+    Raises:
+        RuntimeError: (from torch) if the matrix is not square.
+
+    Examples:
+        >>> import torch
+        >>> inverse_square_root(torch.tensor([[3.0, 0.0], [0.0, 8.0]]))
+        tensor([[0.5000, 0.0000],
+                [0.0000, 0.3333]])
+    """
+    return _SymmetricFunction.apply(matrix, False)[0]
+
+
+def inverse_square_root_difference(matrix: Tensor) -> Tensor:
+    """g(M) = M⁻¹ ((I + M)^-1/2 − I), also for singular M, differentiable at repeated eigenvalues.
+
+    With M = YᵀY it gives the symmetric square root of the larger system from the smaller one:
+    (I + YYᵀ)^-1/2 = I + Y g(YᵀY) Yᵀ. It is computed as −1/(r (1 + r)) with r = sqrt(1 + m), which never
+    divides by m.
+
+    Args:
+        matrix: M, symmetric positive semi-definite, ``[*B, N, N]``.
+
+    Returns:
+        g(M), symmetric, ``[*B, N, N]``; −1/2 I at M = 0.
+
+    Raises:
+        RuntimeError: (from torch) if the matrix is not square.
+
+    Examples:
+        >>> import torch
+        >>> inverse_square_root_difference(torch.tensor([[3.0, 0.0], [0.0, 0.0]]))
+        tensor([[-0.1667,  0.0000],
+                [ 0.0000, -0.5000]])
+    """
+    return _SymmetricFunction.apply(matrix, True)[0]
+
+
+class _SymmetricFunction(torch.autograd.Function):
+    """V f(Λ) Vᵀ, whose backward is V (Γ ∘ (Vᵀ Ḡ V)) Vᵀ with Γ the divided differences of f.
+
+    The theorem of Daleckii and Krein (Higham 2008, Functions of Matrices, Theorem 3.11). eigh's own
+    backward divides by differences of eigenvalues and is NaN where two agree; written out for these two
+    functions, with r = sqrt(1 + λ), Γ divides only by numbers >= 1.
+    """
+
+    @staticmethod
+    def forward(matrix: Tensor, difference: bool) -> tuple[Tensor, Tensor, Tensor]:
+        eigenvalues, vectors = torch.linalg.eigh(matrix)
+        root = (1 + eigenvalues.clamp(min=0)).sqrt()
+        values = -1 / (root * (1 + root)) if difference else 1 / root
+        return (vectors * values.unsqueeze(-2)) @ vectors.mT, root, vectors
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.difference = inputs[1]
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(*output[1:])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor, *_: Tensor):
+        root, vectors = ctx.saved_tensors
+        row, column = root.unsqueeze(-1), root.unsqueeze(-2)
+        divided = -1 / (row * column * (row + column))
+        if ctx.difference:
+            divided = -divided * (1 + row + column) / ((1 + row) * (1 + column))
+        gradient = (gradient + gradient.mT) / 2
+        return vectors @ (divided * (vectors.mT @ gradient @ vectors)) @ vectors.mT, None

@@ -1,0 +1,77 @@
+"""Proper scores of an ensemble forecast: lower is better, and the truth's own distribution is best.
+
+Source: Gneiting & Raftery 2007, JASA 102, eqs. 21 and 22; the fair variants, whose expectation does not
+depend on the ensemble's size, Ferro 2014, Q. J. R. Meteorol. Soc. 140.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional._checks import check_ensemble, check_shape
+
+
+def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
+    """Continuous ranked probability score of each component: E|x − y| − 1/2 E|x − x'|.
+
+    Sorting makes the double sum over pairs a single one: O(E log E) time, O(E) memory.
+
+    Args:
+        ensemble: X, ``[*B, E, S]``, in the state's units.
+        target: the truth y, ``[*B, S]``, in the state's units.
+        fair: average |x − x'| over the E (E − 1) pairs of different members, which makes the score an
+            unbiased estimate of that of the distribution they come from; otherwise over all E², which is
+            the score of the empirical distribution.
+
+    Returns:
+        The scores, ``[*B, S]``, in the state's units.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if ``fair`` and there are fewer than two members.
+
+    Examples:
+        >>> import torch
+        >>> crps_ensemble(torch.tensor([[0.0], [2.0]]), torch.tensor([1.0]), fair=False)
+        tensor([0.5000])
+    """
+    size = _check(ensemble, target, fair)
+    # Differences to the target before sorting: no digits are lost where the mean dwarfs the spread.
+    error = (ensemble - target.unsqueeze(-2)).sort(-2).values
+    rank = torch.arange(size, dtype=error.dtype, device=error.device)
+    weights = (2 * rank - (size - 1)) / (size * (size - 1 if fair else size))
+    return error.abs().mean(-2) - weights @ error
+
+
+def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
+    """Energy score of the whole vector, E‖x − y‖ − 1/2 E‖x − x'‖: the CRPS in more than one dimension.
+
+    It costs O(E² S) time and O(E²) memory. Components of different units should be scaled first.
+
+    Args:
+        ensemble: X, ``[*B, E, S]``.
+        target: the truth y, ``[*B, S]``.
+        fair: average over pairs of different members, as in :func:`crps_ensemble`.
+
+    Returns:
+        The scores, ``[*B]``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if ``fair`` and there are fewer than two members.
+
+    Examples:
+        >>> import torch
+        >>> energy_score(torch.tensor([[0.0, 0.0], [6.0, 8.0]]), torch.zeros(2), fair=False)
+        tensor(2.5000)
+    """
+    size = _check(ensemble, target, fair)
+    to_target = torch.linalg.vector_norm(ensemble - target.unsqueeze(-2), dim=-1).mean(-1)
+    # cdist by plain differences: its matrix product route would lose digits between close members.
+    pairs = torch.cdist(ensemble, ensemble, compute_mode="donot_use_mm_for_euclid_dist")
+    return to_target - pairs.sum((-2, -1)) / (2 * size * (size - 1 if fair else size))
+
+
+def _check(ensemble: Tensor, target: Tensor, fair: bool) -> int:
+    check_ensemble("ensemble", ensemble, min_size=2 if fair else 1)
+    check_shape("target", target, (*ensemble.shape[:-2], ensemble.shape[-1]), "[*B, S]")
+    return ensemble.shape[-2]
