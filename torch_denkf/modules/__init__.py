@@ -1,1 +1,38 @@
-"""modules"""
+"""Sub-models of a filter, each a TensorDict module with its own keys.
+
+Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSensor, ...``.
+"""
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.analysis import EnsembleAnalysis
+from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
+from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
+from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
+from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
+from torch_denkf.modules.transition import LearnedTransition, UnicycleTransition
+
+__all__ = [
+    "SubModel",
+    "StochasticMLP",
+    "FlipoutLinear",
+    "deterministic",
+    "LearnedTransition",
+    "UnicycleTransition",
+    "LearnedObservation",
+    "LinearObservation",
+    "Select",
+    "DiagonalNoise",
+    "ConstantNoise",
+    "ImageSensor",
+    "VectorSensor",
+    "convolutional_trunk",
+    "GaussianPrior",
+    "AroundState",
+    "FromSensor",
+    "EnsembleAnalysis",
+    "MomentPrior",
+    "LinearTransition",
+    "KalmanAnalysis",
+]

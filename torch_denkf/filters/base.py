@@ -1,0 +1,306 @@
+r"""One base for all filters: a step on a tensordict, or a whole sequence with resets.
+
+The order in time is predict, then update::
+
+    belief[t-1] --transition--> forecast[t] --observation, analysis--> belief[t]
+                                    ^ the sensor's reading of frame t
+
+At a reset the forecast is the initial belief, and so is the belief unless ``update_at_reset``. Nothing is kept on
+``self`` between steps: the belief lives in the tensordict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import expand_as_right
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+
+__all__ = ["Filter"]
+
+
+class Filter(TensorDictSequential):
+    """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
+
+    The modules are sorted once, by their keys: those that depend on the belief (transition, observation,
+    analysis) form the *recursion*; the others (sensor, noise) read frames alone and, on a sequence, run once on
+    all of them. The entries that the recursion reads before it writes them, and that ``initial`` provides, are the
+    *carry*: ``("belief", "ensemble")`` for an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a
+    Kalman filter.
+
+    Called outside torchrl's recurrent mode, a filter takes one step on a tensordict ``[*B]``: the carry there is
+    the belief at t-1, the frame is that of t, and afterwards the belief is that of t, also under ``("next", ...)``
+    so that a policy hands it on like :class:`torchrl.modules.LSTMModule` does its hidden state. In recurrent mode
+    (``with set_recurrent_mode(True)``; every torchrl loss does it) it takes a sequence ``[*B, T]``, time last. Its
+    first element starts from the belief that is stored there, which has seen that frame already, or from the
+    initial belief where none is stored; elements with ``is_init`` start anew from the initial belief; all others
+    are one step on from their predecessor. Actions are read one step earlier, as torchrl stores them.
+
+    Args:
+        modules: TensorDict modules in order, or one dict of them by name.
+        initial: the initial belief, see :mod:`torch_denkf.modules.belief`.
+        control_keys: entries that drive the transition *out of* the time they are stored at, by default the action.
+        init_key: marks the first element of an episode, ``[*B, 1]`` bool, as written by
+            :class:`torchrl.envs.InitTracker`.
+        update_at_reset: whether the initial belief is updated with the first frame.
+
+    Raises:
+        ValueError: if no module depends on what ``initial`` provides.
+
+    Example:
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+        >>> kf.carry_keys
+        [('belief', 'mean'), ('belief', 'cov')]
+        >>> drives = TensorDict({"observation": torch.ones(4, 10, 1)}, [4, 10])
+        >>> kf.sequence(drives)["belief", "mean"].shape
+        torch.Size([4, 10, 1])
+    """
+
+    def __init__(
+        self,
+        *modules: TensorDictModuleBase | dict[str, TensorDictModuleBase],
+        initial: TensorDictModuleBase,
+        control_keys: Sequence[NestedKey] = ("action",),
+        init_key: NestedKey = "is_init",
+        update_at_reset: bool = False,
+    ):
+        super().__init__(*modules)
+        self.initial = initial
+        self.init_key = unravel_key(init_key)
+        self.control_keys = [unravel_key(key) for key in control_keys]
+        self.update_at_reset = update_at_reset
+        self._sort_modules()
+
+    def _sort_modules(self) -> None:
+        provided = [unravel_key(key) for key in self.initial.out_keys]
+        self.carry_keys = [key for key in map(unravel_key, self.in_keys) if key in provided]
+        if not self.carry_keys:
+            raise ValueError(
+                f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
+                f"{list(self.in_keys)}. Give both the same keys."
+            )
+        modules = list(self._module_iter())
+        dependent = {*self.carry_keys, *self.control_keys}
+        self._recursion = []
+        for index, module in enumerate(modules):
+            if not dependent.isdisjoint(map(unravel_key, module.in_keys)):
+                self._recursion.append(index)
+                dependent.update(map(unravel_key, module.out_keys))
+        recursion = [modules[index] for index in self._recursion]
+        self.recursion_out_keys = list(dict.fromkeys(unravel_key(k) for m in recursion for k in m.out_keys))
+        self.belief_keys = [key for key in provided if key in self.recursion_out_keys]
+        # The first module of the recursion is the transition; what it writes is the forecast of the carry, in order.
+        self._forecast_of = dict(zip(self.carry_keys, map(unravel_key, recursion[0].out_keys), strict=False))
+        size = getattr(self.initial, "ensemble_size", None)
+        for module in modules:
+            if getattr(module, "ensemble_size", size) is None:
+                module.ensemble_size = size
+
+    def __getitem__(self, index):
+        """Returns one module, or a plain ``TensorDictSequential`` of several."""
+        if isinstance(index, (int, str)):
+            return super().__getitem__(index)
+        return TensorDictSequential(*list(self._module_iter())[index])
+
+    @property
+    def frame_modules(self) -> list[TensorDictModuleBase]:
+        """The modules that read frames alone, and not the belief."""
+        return [module for index, module in enumerate(self._module_iter()) if index not in self._recursion]
+
+    @property
+    def transition_module(self) -> TensorDictModuleBase:
+        """The module that forecasts the carry: the first that depends on the belief."""
+        return list(self._module_iter())[self._recursion[0]]
+
+    @property
+    def update_modules(self) -> list[TensorDictModuleBase]:
+        """The modules between the forecast and the belief."""
+        modules = list(self._module_iter())
+        return [modules[index] for index in self._recursion[1:]]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Returns the transform that keeps the carry in the environment's tensordict where the filter is a policy's.
+
+        Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; needs torchrl's ``InitTracker`` in the
+        environment, too, so that the filter knows where an episode begins.
+        """
+        probe = TensorDict({}, batch_size=[])
+        for key in self.initial.in_keys:
+            probe.set(key, torch.zeros(getattr(self.initial, "state_dim", 1)))
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            belief = self.initial(probe)
+        primers = Composite()
+        for key in self.carry_keys:
+            value = belief.get(key)
+            primers[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+        return TensorDictPrimer(primers, expand_specs=True)
+
+    # ----------------------------------------------------------------------------------------------- one step
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Takes one step, or filters a sequence in recurrent mode; writes into ``tensordict``."""
+        if recurrent_mode():
+            return self.sequence(tensordict)
+        is_init = tensordict.get(self.init_key, None)
+        if is_init is None:
+            tensordict = self.step(tensordict)
+        else:
+            self._check_carry(tensordict)
+            tensordict = self._run(self.frame_modules, tensordict)
+            tensordict = self._advance(
+                tensordict, is_init, self._initial_of(tensordict), self.update_at_reset
+            )
+        for key in self.carry_keys:
+            tensordict.set(("next", key) if isinstance(key, str) else ("next", *key), tensordict.get(key))
+        return tensordict
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Predicts, then updates, on ``[*B]``: the carry in ``tensordict`` is the belief at t-1.
+
+        Raises:
+            KeyError: if the carry is missing.
+        """
+        self._check_carry(tensordict)
+        return self._run(self._module_iter(), tensordict)
+
+    def initialise(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
+        frame_outputs = {unravel_key(key) for module in self.frame_modules for key in module.out_keys}
+        if self.update_at_reset or not frame_outputs.isdisjoint(map(unravel_key, self.initial.in_keys)):
+            tensordict = self._run(self.frame_modules, tensordict)
+        tensordict = self.initial(tensordict)
+        if self.update_at_reset:
+            for key, forecast_key in self._forecast_of.items():
+                tensordict.set(forecast_key, tensordict.get(key))
+            tensordict = self._run(self.update_modules, tensordict)
+        return tensordict
+
+    def _check_carry(self, tensordict: TensorDictBase) -> None:
+        for key in self.carry_keys:
+            if tensordict.get(key, None) is None:
+                raise KeyError(
+                    f"{type(self).__name__} carries its belief in {key!r}, which the tensordict lacks. Call "
+                    "filter.initialise(tensordict) at the start of an episode; in an environment append "
+                    "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
+                    "part of the policy."
+                )
+
+    @staticmethod
+    def _run(modules: Iterable[TensorDictModuleBase], tensordict: TensorDictBase) -> TensorDictBase:
+        for module in modules:
+            tensordict = module(tensordict)
+        return tensordict
+
+    def _initial_of(self, frames: TensorDictBase) -> TensorDictBase:
+        """The initial belief for every element of ``frames``, which is left as it is."""
+        return self.initial(frames.copy()).select(*self.belief_keys, *self.carry_keys)
+
+    def _advance(self, row, reset, start, update_at_reset: bool) -> TensorDictBase:
+        """One step of the recursion, except that rows in ``reset`` forecast their ``start``, and believe it."""
+        row = self.transition_module(row)
+        for key, forecast_key in self._forecast_of.items():
+            row.set(forecast_key, _where(reset, start.get(key), row.get(forecast_key)))
+        for key in self.carry_keys:
+            if key not in self._forecast_of:
+                row.set(key, _where(reset, start.get(key), row.get(key)))
+        row = self._run(self.update_modules, row)
+        if not update_at_reset:
+            for key in self.belief_keys:
+                row.set(key, _where(reset, start.get(key), row.get(key)))
+        return row
+
+    # --------------------------------------------------------------------------------------------- a sequence
+
+    def draw_noise(
+        self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None
+    ) -> TensorDictBase:
+        """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
+
+        Noise that is there already is kept.
+        """
+        dtype = next((p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()), None)
+        for module in (*self._module_iter(), self.initial):
+            key = getattr(module, "noise_key", None)
+            if key is not None and tensordict.get(key, None) is None:
+                size, device = tensordict.batch_size, tensordict.device
+                noise = module.draw_noise(size, device=device, dtype=dtype, generator=generator)
+                if noise is not None:
+                    tensordict.set(key, noise)
+        return tensordict
+
+    def sequence(self, tensordict: TensorDictBase, *, detach_every: int | None = None) -> TensorDictBase:
+        """Filters a sequence ``[*B, T]`` and writes what a step writes, for every time.
+
+        Args:
+            tensordict: frames, and optionally ``is_init``, actions, masks, noise, and stored beliefs (see the class).
+            detach_every: truncates back-propagation through time: the belief is detached every so many steps.
+
+        Returns:
+            ``tensordict``, with the outputs of all modules.
+
+        Raises:
+            ValueError: if there is no time dimension.
+        """
+        if not tensordict.ndim:
+            raise ValueError(
+                "A sequence has time as its last batch dimension; this tensordict has batch_size []."
+            )
+        time, steps = tensordict.ndim - 1, tensordict.shape[-1]
+        work = self._run(self.frame_modules, self.draw_noise(tensordict.copy()))
+        is_init = tensordict.get(self.init_key, None)
+        stored = all(tensordict.get(key, None) is not None for key in self.belief_keys)
+        if stored:  # these have seen their frame
+            starts = tensordict.select(*self.belief_keys, *self.carry_keys)
+        else:  # where only the first element starts, only its initial belief is needed
+            starts = self._initial_of(work if is_init is not None else work[..., :1])
+        update_at_reset = self.update_at_reset and not stored
+        starts, resets = starts.unbind(time), None if is_init is None else is_init.unbind(time)
+        inputs = {key: work.get(key).unbind(time) for key in self._recursion_inputs(work)}
+
+        outputs = []
+        for t in range(steps):
+            now = {
+                key: values[max(t - 1, 0) if key in self.control_keys else t]
+                for key, values in inputs.items()
+            }
+            row = TensorDict({}, batch_size=work.batch_size[:-1], device=work.device).update(now)
+            if t == 0:
+                for key in self.carry_keys:
+                    row.set(key, starts[0].get(key))
+                for key, forecast_key in self._forecast_of.items():
+                    row.set(forecast_key, starts[0].get(key))
+                row = self._run(self.update_modules, row)
+                if not update_at_reset:
+                    row.update(starts[0])
+            else:
+                if detach_every and t % detach_every == 0:
+                    belief = belief.detach()
+                row.update(belief)
+                if resets is None:
+                    row = self._run((self.transition_module, *self.update_modules), row)
+                else:
+                    row = self._advance(row, resets[t], starts[t], update_at_reset)
+            belief = row.select(*self.carry_keys)
+            outputs.append(row.select(*self.recursion_out_keys))
+        frame_keys = [key for module in self.frame_modules for key in module.out_keys]
+        return tensordict.update(work.select(*frame_keys)).update(torch.stack(outputs, time))
+
+    def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
+        """The entries of ``tensordict`` that the recursion reads and does not write."""
+        modules = (self.transition_module, *self.update_modules)
+        keys = [key for m in modules for key in (*m.in_keys, *getattr(m, "optional_keys", ()))]
+        keys += [m.noise_key for m in modules if getattr(m, "noise_key", None) is not None]
+        own = {*self.recursion_out_keys, *self.carry_keys}
+        keys = [key for key in dict.fromkeys(map(unravel_key, keys)) if key not in own]
+        return [key for key in keys if tensordict.get(key, None) is not None]
+
+
+def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+    return torch.where(expand_as_right(mask, old), new, old)

@@ -1,0 +1,127 @@
+"""The measurement update of an ensemble as a TensorDict module (the paper's eqs. 6 to 12)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.functional import (
+    analyse,
+    ensemble_mean,
+    ensemble_var,
+    inflate,
+    random_rotation,
+    relax_to_prior_spread,
+)
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["EnsembleAnalysis"]
+
+
+class EnsembleAnalysis(SubModel):
+    """Updates the forecast ensemble with the observation; the mathematics is :func:`~torch_denkf.functional.analyse`.
+
+    Args:
+        scheme: ``"sensor"`` (the paper: innovations from the sensor's samples), ``"perturbed"`` (the sensor's mean
+            plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
+        inflation: factor on the analysis anomalies; 1 for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
+        rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
+        ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
+        observation_dim: O, likewise.
+        forecast_key: forecast ensemble ``[*B, E, S]``.
+        predicted_key: predicted observations ``[*B, E, O]``.
+        sensor_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]`` (not for ``"sensor"``).
+        noise_variance_key: variances ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed.
+        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``.
+        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
+        noise_key: optional standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``.
+
+    Raises:
+        ValueError: on an unknown scheme.
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": torch.randn(32, 3), "observation": torch.randn(32, 2)},
+        ...     "sensor": {"ensemble": torch.randn(32, 2), "noise": torch.ones(2)},
+        ... })
+        >>> EnsembleAnalysis("sensor")(td)["belief", "mean"].shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        scheme: Literal["sensor", "perturbed", "etkf", "sakov"] = "sensor",
+        *,
+        inflation: float = 1.0,
+        relaxation: float = 0.0,
+        rotate: bool = False,
+        ensemble_size: int | None = None,
+        observation_dim: int | None = None,
+        forecast_key: NestedKey = ("forecast", "ensemble"),
+        predicted_key: NestedKey = ("forecast", "observation"),
+        sensor_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        belief_key: str = "belief",
+        info_key: str = "info",
+        noise_key: NestedKey = ("noise", "analysis"),
+    ):
+        if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
+            raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
+        if rotate and scheme != "etkf":
+            raise ValueError(f'rotate=True belongs to scheme="etkf"; got {scheme!r}.')
+        super().__init__(
+            nn.Identity(),
+            [forecast_key, predicted_key, sensor_key, noise_variance_key],
+            [(belief_key, name) for name in ("ensemble", "mean", "var")]
+            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
+            optional_keys=[observed_key],
+            noise_key=noise_key,
+        )
+        self.scheme, self.rotate = scheme, rotate
+        self.inflation, self.relaxation = inflation, relaxation
+        self.ensemble_size, self.observation_dim = ensemble_size, observation_dim
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws perturbations or rotations; ``None`` where the scheme needs none or the sizes are unknown."""
+        size = self.ensemble_size
+        if self.rotate and size is not None:
+            return random_rotation(size, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+        if self.scheme == "perturbed" and None not in (size, self.observation_dim):
+            shape = (*batch_size, size, self.observation_dim)
+            return torch.randn(shape, device=device, dtype=dtype, generator=generator)
+        return None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and the diagnostics."""
+        forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
+        noise = self.read_noise(tensordict)
+        if self.rotate and noise is None:
+            noise = random_rotation(
+                forecast.shape[-2], forecast.shape[:-2], device=forecast.device, dtype=forecast.dtype
+            )
+        ensemble, innovation, nis, log_likelihood = analyse(
+            forecast,
+            predicted,
+            observation,
+            variance,
+            scheme=self.scheme,
+            observed=tensordict.get(self.optional_keys[0], None),
+            perturbation=noise if self.scheme == "perturbed" else None,
+            rotation=noise if self.rotate else None,
+        )
+        if self.relaxation:
+            ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
+        if self.inflation != 1.0:
+            ensemble = inflate(ensemble, self.inflation)
+        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), innovation, nis, log_likelihood)
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict

@@ -1,0 +1,182 @@
+r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["AroundState", "FromSensor", "GaussianPrior"]
+
+
+class _InitialEnsemble(SubModel):
+    """Draws ``center + std * N(0, I)`` and writes ensemble, mean and variance of the belief."""
+
+    def __init__(
+        self,
+        std: Sequence[float] | torch.Tensor,
+        ensemble_size: int,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+        optional_keys: Sequence[NestedKey] = (),
+    ):
+        super().__init__(
+            nn.Identity(), in_keys, out_keys, optional_keys=optional_keys, noise_key=("noise", "initial")
+        )
+        std = torch.as_tensor(std, dtype=torch.get_default_dtype())
+        if std.ndim != 1 or not (std >= 0).all():
+            raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
+        self.register_buffer("std", std)
+        self.ensemble_size, self.state_dim = ensemble_size, std.numel()
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws standard-normal values ``[*batch_size, E, S]``."""
+        shape = (*batch_size, self.ensemble_size, self.state_dim)
+        return torch.randn(shape, device=device, dtype=dtype, generator=generator)
+
+    def _write(self, tensordict: TensorDictBase, center: torch.Tensor, std: torch.Tensor) -> TensorDictBase:
+        noise = self.read_noise(tensordict)
+        if noise is None:
+            noise = self.draw_noise(tensordict.batch_size, device=center.device, dtype=center.dtype)
+        ensemble = center.unsqueeze(-2) + std.unsqueeze(-2) * noise
+        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+_BELIEF_KEYS = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
+
+
+class GaussianPrior(_InitialEnsemble):
+    """A Gaussian prior with a diagonal covariance, the same for every episode.
+
+    Args:
+        mean: ``[S]``, in the state's units.
+        std: standard deviations ``[S]``.
+        ensemble_size: E.
+        out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> prior = GaussianPrior([0.0, 0.0], std=[1.0, 2.0], ensemble_size=16)
+        >>> prior(TensorDict({}, [3]))["belief", "ensemble"].shape
+        torch.Size([3, 16, 2])
+    """
+
+    def __init__(
+        self,
+        mean: Sequence[float] | torch.Tensor,
+        std: Sequence[float] | torch.Tensor,
+        *,
+        ensemble_size: int = 32,
+        out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
+    ):
+        super().__init__(std, ensemble_size, [], out_keys)
+        mean = torch.as_tensor(mean, dtype=torch.get_default_dtype())
+        if mean.shape != self.std.shape:
+            raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
+        self.register_buffer("mean", mean)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        return self._write(tensordict, self.mean.expand(*tensordict.batch_size, -1), self.std)
+
+
+class AroundState(_InitialEnsemble):
+    """A belief around a state that is known at reset, e.g. the ground truth of a data set.
+
+    Args:
+        std: standard deviations ``[S]``, in the state's units.
+        ensemble_size: E.
+        state_key: the known state ``[*B, S]``.
+        out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
+
+    Raises:
+        KeyError: if ``state_key`` is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> around = AroundState([0.0, 0.0])
+        >>> around(TensorDict({"state": torch.tensor([1.0, 2.0])}))["belief", "mean"]
+        tensor([1., 2.])
+    """
+
+    def __init__(
+        self,
+        std: Sequence[float] | torch.Tensor,
+        *,
+        ensemble_size: int = 32,
+        state_key: NestedKey = "state",
+        out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
+    ):
+        super().__init__(std, ensemble_size, [state_key], out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        return self._write(tensordict, self.read(tensordict, self.in_keys[0]).to(self.std.dtype), self.std)
+
+
+class FromSensor(_InitialEnsemble):
+    """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
+
+    Where nothing is observed at reset, the prior alone is used.
+
+    Args:
+        dims: state dimensions that the sensor reads, in the observation's order.
+        mean: prior mean ``[S]``, in the state's units.
+        std: prior standard deviations ``[S]``.
+        ensemble_size: E.
+        sensor_key: learned observations ``[*B, E, O]`` or a reading ``[*B, O]``.
+        noise_variance_key: variances ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
+        out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
+
+    Raises:
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> start = FromSensor([0], mean=[0.0, 0.0], std=[1.0, 0.0], ensemble_size=1000)
+        >>> td = TensorDict({"sensor": {"ensemble": torch.tensor([5.0]), "noise": torch.tensor([0.01])}})
+        >>> start(td)["belief", "mean"].round(decimals=1)
+        tensor([5., 0.])
+    """
+
+    def __init__(
+        self,
+        dims: Sequence[int],
+        mean: Sequence[float] | torch.Tensor,
+        std: Sequence[float] | torch.Tensor,
+        *,
+        ensemble_size: int = 32,
+        sensor_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
+    ):
+        super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
+        self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.get_default_dtype()))
+        self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        reading = self.read(tensordict, self.in_keys[0])
+        if reading.ndim > tensordict.ndim + 1:
+            reading = reading.mean(-2)
+        std = self.read(tensordict, self.in_keys[1]).sqrt()
+        mean, prior_std = (part.expand(*reading.shape[:-1], -1) for part in (self.mean, self.std))
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observed is not None:
+            reading = torch.where(observed, reading, mean.index_select(-1, self.dims))
+            std = torch.where(observed, std, prior_std.index_select(-1, self.dims))
+        return self._write(
+            tensordict,
+            mean.index_copy(-1, self.dims, reading.to(mean.dtype)),
+            prior_std.index_copy(-1, self.dims, std.to(mean.dtype)),
+        )

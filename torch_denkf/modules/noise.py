@@ -1,0 +1,136 @@
+r"""Observation noise: the diagonal of :math:`r_\zeta(\tilde y_t)` in eq. 9."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.stochastic import StochasticMLP
+
+__all__ = ["ConstantNoise", "DiagonalNoise"]
+
+
+class DiagonalNoise(SubModel):
+    r"""A learned diagonal of R from the learned observation, with :math:`R = r^2` before training and a floor.
+
+    .. math:: R = (r^2 - c)\,(1 + g_\zeta(\tilde y / r))^2 + c
+
+    This is the form of Kloss et al. (2021), written so that the network's output is relative to ``r`` and the
+    floor ``c`` is never larger than :math:`r^2`: no value of ``r`` gives NaN. The last layer starts at zero.
+
+    Args:
+        observation_dim: O.
+        r: standard deviation before training, a number or one for each dimension, in the observation's units.
+        floor: smallest variance ``c``; 1 % of :math:`r^2` by default.
+        num_cells: hidden layers; Table I has (16, 16).
+        in_features: size of the input, O by default; the sensor's encoding has its own.
+        loc: mean of the input ``[in_features]``; zero by default.
+        scale: standard deviation of the input ``[in_features]``; one by default.
+        in_key: learned observations ``[*B, E, O]`` (their mean is used) or any ``[*B, in_features]`` entry.
+        out_key: variances ``[*B, O]``.
+
+    Raises:
+        ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
+
+    Reference:
+        Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 4.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = DiagonalNoise(2, r=0.1)
+        >>> noise(TensorDict({("sensor", "ensemble"): torch.randn(32, 2)}))["sensor", "noise"]
+        tensor([0.0100, 0.0100], grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        *,
+        r: float | Sequence[float] | torch.Tensor = 0.1,
+        floor: float | Sequence[float] | torch.Tensor | None = None,
+        num_cells: Sequence[int] = (16, 16),
+        in_features: int | None = None,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        in_key: NestedKey = ("sensor", "ensemble"),
+        out_key: NestedKey = ("sensor", "noise"),
+    ):
+        in_features = observation_dim if in_features is None else in_features
+        network = StochasticMLP(in_features, observation_dim, num_cells, layer="none", output_gain=0.0)
+        super().__init__(network, [in_key], [out_key])
+        dtype = torch.get_default_dtype()
+        variance = torch.as_tensor(r, dtype=dtype).expand(observation_dim) ** 2
+        floor = (
+            0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(observation_dim)
+        )
+        if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
+            raise ValueError(
+                f"DiagonalNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
+                f"floor = {floor.tolist()}."
+            )
+        self.register_buffer("variance", (variance - floor).clone())
+        self.register_buffer("floor", floor.clone())
+        self.register_buffer(
+            "loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype)
+        )
+        self.register_buffer(
+            "scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype)
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the variances."""
+        features = self.read(tensordict, self.in_keys[0])
+        if features.ndim > tensordict.ndim + 1:
+            features = features.mean(-2)
+        relative = 1 + self.module((features - self.loc) / self.scale)
+        return tensordict.set(self.out_keys[0], self.variance * relative**2 + self.floor)
+
+
+class ConstantNoise(SubModel):
+    """A constant diagonal of R, learned or known.
+
+    Args:
+        r: standard deviation of each observation dimension ``[O]``, in the observation's units.
+        trainable: whether log R is a parameter.
+        in_key: any entry of batch shape ``[*B, ...]``, read for its dtype alone.
+        out_key: variances ``[*B, O]``.
+
+    Raises:
+        ValueError: if ``r`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = ConstantNoise([0.1, 2.0], in_key="position")
+        >>> noise(TensorDict({"position": torch.zeros(2)}))["sensor", "noise"]
+        tensor([0.0100, 4.0000])
+    """
+
+    def __init__(
+        self,
+        r: Sequence[float] | torch.Tensor,
+        *,
+        trainable: bool = False,
+        in_key: NestedKey = ("sensor", "ensemble"),
+        out_key: NestedKey = ("sensor", "noise"),
+    ):
+        super().__init__(nn.Identity(), [in_key], [out_key])
+        r = torch.as_tensor(r, dtype=torch.get_default_dtype())
+        if r.ndim != 1 or not (r > 0).all():
+            raise ValueError(f"ConstantNoise needs one positive standard deviation a dimension; got r = {r}.")
+        log_variance = 2 * r.log()
+        if trainable:
+            self.log_variance = nn.Parameter(log_variance)
+        else:
+            self.register_buffer("log_variance", log_variance)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the variances."""
+        like = self.read(tensordict, self.in_keys[0])
+        variance = self.log_variance.exp().to(
+            like.dtype if like.is_floating_point() else self.log_variance.dtype
+        )
+        return tensordict.set(self.out_keys[0], variance.expand(*tensordict.batch_size, -1))

@@ -1,0 +1,133 @@
+r"""Observation models: predicted observations :math:`H X_{t|t-1} = [h_\psi(x^1), \dots, h_\psi(x^E)]` (eq. 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["LearnedObservation", "LinearObservation", "Select"]
+
+
+class _Observation(SubModel):
+    """Reads the forecast ensemble ``[*B, E, S]``, writes the predicted observations ``[*B, E, O]``."""
+
+    def __init__(
+        self,
+        network: nn.Module,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(network, [in_key], [out_key])
+
+    def observe(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns :math:`h` of states ``[*, S]``, as ``[*, O]``."""
+        return self.module(state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the predicted observations."""
+        return tensordict.set(self.out_keys[0], self.observe(self.read(tensordict, self.in_keys[0])))
+
+
+class LearnedObservation(_Observation):
+    """A learned observation model, deterministic as in Table I (``fc`` layers).
+
+    Args:
+        network: maps ``[*, S]`` to ``[*, O]``, e.g. ``StochasticMLP(S, O, layer="none")``.
+        loc: mean of each state dimension ``[S]``; the network reads standardised states.
+        scale: standard deviation of each state dimension ``[S]``.
+        in_key: ensemble to observe ``[*B, E, S]``.
+        out_key: predicted observations ``[*B, E, O]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> h = LearnedObservation(nn.Linear(5, 2))
+        >>> h(TensorDict({("forecast", "ensemble"): torch.zeros(32, 5)}))["forecast", "observation"].shape
+        torch.Size([32, 2])
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        loc: torch.Tensor | Sequence[float] | None = None,
+        scale: torch.Tensor | Sequence[float] | None = None,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(network, in_key, out_key)
+        dtype = torch.get_default_dtype()
+        self.register_buffer("loc", None if loc is None else torch.as_tensor(loc, dtype=dtype))
+        self.register_buffer("scale", None if scale is None else torch.as_tensor(scale, dtype=dtype))
+
+    def observe(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the network's observation of states ``[*, S]``, as ``[*, O]``."""
+        if self.loc is not None:
+            state = state - self.loc
+        if self.scale is not None:
+            state = state / self.scale
+        return self.module(state)
+
+
+class Select(_Observation):
+    """Known observation of single state dimensions, e.g. the velocities of [x, y, theta, v, theta_dot].
+
+    Args:
+        dims: indices of the observed dimensions, in the observation's order.
+        in_key: ensemble to observe ``[*B, E, S]``.
+        out_key: predicted observations ``[*B, E, len(dims)]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({("forecast", "ensemble"): torch.tensor([[0.0, 1.0, 2.0, 3.0, 4.0]])})
+        >>> Select([3, 4])(td)["forecast", "observation"].tolist()
+        [[3.0, 4.0]]
+    """
+
+    def __init__(
+        self,
+        dims: Sequence[int],
+        *,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(nn.Identity(), in_key, out_key)
+        self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+
+    def observe(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the selected dimensions of states ``[*, S]``."""
+        return state.index_select(-1, self.dims)
+
+
+class LinearObservation(_Observation):
+    """Known linear observation, ``y = H x``.
+
+    Args:
+        matrix: H, ``[O, S]``.
+        in_key: ensemble to observe ``[*B, E, S]``.
+        out_key: predicted observations ``[*B, E, O]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> sums = LinearObservation(torch.ones(1, 3))
+        >>> sums(TensorDict({("forecast", "ensemble"): torch.ones(8, 3)}))["forecast", "observation"][0]
+        tensor([3.])
+    """
+
+    def __init__(
+        self,
+        matrix: torch.Tensor | Sequence[Sequence[float]],
+        *,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(nn.Identity(), in_key, out_key)
+        self.register_buffer("matrix", torch.as_tensor(matrix, dtype=torch.get_default_dtype()))
+
+    def observe(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns ``H x`` of states ``[*, S]``."""
+        return state @ self.matrix.mT

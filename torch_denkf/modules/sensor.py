@@ -1,0 +1,215 @@
+r"""Learned sensors: :math:`\tilde y^i_t \sim s_\xi(\tilde y^i_t \mid y_t)` (the paper's eq. 8, Table I)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.stochastic import StochasticMLP
+
+__all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
+
+#: Table I: (channels, kernel, stride) of each convolution.
+PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
+
+
+def convolutional_trunk(
+    in_channels: int, layers: Sequence[tuple[int, int, int]] = PAPER_TRUNK
+) -> nn.Sequential:
+    """Builds convolutions with ReLU and 'same' padding (kernel // 2), then flattens.
+
+    Args:
+        in_channels: channels of the image.
+        layers: (channels, kernel, stride) of each convolution; Table I's by default.
+
+    Example:
+        >>> convolutional_trunk(6)(torch.zeros(1, 6, 50, 150)).shape  # 16 channels, 7 x 19
+        torch.Size([1, 2128])
+    """
+    parts: list[nn.Module] = []
+    for channels, kernel, stride in layers:
+        parts += [nn.Conv2d(in_channels, channels, kernel, stride, padding=kernel // 2), nn.ReLU()]
+        in_channels = channels
+    return nn.Sequential(*parts, nn.Flatten())
+
+
+class _Sensor(SubModel):
+    """A trunk that runs once a frame, and a stochastic head that runs for every member."""
+
+    def __init__(
+        self,
+        trunk: nn.Module,
+        head: StochasticMLP,
+        ensemble_size: int,
+        in_key: NestedKey,
+        out_key: NestedKey,
+        encoding_key: NestedKey | None,
+        noise_key: NestedKey,
+        loc,
+        scale,
+        event_ndim: int,
+        observed_key: NestedKey,
+    ):
+        super().__init__(
+            nn.ModuleDict({"trunk": trunk, "head": head}),
+            [in_key],
+            [out_key] if encoding_key is None else [out_key, encoding_key],
+            optional_keys=[observed_key],
+            noise_key=noise_key,
+        )
+        self.ensemble_size, self.event_ndim = ensemble_size, event_ndim
+        dtype = torch.get_default_dtype()
+        self.register_buffer("loc", torch.as_tensor(0.0 if loc is None else loc, dtype=dtype))
+        self.register_buffer("scale", torch.as_tensor(1.0 if scale is None else scale, dtype=dtype))
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws the head's noise for ``[*batch_size, E]`` rows."""
+        return self.module["head"].draw_noise(
+            batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator
+        )
+
+    def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
+        return measurement
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the learned observations of every member."""
+        measurement = self._prepare(self.read(tensordict, self.in_keys[0]))
+        batch_ndim = measurement.ndim - self.event_ndim
+        batch_size, event_shape = measurement.shape[:batch_ndim], measurement.shape[batch_ndim:]
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observed is not None:
+            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
+            seen = observed.any(-1).reshape(*batch_size, *(1,) * self.event_ndim)
+            measurement = torch.where(seen, measurement, 0.0)
+        # A trunk takes one batch dimension; the tensordict may have none or many.
+        code = self.module["trunk"](measurement.reshape(-1, *event_shape)).reshape(*batch_size, -1)
+        head, noise = self.module["head"], self.read_noise(tensordict)
+        if noise is None and head.sample:
+            noise = self.draw_noise(batch_size, device=code.device, dtype=code.dtype)
+        # [*B, 1, F] against noise [*B, E, N]: what is equal for all members is computed once.
+        samples, hidden = head.forward_with_hidden(code.unsqueeze(-2), noise)
+        samples = (self.loc + self.scale * samples).expand(*batch_size, self.ensemble_size, -1)
+        tensordict.set(self.out_keys[0], samples)
+        if len(self.out_keys) > 1:
+            tensordict.set(self.out_keys[1], hidden.mean(-2))
+        return tensordict
+
+
+class ImageSensor(_Sensor):
+    """Table I's sensor: three convolutions once a frame, then stochastic layers for each ensemble member.
+
+    Args:
+        observation_dim: O.
+        image_shape: (channels, height, width); the paper's KITTI input is (6, 50, 150), a frame and its
+            difference from the previous one.
+        ensemble_size: E.
+        trunk: a module from ``[N, C, H, W]`` to ``[N, F]``; Table I's convolutions by default.
+        num_cells: widths of the head's hidden layers; Table I has (64, 64, 32, 32).
+        layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
+        rate: drop probability of the head's hidden units.
+        loc: mean of the observation ``[O]`` in its units; the head's output is standardised.
+        scale: standard deviation of the observation ``[O]``.
+        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point.
+        out_key: learned observations ``[*B, E, O]``.
+        encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
+            if anywhere.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; frames of which nothing is observed are not read.
+        noise_key: optional noise (see :class:`StochasticMLP`).
+
+    Raises:
+        ValueError: if an image does not have ``image_shape``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> sensor = ImageSensor(2, image_shape=(6, 50, 150), ensemble_size=8)
+        >>> sensor(TensorDict({"pixels": torch.zeros(3, 6, 50, 150)}, [3]))["sensor", "ensemble"].shape
+        torch.Size([3, 8, 2])
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        *,
+        image_shape: tuple[int, int, int] = (6, 50, 150),
+        ensemble_size: int = 32,
+        trunk: nn.Module | None = None,
+        num_cells: Sequence[int] = (64, 64, 32, 32),
+        layer: Literal["dropout", "flipout", "none"] = "dropout",
+        rate: float = 0.1,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        in_key: NestedKey = "pixels",
+        out_key: NestedKey = ("sensor", "ensemble"),
+        encoding_key: NestedKey | None = None,
+        observed_key: NestedKey = "observed",
+        noise_key: NestedKey = ("noise", "sensor"),
+    ):
+        trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
+        with torch.no_grad():
+            features = trunk(torch.zeros(1, *image_shape)).shape[-1]
+        head = StochasticMLP(features, observation_dim, num_cells, layer=layer, rate=rate)
+        super().__init__(
+            trunk, head, ensemble_size, in_key, out_key, encoding_key, noise_key, loc, scale, 3, observed_key
+        )
+        self.image_shape = tuple(image_shape)
+
+    def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
+        if tuple(measurement.shape[-3:]) != self.image_shape:
+            raise ValueError(
+                f"ImageSensor was built for images of shape [*B, {', '.join(map(str, self.image_shape))}]; "
+                f"{self.in_keys[0]!r} has shape {list(measurement.shape)}. Pass image_shape=, or resize the images."
+            )
+        if measurement.dtype == torch.uint8:
+            return measurement.to(self.loc.dtype) / 255
+        return measurement
+
+
+class VectorSensor(_Sensor):
+    """A learned sensor for vectors (encoders, ranges, forces): a stochastic MLP, sampled for each member.
+
+    Args:
+        in_features: size of the measurement.
+        observation_dim: O.
+        ensemble_size: E.
+        num_cells: widths of the hidden layers; Table I's head by default.
+        layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
+        rate: drop probability of hidden units.
+        loc: mean of the observation ``[O]`` in its units; the network's output is standardised.
+        scale: standard deviation of the observation ``[O]``.
+        in_key: measurements ``[*B, in_features]``.
+        out_key: learned observations ``[*B, E, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; rows of which nothing is observed are not read.
+        noise_key: optional noise (see :class:`StochasticMLP`).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> sensor = VectorSensor(6, 2, ensemble_size=8, in_key="encoders")
+        >>> sensor(TensorDict({"encoders": torch.zeros(6)}))["sensor", "ensemble"].shape
+        torch.Size([8, 2])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        observation_dim: int,
+        *,
+        ensemble_size: int = 32,
+        num_cells: Sequence[int] = (64, 64, 32, 32),
+        layer: Literal["dropout", "flipout", "none"] = "dropout",
+        rate: float = 0.1,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        in_key: NestedKey = "measurement",
+        out_key: NestedKey = ("sensor", "ensemble"),
+        observed_key: NestedKey = "observed",
+        noise_key: NestedKey = ("noise", "sensor"),
+    ):
+        head = StochasticMLP(in_features, observation_dim, num_cells, layer=layer, rate=rate)
+        super().__init__(
+            nn.Identity(), head, ensemble_size, in_key, out_key, None, noise_key, loc, scale, 1, observed_key
+        )

@@ -1,0 +1,264 @@
+r"""Stochastic layers (the paper's SNN) and the network built from them.
+
+Two kinds, with the same interface:
+
+* **MC dropout** (Gal & Ghahramani 2016, the paper's section III-A): each hidden unit is dropped with
+  probability ``rate``, also at test time. Masks differ between members, so each member sees its own network.
+* **Flipout** (Wen et al. 2018, the authors' code): weights :math:`W \sim N(\mu, \sigma^2)`; one perturbation
+  :math:`\Delta W = \sigma \circ \varepsilon` a call is decorrelated between rows by random signs,
+  :math:`y_i = x_i \mu^T + ((x_i \circ s_i) \Delta W^T) \circ r_i`.
+
+Whether a layer samples never depends on ``.training`` (torchrl puts transforms in eval mode): ``sample=False``
+gives the deterministic forward, the mean network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torch.nn import functional as F
+
+from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
+
+__all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
+
+
+class FlipoutLinear(nn.Module):
+    r"""A linear layer with Gaussian weights, sampled by flipout.
+
+    Args:
+        in_features: size of the input.
+        out_features: size of the output.
+        posterior_std: initial standard deviation of every weight.
+        prior_std: standard deviation of the zero-mean Gaussian prior that :meth:`kl` measures against.
+
+    Shapes:
+        input ``[*, in_features]``, output ``[*, out_features]``; ``signs`` bool ``[*, in_features + out_features]``;
+        ``perturbation`` ``[out_features * in_features + out_features]``, standard normal.
+
+    Reference:
+        Wen, Vicol, Ba, Tran, Grosse, "Flipout: efficient pseudo-independent weight perturbations on
+        mini-batches", ICLR 2018, arXiv:1803.04386.
+
+    Example:
+        >>> layer = FlipoutLinear(3, 2)
+        >>> layer(torch.zeros(5, 3)).shape, float(layer.kl()) > 0
+        (torch.Size([5, 2]), True)
+    """
+
+    def __init__(self, in_features: int, out_features: int, *, posterior_std=0.05, prior_std: float = 1.0):
+        super().__init__()
+        self.in_features, self.out_features = in_features, out_features
+        self.prior_std = prior_std
+        mean = nn.Linear(in_features, out_features)
+        self.weight, self.bias = mean.weight, mean.bias
+        rho = torch.tensor(posterior_std).expm1().log()  # softplus(rho) = posterior_std
+        self.weight_rho = nn.Parameter(rho.expand(out_features, in_features).clone())
+        self.bias_rho = nn.Parameter(rho.expand(out_features).clone())
+
+    @property
+    def perturbation_size(self) -> int:
+        """Number of standard-normal values in one perturbation of the weights."""
+        return self.weight.numel() + self.bias.numel()
+
+    def forward(self, x: torch.Tensor, signs=None, perturbation=None, *, sample: bool = True) -> torch.Tensor:
+        """Applies the layer; noise that is not given is drawn. ``sample=False`` uses the mean weights."""
+        mean = F.linear(x, self.weight, self.bias)
+        if not sample:
+            return mean
+        if signs is None:
+            signs = random_signs((*x.shape[:-1], self.in_features + self.out_features), device=x.device)
+        if perturbation is None:
+            perturbation = torch.randn(self.perturbation_size, device=x.device, dtype=x.dtype)
+        sign_in, sign_out = (signs.to(x.dtype) * 2 - 1).split([self.in_features, self.out_features], -1)
+        weight_eps, bias_eps = perturbation.split([self.weight.numel(), self.bias.numel()])
+        weight = F.softplus(self.weight_rho) * weight_eps.view_as(self.weight)
+        bias = F.softplus(self.bias_rho) * bias_eps
+        return mean + F.linear(x * sign_in, weight, bias) * sign_out
+
+    def kl(self) -> torch.Tensor:
+        """KL divergence of the weights' posterior from the prior, in nats, a scalar."""
+        total = self.weight.new_zeros(())
+        for mean, rho in ((self.weight, self.weight_rho), (self.bias, self.bias_rho)):
+            std = F.softplus(rho) / self.prior_std
+            total = total + 0.5 * (std**2 + (mean / self.prior_std) ** 2 - 1 - 2 * std.log()).sum()
+        return total
+
+
+class StochasticMLP(nn.Module):
+    """A multi-layer perceptron of stochastic layers, the paper's ``SNN`` blocks.
+
+    Args:
+        in_features: size of the input.
+        out_features: size of the output.
+        num_cells: width of each hidden layer; Table I's transition has (32, 32, 64, 64).
+        layer: ``"dropout"`` (MC dropout after each hidden activation), ``"flipout"`` or ``"none"``
+            (deterministic, the paper's ``fc``).
+        rate: probability of dropping a hidden unit (``"dropout"``), rounded to a multiple of 1/256.
+        posterior_std: initial standard deviation of the weights (``"flipout"``).
+        activation: the non-linearity of hidden layers.
+        output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
+            identity, zero starts it there.
+
+    Shapes:
+        input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, a boolean keep mask
+        ``[*, noise_size]``; for flipout, a TensorDict of ``signs`` bool ``[*, noise_size]`` and ``perturbation``
+        ``[*, P]``, one draw a call, expanded over the batch.
+
+    Raises:
+        ValueError: if ``layer`` is none of the three.
+
+    Example:
+        >>> net = StochasticMLP(5, 2)
+        >>> x = torch.zeros(32, 5)
+        >>> net(x).shape, bool((net(x, sample=False) == net(x, sample=False)).all())
+        (torch.Size([32, 2]), True)
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        num_cells: Sequence[int] = (32, 32, 64, 64),
+        *,
+        layer: Literal["dropout", "flipout", "none"] = "dropout",
+        rate: float = 0.1,
+        posterior_std: float = 0.05,
+        activation: Callable[[], nn.Module] = nn.ReLU,
+        output_gain: float = 1.0,
+    ):
+        super().__init__()
+        if layer not in ("dropout", "flipout", "none"):
+            raise ValueError(f'layer is "dropout", "flipout" or "none"; got {layer!r}.')
+        self.layer, self.rate = layer, representable_rate(rate)
+        self.sample = True
+        sizes = [in_features, *num_cells, out_features]
+        self.in_features, self.out_features = in_features, out_features
+
+        def make(n_in: int, n_out: int) -> nn.Module:
+            if layer == "flipout":
+                return FlipoutLinear(n_in, n_out, posterior_std=posterior_std)
+            return nn.Linear(n_in, n_out)
+
+        self.layers = nn.ModuleList(
+            make(n_in, n_out) for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+        self.activation = activation()
+        with torch.no_grad():
+            self.layers[-1].weight.mul_(output_gain)
+            self.layers[-1].bias.mul_(output_gain)
+        if layer == "dropout":
+            self.noise_splits = list(num_cells)
+        elif layer == "flipout":
+            self.noise_splits = [n_in + n_out for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True)]
+        else:
+            self.noise_splits = []
+
+    @property
+    def noise_size(self) -> int:
+        """Number of random bits that one row of the input needs."""
+        return sum(self.noise_splits)
+
+    def draw_noise(
+        self, batch_size: Sequence[int], *members: int, device=None, dtype=None, generator=None
+    ) -> torch.Tensor | TensorDictBase | None:
+        """Draws the noise of one call on rows ``[*batch_size, *members]``, in bulk.
+
+        Args:
+            batch_size: batch dimensions (the tensordict's).
+            members: event dimensions in front of the features, usually the ensemble size.
+            device: where to draw.
+            dtype: of the flipout perturbation.
+            generator: source of randomness; torch's global one by default.
+
+        Returns:
+            See the class: a mask, a TensorDict, or ``None`` for a deterministic network.
+        """
+        rows = (*batch_size, *members, self.noise_size)
+        if not self.noise_size:
+            return None
+        if self.layer == "dropout":
+            return random_keep_mask(rows, self.rate, device=device, generator=generator)
+        size = sum(layer.perturbation_size for layer in self.layers)
+        # One draw of the weights' perturbation for the call: the expanded batch dimensions take no memory.
+        perturbation = torch.randn(size, device=device, dtype=dtype, generator=generator).expand(
+            *batch_size, size
+        )
+        signs = random_signs(rows, device=device, generator=generator)
+        return TensorDict(
+            {"signs": signs, "perturbation": perturbation}, batch_size=list(batch_size), device=device
+        )
+
+    def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None) -> torch.Tensor:
+        """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn."""
+        return self.forward_with_hidden(x, noise, sample=sample)[0]
+
+    def forward_with_hidden(self, x: torch.Tensor, noise=None, *, sample: bool | None = None):
+        """Like ``forward``; returns the output and the last hidden layer ``[*, num_cells[-1]]``."""
+        sample = self.sample if sample is None else sample
+        if sample and noise is None and self.noise_size:
+            noise = self.draw_noise(x.shape[:-1], device=x.device, dtype=x.dtype)
+        if self.layer == "flipout":
+            run = self._flipout(noise, sample)
+        elif self.layer == "dropout" and sample:
+            run = self._dropout(noise, x.dtype)
+        else:
+            run = [(layer, None) for layer in self.layers]
+        hidden = x
+        for layer, factor in run[:-1]:
+            hidden = self.activation(layer(hidden))
+            if factor is not None:
+                hidden = hidden * factor
+        return run[-1][0](hidden), hidden
+
+    def _dropout(self, keep: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:
+        factors = (keep.to(dtype) * (1 / (1 - self.rate))).split(self.noise_splits, -1)
+        return list(zip(self.layers, (*factors, None), strict=True))
+
+    def _flipout(self, noise: TensorDictBase | None, sample: bool) -> list[tuple[Callable, None]]:
+        if not sample:
+            return [(partial(layer, sample=False), None) for layer in self.layers]
+        perturbation = noise["perturbation"]
+        while perturbation.ndim > 1:  # the same draw for the whole call
+            perturbation = perturbation[0]
+        signs = noise["signs"].split(self.noise_splits, -1)
+        perturbations = perturbation.split([layer.perturbation_size for layer in self.layers])
+        return [
+            (partial(layer, signs=sign, perturbation=eps), None)
+            for layer, sign, eps in zip(self.layers, signs, perturbations, strict=True)
+        ]
+
+    def kl(self) -> torch.Tensor:
+        """KL divergence of the weights from their prior, in nats; zero where the layers have none."""
+        if self.layer != "flipout":
+            return self.layers[0].weight.new_zeros(())
+        return sum(layer.kl() for layer in self.layers)
+
+
+class deterministic:  # noqa: N801 - a context manager, named like torch.no_grad
+    """Context manager: every :class:`StochasticMLP` inside ``module`` runs its deterministic forward.
+
+    Example:
+        >>> net = StochasticMLP(5, 2)
+        >>> with deterministic(net):
+        ...     same = bool((net(torch.ones(5)) == net(torch.ones(5))).all())
+        >>> same, net.sample
+        (True, True)
+    """
+
+    def __init__(self, module: nn.Module):
+        self.networks = [part for part in module.modules() if isinstance(part, StochasticMLP)]
+
+    def __enter__(self) -> None:
+        self.before = [network.sample for network in self.networks]
+        for network in self.networks:
+            network.sample = False
+
+    def __exit__(self, *exc_info) -> None:
+        for network, sample in zip(self.networks, self.before, strict=True):
+            network.sample = sample
