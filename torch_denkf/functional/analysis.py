@@ -147,7 +147,7 @@ def analyse(
         count = dim
     else:
         observed = observed.expand(noise.shape)
-        count = observed.sum(-1, keepdim=True)
+        count = observed.sum(-1, keepdim=True, dtype=noise.dtype)
         ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
     nis = nis * (size - 1)
     log_det = log_det + noise.log().sum(-1, keepdim=True)

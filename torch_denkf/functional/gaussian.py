@@ -117,7 +117,7 @@ def kalman_update(
         observation = torch.where(observed, observation, 0)
         observation_matrix = torch.where(row, observation_matrix, 0)
         noise = torch.where(row & column, noise, identity)
-        count = observed.sum(-1, keepdim=True)
+        count = observed.sum(-1, keepdim=True, dtype=mean.dtype)
 
     cross = observation_matrix @ cov  # HP
     factor = cholesky(cross @ observation_matrix.mT + noise)

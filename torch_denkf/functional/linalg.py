@@ -1,4 +1,4 @@
-"""Two decompositions of symmetric matrices that are safe to differentiate and never wait for the device."""
+"""Functions of symmetric matrices that are safe to differentiate; where one has no value, it is NaN."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ def inverse_square_root(matrix: Tensor) -> Tensor:
 
     Args:
         matrix: M, ``[*B, N, N]``; eigenvalues that round-off made negative count as zero.
+            A matrix with a NaN in it gives NaN.
 
     Returns:
         (I + M)^-1/2, symmetric, ``[*B, N, N]``.
@@ -89,8 +90,10 @@ class _SymmetricFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(matrix: Tensor, difference: bool) -> tuple[Tensor, Tensor, Tensor]:
-        eigenvalues, vectors = torch.linalg.eigh(matrix)
-        root = (1 + eigenvalues.clamp(min=0)).sqrt()
+        # eigh raises on the first NaN: such a matrix becomes NaN in the result, and only that one.
+        finite = matrix.isfinite().all(-1).all(-1)
+        eigenvalues, vectors = torch.linalg.eigh(torch.where(finite[..., None, None], matrix, 0))
+        root = torch.where(finite[..., None], (1 + eigenvalues.clamp(min=0)).sqrt(), torch.nan)
         values = -1 / (root * (1 + root)) if difference else 1 / root
         return (vectors * values.unsqueeze(-2)) @ vectors.mT, root, vectors
 

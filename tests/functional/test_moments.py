@@ -1,0 +1,31 @@
+"""Oracles: numpy's mean, var and cov."""
+
+import numpy as np
+import pytest
+import torch
+
+from torch_denkf.functional import ensemble_anomalies, ensemble_cov, ensemble_mean, ensemble_var
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_moments_are_numpys(batch):
+    ensemble = torch.randn(*batch, 7, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    array = ensemble.numpy()
+    close = {"rtol": 1e-12, "atol": 1e-12}  # sums of seven numbers of size 1
+    np.testing.assert_allclose(ensemble_mean(ensemble), array.mean(-2), **close)
+    np.testing.assert_allclose(ensemble_anomalies(ensemble), array - array.mean(-2, keepdims=True), **close)
+    np.testing.assert_allclose(ensemble_var(ensemble), array.var(-2, ddof=1), **close)
+    for index in np.ndindex(*batch):
+        np.testing.assert_allclose(ensemble_cov(ensemble)[index], np.cov(array[index].T), **close)
+
+
+@pytest.mark.parametrize("function", [ensemble_mean, ensemble_anomalies, ensemble_var, ensemble_cov])
+def test_a_vector_is_no_ensemble(function):
+    with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
+        function(torch.zeros(3))
+
+
+@pytest.mark.parametrize("function", [ensemble_var, ensemble_cov])
+def test_one_member_has_no_variance(function):
+    with pytest.raises(ValueError, match="at least 2 are needed"):
+        function(torch.zeros(1, 3))

@@ -1,0 +1,98 @@
+"""Oracles: the scores' integrals and double sums, written out."""
+
+import pytest
+import torch
+
+from torch_denkf.functional import crps_ensemble, energy_score
+
+BATCHES = [(), (3,), (2, 3)]
+# Sums of a few dozen numbers of size 1 in double precision.
+EXACT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+def problem(batch=(), size=9, dim=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    ensemble = torch.randn(*batch, size, dim, generator=generator, dtype=torch.float64)
+    return ensemble, torch.randn(*batch, dim, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("fair", [False, True])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_crps_is_the_double_sum(batch, fair):
+    ensemble, target = problem(batch)
+    size = ensemble.shape[-2]
+    pairs = (ensemble.unsqueeze(-2) - ensemble.unsqueeze(-3)).abs().sum((-2, -3))
+    expected = (ensemble - target.unsqueeze(-2)).abs().mean(-2)
+    expected = expected - pairs / (2 * size * (size - 1 if fair else size))
+    torch.testing.assert_close(crps_ensemble(ensemble, target, fair=fair), expected, **EXACT)
+
+
+def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
+    ensemble, target = problem()
+    grid = torch.linspace(-6, 6, 120_001, dtype=torch.float64)  # wider than all members
+    distribution = (ensemble.unsqueeze(-1) <= grid).double().mean(0)
+    step = (target.unsqueeze(-1) <= grid).double()
+    integral = torch.trapezoid((distribution - step).square(), grid)
+    # Each of the 10 jumps is misplaced by at most half a grid step, 5e-5, and counts at most once.
+    torch.testing.assert_close(crps_ensemble(ensemble, target, fair=False), integral, rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize("score", [crps_ensemble, energy_score])
+def test_fair_score_does_not_depend_on_the_ensemble_size(score):
+    # 40,000 ensembles of 3 and of 20 from N(0, 1) against y = 0.7. For one component the expectation is
+    # the Gaussian CRPS, y (2 Φ(y) - 1) + 2 φ(y) - 1 / sqrt(π) (Gneiting & Raftery 2007, eq. 21 ff.).
+    y, normal = torch.tensor(0.7, dtype=torch.float64), torch.distributions.Normal(0, 1)
+    expected = y * (2 * normal.cdf(y) - 1) + 2 * normal.log_prob(y).exp() - torch.pi**-0.5
+    for size in (3, 20):
+        ensemble, _ = problem((40_000,), size, 1)
+        scores = score(ensemble, y.expand(40_000, 1))
+        standard_error = scores.std().item() / 200
+        assert abs(scores.mean().item() - expected.item()) < 3 * standard_error
+        unfair = score(ensemble, y.expand(40_000, 1), fair=False).mean().item()
+        # Counting the pairs i = j, whose distance is 0, costs 1/(2E) E|x - x'| = 1 / (E sqrt(π)).
+        assert abs(unfair - expected.item() - 1 / size / torch.pi**0.5) < 3 * standard_error
+
+
+@pytest.mark.parametrize("fair", [False, True])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_energy_score_is_the_double_sum(batch, fair):
+    ensemble, target = problem(batch)
+    size = ensemble.shape[-2]
+    pairs = (ensemble.unsqueeze(-2) - ensemble.unsqueeze(-3)).square().sum(-1).sqrt().sum((-1, -2))
+    expected = (ensemble - target.unsqueeze(-2)).square().sum(-1).sqrt().mean(-1)
+    expected = expected - pairs / (2 * size * (size - 1 if fair else size))
+    torch.testing.assert_close(energy_score(ensemble, target, fair=fair), expected, **EXACT)
+
+
+def test_energy_score_in_one_dimension_is_the_crps():
+    ensemble, target = problem((3,), dim=1)
+    torch.testing.assert_close(
+        energy_score(ensemble, target), crps_ensemble(ensemble, target)[..., 0], **EXACT
+    )
+
+
+@pytest.mark.parametrize("score", [crps_ensemble, energy_score])
+def test_gradients(score):
+    ensemble, target = problem((2,))
+    assert torch.autograd.gradcheck(score, (ensemble.requires_grad_(), target.requires_grad_()))
+    same = torch.ones(2, 3, 4, requires_grad=True)  # all members and the target at one point
+    score(same, torch.ones(2, 4)).sum().backward()
+    assert same.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("score", [crps_ensemble, energy_score])
+def test_no_digits_are_lost_far_from_the_origin(score):
+    ensemble, target = problem()
+    # At 1e4 single precision resolves 1e-3, which the members are rounded to beforehand.
+    shifted, shifted_target = (ensemble + 1e4).float(), (target + 1e4).float()
+    expected = score(shifted.double(), shifted_target.double())
+    torch.testing.assert_close(score(shifted, shifted_target), expected.float(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("score", [crps_ensemble, energy_score])
+def test_errors(score):
+    with pytest.raises(ValueError, match=r"target must be \[\*B, S\] = \[2\], got \[3\]"):
+        score(torch.zeros(4, 2), torch.zeros(3))
+    with pytest.raises(ValueError, match="at least 2 are needed"):
+        score(torch.zeros(1, 2), torch.zeros(2))
+    assert score(torch.zeros(1, 2), torch.zeros(2), fair=False).sum() == 0
