@@ -21,7 +21,15 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf.functional import ensemble_mean, ensemble_var
+
 __all__ = ["Filter"]
+
+#: What follows from what: the summaries of a belief that a filter carries under these names.
+_SUMMARIES = {
+    "ensemble": {"mean": ensemble_mean, "var": ensemble_var},
+    "cov": {"var": lambda cov: cov.diagonal(dim1=-2, dim2=-1)},
+}
 
 
 class Filter(TensorDictSequential):
@@ -180,6 +188,14 @@ class Filter(TensorDictSequential):
             for key, forecast_key in self._forecast_of.items():
                 tensordict.set(forecast_key, tensordict.get(key))
             tensordict = self._run(self.update_modules, tensordict)
+        return tensordict
+
+    def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
+        for key in self.belief_keys:
+            if key not in self.carry_keys:
+                source = next(k for k in self.carry_keys if k[-1] in _SUMMARIES and key[-1] in _SUMMARIES[k[-1]])
+                tensordict.set(key, _SUMMARIES[source[-1]][key[-1]](tensordict.get(source)))
         return tensordict
 
     def _check_carry(self, tensordict: TensorDictBase) -> None:

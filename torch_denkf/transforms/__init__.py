@@ -1,1 +1,5 @@
-"""transforms"""
+"""What torchrl environments see of a filter."""
+
+from torch_denkf.transforms.denkf import DEnKFTransform
+
+__all__ = ["DEnKFTransform"]

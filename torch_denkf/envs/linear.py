@@ -1,0 +1,104 @@
+"""A linear-Gaussian system as an environment: the one on which every filter has a closed-form oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+__all__ = ["LinearGaussianEnv"]
+
+
+class LinearGaussianEnv(EnvBase):
+    r"""Simulates :math:`x_{t+1} = F x_t + B a_t + N(0, Q)`, :math:`y_t = H x_t + N(0, R)`.
+
+    Emits ``"state"`` ``[*B, S]`` (the truth), ``"observation"`` ``[*B, O]`` and ``"observed"`` ``[*B, 1]``; readings
+    that are not observed are NaN. Takes an ``"action"`` ``[*B, A]``; without ``control`` it has no effect.
+
+    Args:
+        transition: F, ``[S, S]``.
+        observation: H, ``[O, S]``.
+        transition_std: standard deviations of Q's diagonal, ``[S]``.
+        observation_std: standard deviations of R's diagonal, ``[O]``.
+        control: B, ``[S, A]``; by default one action without effect.
+        initial_std: standard deviation of the initial state, ``[S]``; one by default.
+        missing: probability that a reading is missing.
+        max_steps: length of an episode, a number or one for each row of the batch.
+        batch_size: ``*B``.
+        seed: of the environment's own generator.
+
+    Example:
+        >>> env = LinearGaussianEnv(torch.eye(2), torch.eye(2), [0.1, 0.1], [1.0, 1.0], batch_size=[3])
+        >>> env.rollout(5)["next", "observation"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(
+        self,
+        transition: torch.Tensor,
+        observation: torch.Tensor,
+        transition_std: Sequence[float],
+        observation_std: Sequence[float],
+        *,
+        control: torch.Tensor | None = None,
+        initial_std: Sequence[float] | None = None,
+        missing: float = 0.0,
+        max_steps: int | Sequence[int] = 100,
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+    ):
+        super().__init__(batch_size=torch.Size(batch_size), device=device)
+        dtype = torch.get_default_dtype()
+        self.F, self.H = torch.as_tensor(transition, dtype=dtype), torch.as_tensor(observation, dtype=dtype)
+        state_dim, observation_dim = self.F.shape[0], self.H.shape[0]
+        self.B = torch.zeros(state_dim, 1) if control is None else torch.as_tensor(control, dtype=dtype)
+        self.transition_std = torch.as_tensor(transition_std, dtype=dtype)
+        self.observation_std = torch.as_tensor(observation_std, dtype=dtype)
+        self.initial_std = torch.ones(state_dim) if initial_std is None else torch.as_tensor(initial_std, dtype=dtype)
+        self.missing = missing
+        self.max_steps = torch.as_tensor(max_steps).expand(self.batch_size)
+        shape = self.batch_size
+        self.observation_spec = Composite(
+            state=Unbounded((*shape, state_dim), dtype=dtype),
+            observation=Unbounded((*shape, observation_dim), dtype=dtype),
+            observed=Binary(shape=(*shape, 1), dtype=torch.bool),
+            step=Unbounded((*shape, 1), dtype=torch.int64),
+            shape=shape,
+        )
+        self.state_spec = Composite(
+            {key: self.observation_spec[key].clone() for key in ("state", "step")}, shape=shape
+        )
+        self.action_spec = Unbounded((*shape, self.B.shape[1]), dtype=dtype)
+        self.reward_spec = Unbounded((*shape, 1))
+        flag = Binary(shape=(*shape, 1), dtype=torch.bool)
+        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
+        self.rng = torch.Generator().manual_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng.manual_seed(0 if seed is None else seed)
+
+    def _randn(self, like: torch.Tensor, size: int) -> torch.Tensor:
+        return torch.randn(*self.batch_size, size, generator=self.rng, dtype=like.dtype)
+
+    def _emit(self, state: torch.Tensor, step: torch.Tensor) -> TensorDict:
+        reading = state @ self.H.mT + self.observation_std * self._randn(state, self.H.shape[0])
+        observed = torch.rand(*self.batch_size, 1, generator=self.rng) >= self.missing
+        reading = torch.where(observed, reading, torch.nan)
+        entries = {"state": state, "observation": reading, "observed": observed, "step": step}
+        truncated = step >= self.max_steps.unsqueeze(-1)
+        entries.update(truncated=truncated, terminated=torch.zeros_like(truncated), done=truncated)
+        return TensorDict(entries, self.batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
+        state = self.initial_std * self._randn(self.initial_std, self.F.shape[0])
+        return self._emit(state, torch.zeros(*self.batch_size, 1, dtype=torch.int64))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        state, action = tensordict["state"], tensordict["action"]
+        noise = self.transition_std * self._randn(state, state.shape[-1])
+        out = self._emit(state @ self.F.mT + action @ self.B.mT + noise, tensordict["step"] + 1)
+        return out.set("reward", torch.zeros(*self.batch_size, 1))

@@ -1,0 +1,254 @@
+"""The transform that carries a filter's belief through an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import expand_as_right
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+from torchrl.modules import set_recurrent_mode
+
+from torch_denkf.filters import Filter
+
+__all__ = ["DEnKFTransform"]
+
+
+class DEnKFTransform(Transform):
+    """Filters an environment's observations: appends the belief to what the environment emits.
+
+    At reset the belief is the filter's initial belief (of the rows that reset; the others keep theirs bit for bit).
+    At each step the belief at t and the action lead to the forecast, the new observation to the belief at t+1::
+
+        root:  observation[t]    belief[t]    action[t]
+        next:  observation[t+1]  belief[t+1]            <- filter.step(belief[t], action[t], observation[t+1])
+
+    The belief is part of the observation spec and of the state spec, so batched environments, collectors, partial
+    resets and replay buffers carry it; nothing is kept on the transform. A belief that is passed to
+    ``env.reset(tensordict)`` without a ``"_reset"`` mask is taken as the prior. Randomness comes from torch's global
+    generator and does not depend on ``.training``.
+
+    In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
+    :class:`~torch_denkf.filters.Filter`.
+
+    Args:
+        filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
+            its ``initial`` belief.
+        initial: the initial belief of a plain ``TensorDictSequential``.
+        diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
+        store_ensemble: if ``False``, rollouts and collected data hold the belief's mean and variance alone; the
+            ensemble still flows from step to step. Only outside a ``SerialEnv`` or ``ParallelEnv``.
+        no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
+            rollout grows with every step, so this is on by default.
+        check_finite: whether a non-finite observation, forecast or belief raises. Costs one synchronisation a step.
+
+    Raises:
+        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
+        KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
+        ValueError: if the filter's result is not finite, or shapes do not fit.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(7)
+        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(7), cov=one)
+        >>> env = TransformedEnv(ContinuousActionVecMockEnv(), DEnKFTransform(kf))
+        >>> env.rollout(3)["next", "belief", "mean"].shape
+        torch.Size([3, 7])
+    """
+
+    def __init__(
+        self,
+        filter: Filter | TensorDictSequential,
+        *,
+        initial: TensorDictModuleBase | None = None,
+        diagnostics: Sequence[NestedKey] = (),
+        store_ensemble: bool = True,
+        no_grad: bool = True,
+        check_finite: bool = True,
+    ):
+        if not isinstance(filter, Filter):
+            if not isinstance(filter, TensorDictSequential) or initial is None:
+                raise TypeError(
+                    "DEnKFTransform takes a torch_denkf Filter, or a TensorDictSequential together with its initial "
+                    f"belief (initial=...); got {type(filter).__name__} and initial={initial!r}."
+                )
+            filter = Filter(*filter._module_iter(), initial=initial)
+        elif initial is not None:
+            raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
+        self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
+        unknown = [key for key in self._keep if key not in map(unravel_key, filter.out_keys)]
+        if unknown:
+            raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(filter.out_keys)}.")
+        reads = [key for key in map(unravel_key, filter.in_keys) if key not in filter.carry_keys]
+        self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
+        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var")]
+        super().__init__(
+            in_keys=[key for key in reads if key not in filter.control_keys],
+            out_keys=[key for key in self._keep if key not in dropped],
+        )
+        self._dropped_keys = dropped
+        self.filter = filter
+        self._controls = [key for key in reads if key in filter.control_keys]
+        optional = [key for module in filter._module_iter() for key in getattr(module, "optional_keys", ())]
+        self._optional = list(dict.fromkeys(optional))
+
+    # ----------------------------------------------------------------------------------------- in an environment
+
+    def _grad_mode(self):
+        return torch.no_grad() if self.no_grad else nullcontext()
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        row = next_tensordict.empty()
+        for key in self.filter.carry_keys:
+            value = tensordict.get(key, None)
+            if value is None:
+                raise KeyError(
+                    f"DEnKFTransform carries the belief in {key!r}, but the tensordict passed to env.step() lacks it. "
+                    "Start from env.reset(), and pass on what step_mdp() or env.step_and_maybe_reset() return."
+                )
+            row.set(key, value)
+        self._copy(tensordict, row, self._controls, "the tensordict passed to env.step()")
+        self._copy(next_tensordict, row, self.in_keys, "the environment")
+        for key in self._optional:
+            value = next_tensordict.get(key, None)
+            if value is not None:
+                row.set(key, value)
+        with self._grad_mode(), set_recurrent_mode(False):
+            row = self.filter.step(row)
+        if self.check_finite:
+            self._assert_finite(row)
+        for key in self._keep:
+            next_tensordict.set(key, row.get(key))
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        with self._grad_mode(), set_recurrent_mode(False):
+            start = self.filter.initialise(tensordict_reset.copy())
+            if any(start.get(key, None) is None for key in self._keep):
+                # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
+                template = self.filter.step(self._with_zero_controls(start.copy()))
+                for key in self._keep:
+                    start.set(key, start.get(key, torch.zeros_like(template.get(key))))
+        given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
+        if given and all(value is not None for value in given.values()):
+            mask = self._reset_mask(tensordict)
+            for key, value in given.items():
+                start.set(key, value if mask is None else _where(mask, start.get(key), value))
+            start = self.filter.summarise(start)
+        for key in self._keep:
+            tensordict_reset.set(key, start.get(key))
+        return tensordict_reset
+
+    def _reset_on_native_autoreset(self, tensordict, tensordict_reset):
+        return self._reset(tensordict, tensordict_reset)
+
+    def _reset_mask(self, tensordict: TensorDictBase) -> torch.Tensor | None:
+        keys = ["_reset"] if self.parent is None else self.parent.reset_keys
+        masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
+        return masks[0].reshape(*tensordict.batch_size, -1).any(-1) if masks else None
+
+    def _with_zero_controls(self, row: TensorDictBase) -> TensorDictBase:
+        if self._controls:
+            actions = self.parent.full_action_spec.zero()
+            self._copy(actions, row, self._controls, "the environment's action spec")
+        return row
+
+    def _copy(self, source: TensorDictBase, target: TensorDictBase, keys, owner: str) -> None:
+        for key in keys:
+            value = source.get(key, None)
+            if value is None:
+                raise KeyError(
+                    f"The filter reads {key!r}, which {owner} does not hold; it holds "
+                    f"{sorted(map(str, source.keys(True, True)))}. Rename the key in the filter's sub-model, or put a "
+                    "transform that writes it before DEnKFTransform."
+                )
+            target.set(key, value)
+
+    def _assert_finite(self, row: TensorDictBase) -> None:
+        if all(torch.isfinite(row.get(key)).all() for key in self.filter.carry_keys):
+            return
+        inputs = [key for key in self.in_keys if not torch.isfinite(row.get(key)).all()]
+        if inputs:
+            raise ValueError(
+                f"The belief became non-finite because of NaN or infinity in {inputs}. Where a frame is missing or "
+                f"broken, set {self._optional} to False for it (it is then not read), or repair it in a transform "
+                "before DEnKFTransform."
+            )
+        raise ValueError(
+            f"The belief became non-finite although all of {self.in_keys} are finite: the filter diverged. Look at "
+            "the transition's weights and at the noise floor; normalise the state; clip gradients in training."
+        )
+
+    # ------------------------------------------------------------------------------------------------- the specs
+
+    def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
+        """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
+        dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
+        probe, row = observation_spec.zero(), TensorDict({}, observation_spec.shape, device=observation_spec.device)
+        self._copy(probe, row, self.in_keys, f"{type(self.parent.base_env).__name__}'s observation spec")
+        for key in self.in_keys:
+            value = row.get(key)
+            if value.is_floating_point() and dtypes and value.dtype not in dtypes:
+                raise TypeError(
+                    f"The environment emits {key!r} as {value.dtype}, the filter computes in {dtypes.pop()}. Put "
+                    "torchrl's DoubleToFloat() before DEnKFTransform, or convert the filter with filter.double()."
+                )
+        row.update(probe)
+        # The shapes come from a trial; it must not use up random numbers.
+        with torch.no_grad(), torch.random.fork_rng(devices=_cuda_devices(row)), set_recurrent_mode(False):
+            row = self.filter.step(self._with_zero_controls(self.filter.initialise(row)))
+        for key in keys:
+            value = row.get(key)
+            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+        return spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the belief and the diagnostics."""
+        keys = [key for key in self._keep if key not in self._dropped_keys]
+        return self._add_specs(observation_spec, keys, observation_spec)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Adds what the filter carries from step to step to the state spec."""
+        if input_spec.get("full_state_spec", None) is None:
+            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+        observation_spec = self.parent.full_observation_spec.clone()
+        keys = [key for key in self.filter.carry_keys if key not in self._dropped_keys]
+        self._add_specs(input_spec["full_state_spec"], keys, observation_spec)
+        return input_spec
+
+    # --------------------------------------------------------------------------------------------------- storage
+
+    def _post_step_mdp_hooks(self, tensordict, tensordict_):
+        # What is stored loses the ensemble; what flows on to the next step keeps it.
+        stored = tensordict.exclude(*self._dropped_keys, *(("next", *key) for key in self._dropped_keys))
+        return stored, tensordict_
+
+    def _check_batched_worker_compat(self) -> None:
+        if not self.store_ensemble:
+            raise RuntimeError(
+                "DEnKFTransform(store_ensemble=False) drops the ensemble after the outermost environment's step, so "
+                "it cannot live inside a SerialEnv or ParallelEnv worker. Append it outside: "
+                "TransformedEnv(ParallelEnv(...), DEnKFTransform(filter, store_ensemble=False))."
+            )
+
+    # ------------------------------------------------------------------------------------------ in a replay buffer
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`."""
+        with self._grad_mode(), set_recurrent_mode(True):
+            return self.filter(tensordict)
+
+
+def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+    return torch.where(expand_as_right(mask, old), new, old)
+
+
+def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:
+    device = tensordict.device
+    return [device] if device is not None and device.type == "cuda" else []
