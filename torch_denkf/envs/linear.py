@@ -69,9 +69,7 @@ class LinearGaussianEnv(EnvBase):
             step=Unbounded((*shape, 1), dtype=torch.int64),
             shape=shape,
         )
-        self.state_spec = Composite(
-            {key: self.observation_spec[key].clone() for key in ("state", "step")}, shape=shape
-        )
+        self.state_spec = Composite({key: self.observation_spec[key].clone() for key in ("state", "step")}, shape=shape)
         self.action_spec = Unbounded((*shape, self.B.shape[1]), dtype=dtype)
         self.reward_spec = Unbounded((*shape, 1))
         flag = Binary(shape=(*shape, 1), dtype=torch.bool)

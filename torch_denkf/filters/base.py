@@ -54,7 +54,8 @@ class Filter(TensorDictSequential):
         initial: the initial belief, see :mod:`torch_denkf.modules.belief`.
         control_keys: entries that drive the transition *out of* the time they are stored at, by default the action.
         init_key: marks the first element of an episode, ``[*B, 1]`` bool, as written by
-            :class:`torchrl.envs.InitTracker`.
+            :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; a sequence without it starts anew
+            after every ``("next", "done")``.
         update_at_reset: whether the initial belief is updated with the first frame.
 
     Raises:
@@ -162,9 +163,7 @@ class Filter(TensorDictSequential):
         else:
             self._check_carry(tensordict)
             tensordict = self._run(self.frame_modules, tensordict)
-            tensordict = self._advance(
-                tensordict, is_init, self._initial_of(tensordict), self.update_at_reset
-            )
+            tensordict = self._advance(tensordict, is_init, self._initial_of(tensordict), self.update_at_reset)
         for key in self.carry_keys:
             tensordict.set(("next", key) if isinstance(key, str) else ("next", *key), tensordict.get(key))
         return tensordict
@@ -234,9 +233,7 @@ class Filter(TensorDictSequential):
 
     # --------------------------------------------------------------------------------------------- a sequence
 
-    def draw_noise(
-        self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None
-    ) -> TensorDictBase:
+    def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
         Noise that is there already is kept.
@@ -265,12 +262,10 @@ class Filter(TensorDictSequential):
             ValueError: if there is no time dimension.
         """
         if not tensordict.ndim:
-            raise ValueError(
-                "A sequence has time as its last batch dimension; this tensordict has batch_size []."
-            )
+            raise ValueError("A sequence has time as its last batch dimension; this tensordict has batch_size [].")
         time, steps = tensordict.ndim - 1, tensordict.shape[-1]
         work = self._run(self.frame_modules, self.draw_noise(tensordict.copy()))
-        is_init = tensordict.get(self.init_key, None)
+        is_init = self._starts(tensordict)
         stored = all(tensordict.get(key, None) is not None for key in self.belief_keys)
         if stored:  # these have seen their frame
             starts = tensordict.select(*self.belief_keys, *self.carry_keys)
@@ -280,12 +275,9 @@ class Filter(TensorDictSequential):
         starts, resets = starts.unbind(time), None if is_init is None else is_init.unbind(time)
         inputs = {key: work.get(key).unbind(time) for key in self._recursion_inputs(work)}
 
-        outputs = []
+        outputs, belief = [], None
         for t in range(steps):
-            now = {
-                key: values[max(t - 1, 0) if key in self.control_keys else t]
-                for key, values in inputs.items()
-            }
+            now = {key: values[max(t - 1, 0) if key in self.control_keys else t] for key, values in inputs.items()}
             row = TensorDict({}, batch_size=work.batch_size[:-1], device=work.device).update(now)
             if t == 0:
                 for key in self.carry_keys:
@@ -307,6 +299,15 @@ class Filter(TensorDictSequential):
             outputs.append(row.select(*self.recursion_out_keys))
         frame_keys = [key for module in self.frame_modules for key in module.out_keys]
         return tensordict.update(work.select(*frame_keys)).update(torch.stack(outputs, time))
+
+    def _starts(self, tensordict: TensorDictBase) -> torch.Tensor | None:
+        """Marks the first elements of episodes or slices: ``is_init``, or what follows a ``("next", "done")``."""
+        is_init = tensordict.get(self.init_key, None)
+        done = tensordict.get(("next", "done"), None)
+        if is_init is not None or done is None:
+            return is_init
+        time = tensordict.ndim - 1
+        return torch.cat([torch.ones_like(done.narrow(time, 0, 1)), done.narrow(time, 0, done.shape[time] - 1)], time)
 
     def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
         """The entries of ``tensordict`` that the recursion reads and does not write."""

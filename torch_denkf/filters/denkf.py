@@ -116,9 +116,7 @@ class DEnKF(Filter):
                 num_cells=(64, 64, 32, 32),
                 rate=rate,
             ),
-            observation=LearnedObservation(
-                StochasticMLP(state_dim, observation_dim, (32, 32, 64, 64), layer="none")
-            ),
+            observation=LearnedObservation(StochasticMLP(state_dim, observation_dim, (32, 32, 64, 64), layer="none")),
             noise=DiagonalNoise(observation_dim, r=r, num_cells=(16, 16)),
             initial=_standard_prior(state_dim, ensemble_size) if initial is None else initial,
             **kwargs,
@@ -163,13 +161,9 @@ class DEnKF(Filter):
             encoding_key=encoding_key,
         )
         return cls(
-            transition=LearnedTransition(
-                StochasticMLP(state_dim, state_dim, (64, 512, 256), layer="flipout")
-            ),
+            transition=LearnedTransition(StochasticMLP(state_dim, state_dim, (64, 512, 256), layer="flipout")),
             sensor=sensor,
-            observation=LearnedObservation(
-                StochasticMLP(state_dim, observation_dim, (64, 128, 128, 64), layer="none")
-            ),
+            observation=LearnedObservation(StochasticMLP(state_dim, observation_dim, (64, 128, 128, 64), layer="none")),
             noise=DiagonalNoise(observation_dim, r=r, num_cells=(32,), in_features=64, in_key=encoding_key),
             initial=_standard_prior(state_dim, ensemble_size) if initial is None else initial,
             **kwargs,

@@ -25,9 +25,7 @@ class _InitialEnsemble(SubModel):
         out_keys: Sequence[NestedKey],
         optional_keys: Sequence[NestedKey] = (),
     ):
-        super().__init__(
-            nn.Identity(), in_keys, out_keys, optional_keys=optional_keys, noise_key=("noise", "initial")
-        )
+        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys, noise_key=("noise", "initial"))
         std = torch.as_tensor(std, dtype=torch.get_default_dtype())
         if std.ndim != 1 or not (std >= 0).all():
             raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")

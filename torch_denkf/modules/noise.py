@@ -64,9 +64,7 @@ class DiagonalNoise(SubModel):
         super().__init__(network, [in_key], [out_key])
         dtype = torch.get_default_dtype()
         variance = torch.as_tensor(r, dtype=dtype).expand(observation_dim) ** 2
-        floor = (
-            0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(observation_dim)
-        )
+        floor = 0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(observation_dim)
         if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
             raise ValueError(
                 f"DiagonalNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
@@ -74,12 +72,8 @@ class DiagonalNoise(SubModel):
             )
         self.register_buffer("variance", (variance - floor).clone())
         self.register_buffer("floor", floor.clone())
-        self.register_buffer(
-            "loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype)
-        )
-        self.register_buffer(
-            "scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype)
-        )
+        self.register_buffer("loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype))
+        self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the variances."""
@@ -130,7 +124,5 @@ class ConstantNoise(SubModel):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the variances."""
         like = self.read(tensordict, self.in_keys[0])
-        variance = self.log_variance.exp().to(
-            like.dtype if like.is_floating_point() else self.log_variance.dtype
-        )
+        variance = self.log_variance.exp().to(like.dtype if like.is_floating_point() else self.log_variance.dtype)
         return tensordict.set(self.out_keys[0], variance.expand(*tensordict.batch_size, -1))

@@ -18,9 +18,7 @@ __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
 
 
-def convolutional_trunk(
-    in_channels: int, layers: Sequence[tuple[int, int, int]] = PAPER_TRUNK
-) -> nn.Sequential:
+def convolutional_trunk(in_channels: int, layers: Sequence[tuple[int, int, int]] = PAPER_TRUNK) -> nn.Sequential:
     """Builds convolutions with ReLU and 'same' padding (kernel // 2), then flattens.
 
     Args:

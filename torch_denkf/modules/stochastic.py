@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -47,7 +48,7 @@ class FlipoutLinear(nn.Module):
 
     Example:
         >>> layer = FlipoutLinear(3, 2)
-        >>> layer(torch.zeros(5, 3)).shape, float(layer.kl()) > 0
+        >>> layer(torch.zeros(5, 3)).shape, layer.kl().item() > 0
         (torch.Size([5, 2]), True)
     """
 
@@ -145,9 +146,7 @@ class StochasticMLP(nn.Module):
                 return FlipoutLinear(n_in, n_out, posterior_std=posterior_std)
             return nn.Linear(n_in, n_out)
 
-        self.layers = nn.ModuleList(
-            make(n_in, n_out) for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True)
-        )
+        self.layers = nn.ModuleList(make(n_in, n_out) for n_in, n_out in pairwise(sizes))
         self.activation = activation()
         with torch.no_grad():
             self.layers[-1].weight.mul_(output_gain)
@@ -155,7 +154,7 @@ class StochasticMLP(nn.Module):
         if layer == "dropout":
             self.noise_splits = list(num_cells)
         elif layer == "flipout":
-            self.noise_splits = [n_in + n_out for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True)]
+            self.noise_splits = [n_in + n_out for n_in, n_out in pairwise(sizes)]
         else:
             self.noise_splits = []
 
@@ -186,13 +185,9 @@ class StochasticMLP(nn.Module):
             return random_keep_mask(rows, self.rate, device=device, generator=generator)
         size = sum(layer.perturbation_size for layer in self.layers)
         # One draw of the weights' perturbation for the call: the expanded batch dimensions take no memory.
-        perturbation = torch.randn(size, device=device, dtype=dtype, generator=generator).expand(
-            *batch_size, size
-        )
+        perturbation = torch.randn(size, device=device, dtype=dtype, generator=generator).expand(*batch_size, size)
         signs = random_signs(rows, device=device, generator=generator)
-        return TensorDict(
-            {"signs": signs, "perturbation": perturbation}, batch_size=list(batch_size), device=device
-        )
+        return TensorDict({"signs": signs, "perturbation": perturbation}, batch_size=list(batch_size), device=device)
 
     def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None) -> torch.Tensor:
         """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn."""
@@ -240,7 +235,7 @@ class StochasticMLP(nn.Module):
         return sum(layer.kl() for layer in self.layers)
 
 
-class deterministic:  # noqa: N801 - a context manager, named like torch.no_grad
+class deterministic:
     """Context manager: every :class:`StochasticMLP` inside ``module`` runs its deterministic forward.
 
     Example:

@@ -17,9 +17,7 @@ __all__ = ["LearnedTransition", "UnicycleTransition"]
 class _StochasticTransition(SubModel):
     """A transition of an ensemble whose noise is that of a stochastic network."""
 
-    def __init__(
-        self, network: nn.Module, in_keys, out_keys, ensemble_size: int | None, noise_key: NestedKey
-    ):
+    def __init__(self, network: nn.Module, in_keys, out_keys, ensemble_size: int | None, noise_key: NestedKey):
         super().__init__(network, in_keys, out_keys, noise_key=noise_key)
         self.ensemble_size = ensemble_size
 
@@ -27,9 +25,7 @@ class _StochasticTransition(SubModel):
         """Draws the network's noise for ``[*batch_size, E]`` rows; needs ``ensemble_size``."""
         if self.ensemble_size is None or not isinstance(self.module, StochasticMLP):
             return None
-        return self.module.draw_noise(
-            batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator
-        )
+        return self.module.draw_noise(batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator)
 
     def _run(self, features: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
         if not isinstance(self.module, StochasticMLP):
@@ -86,9 +82,7 @@ class LearnedTransition(_StochasticTransition):
         in_keys = [in_key] if action_key is None else [in_key, action_key]
         super().__init__(network, in_keys, [out_key], ensemble_size, noise_key)
         self.residual, self.action_key = residual, action_key
-        self.register_buffer(
-            "loc", None if loc is None else torch.as_tensor(loc, dtype=torch.get_default_dtype())
-        )
+        self.register_buffer("loc", None if loc is None else torch.as_tensor(loc, dtype=torch.get_default_dtype()))
         self.register_buffer(
             "scale", None if scale is None else torch.as_tensor(scale, dtype=torch.get_default_dtype())
         )

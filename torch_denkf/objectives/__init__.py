@@ -1,1 +1,5 @@
-"""objectives"""
+"""Training objectives, torchrl loss modules."""
+
+from torch_denkf.objectives.denkf import DEnKFLoss
+
+__all__ = ["DEnKFLoss"]

@@ -190,7 +190,10 @@ class DEnKFTransform(Transform):
     def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
         """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
         dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
-        probe, row = observation_spec.zero(), TensorDict({}, observation_spec.shape, device=observation_spec.device)
+        probe, row = (
+            observation_spec.zero(),
+            TensorDict({}, observation_spec.shape, device=observation_spec.device),
+        )
         self._copy(probe, row, self.in_keys, f"{type(self.parent.base_env).__name__}'s observation spec")
         for key in self.in_keys:
             value = row.get(key)
