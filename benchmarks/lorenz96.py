@@ -1,0 +1,176 @@
+"""Ensemble filters on Lorenz-96 against published scores, all seeds as one batch.
+
+The standard set-up (Sakov & Oke 2008; DAPPER's ``mods/Lorenz96/sakov2008.py``): 40 variables, forcing 8, all
+observed every 0.05 time units with unit noise variance, no model noise, no localisation. The score is the
+time mean of the root mean square error of the analysis mean, after a burn-in.
+
+    python benchmarks/lorenz96.py --out benchmarks/results/lorenz96.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import shlex
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torch_denkf.data.lorenz96 import lorenz96_step
+from torch_denkf.functional import analyse, inflate, random_rotation
+
+VARIABLES = 40
+SPIN_UP = 1000  # cycles from a random state to the attractor
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table: a scheme, its tuning, and what others got with it."""
+
+    scheme: str
+    ensemble_size: int
+    inflation: float  # factor on the analysis anomalies, DAPPER's convention
+    published: float  # DAPPER's table, which cites the papers
+    target: float
+    rotate: bool = False
+
+    @property
+    def name(self) -> str:
+        """The scheme in words."""
+        return self.scheme + (", rotated every cycle" if self.rotate else "")
+
+
+CASES = [
+    Case("perturbed", 40, 1.06, published=0.22, target=0.24),
+    Case("sakov", 40, 1.01, published=0.18, target=0.20),
+    Case("etkf", 24, 1.013, published=0.18, target=0.21, rotate=True),
+]
+
+
+class Random:
+    """One generator a seed, so a seed's draws do not depend on which others run."""
+
+    def __init__(self, seeds: int, stream: int) -> None:
+        self.generators = [torch.Generator().manual_seed(1000 * stream + seed) for seed in range(seeds)]
+
+    def randn(self, *shape: int) -> Tensor:
+        """Standard normal, ``[seeds, *shape]``."""
+        return torch.stack([torch.randn(*shape, generator=g, dtype=torch.float64) for g in self.generators])
+
+    def rotation(self, size: int) -> Tensor:
+        """Mean-preserving rotations, ``[seeds, size, size]``."""
+        return torch.stack([random_rotation(size, generator=g, dtype=torch.float64) for g in self.generators])
+
+
+def simulate(seeds: int, cycles: int) -> tuple[Tensor, Tensor]:
+    """Truth and observations, ``[cycles + 1, seeds, VARIABLES]``; the first is the start."""
+    random = Random(seeds, stream=0)
+    state = 8 + random.randn(VARIABLES)
+    for _ in range(SPIN_UP):
+        state = lorenz96_step(state)
+    truth = [state]
+    for _ in range(cycles):
+        truth.append(lorenz96_step(truth[-1]))
+    return torch.stack(truth), torch.stack([state + random.randn(VARIABLES) for state in truth])
+
+
+def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor, Tensor]:
+    """Root mean square error and spread of every analysis, both ``[cycles, seeds]``."""
+    seeds = truth.shape[1]
+    random = Random(seeds, stream=1)
+    noise = torch.ones(seeds, VARIABLES, dtype=torch.float64)
+    ensemble = truth[0].unsqueeze(1) + random.randn(case.ensemble_size, VARIABLES)
+    errors, spreads = [], []
+    for state, observation in zip(truth[1:], observations[1:], strict=True):
+        ensemble = lorenz96_step(ensemble)
+        ensemble = analyse(
+            ensemble,
+            ensemble,
+            observation,
+            noise,
+            scheme=case.scheme,
+            perturbation=random.randn(case.ensemble_size, VARIABLES) if case.scheme == "perturbed" else None,
+            rotation=random.rotation(case.ensemble_size) if case.rotate else None,
+        ).ensemble
+        ensemble = inflate(ensemble, case.inflation)
+        errors.append((ensemble.mean(1) - state).square().mean(-1).sqrt())
+        spreads.append(ensemble.var(1).mean(-1).sqrt())
+    return torch.stack(errors), torch.stack(spreads)
+
+
+def processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
+        if line.startswith("model name"):
+            return line.split(":")[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def report(seeds: int, cycles: int, burn_in: int) -> str:
+    """Run every case; the Markdown table with what is needed to repeat it."""
+    start = time.perf_counter()
+    truth, observations = simulate(seeds, burn_in + cycles)
+    lines = [
+        "# Lorenz-96: analysis error of the ensemble schemes",
+        "",
+        "40 variables, forcing 8, all observed with unit variance every 0.05 time units. RMSE: time mean",
+        f"over {cycles:,} cycles after {burn_in:,} of burn-in of the root mean square error of the analysis mean;",
+        f"mean over {seeds} seeds, then each seed. Spread: the same of the ensemble's standard deviation.",
+        "Published: DAPPER's table, which reproduces the papers. Met: the mean does not exceed the target.",
+        "",
+        "| scheme | E | inflation | RMSE | each seed | spread | published | target | met | ms a cycle |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        began = time.perf_counter()
+        errors, spreads = assimilate(case, truth, observations)
+        elapsed = 1e3 * (time.perf_counter() - began) / len(errors)
+        scores = errors[burn_in:].mean(0)
+        cells = [
+            case.name,
+            str(case.ensemble_size),
+            f"{case.inflation}",
+            f"{scores.mean():.3f}",
+            ", ".join(f"{score:.3f}" for score in scores),
+            f"{spreads[burn_in:].mean():.3f}",
+            f"{case.published}",
+            f"{case.target}",
+            "yes" if scores.mean() <= case.target else "no",
+            f"{elapsed:.2f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+        print(lines[-1], flush=True)
+    command = shlex.join(["python", "benchmarks/lorenz96.py", *sys.argv[1:]])
+    lines += [
+        "",
+        f"* Command: `{command}`",
+        f"* Seeds: 0 to {seeds - 1}, all run as one batch, none left out; double precision.",
+        f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s); torch {torch.__version__}; "
+        f"{time.perf_counter() - start:.0f} s in all. A cycle: {seeds} filters' forecast, analysis, score.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=4, help="independent runs, one batch (default: 4)")
+    parser.add_argument("--cycles", type=int, default=10_000, help="cycles averaged (default: 10000)")
+    parser.add_argument("--burn-in", type=int, default=400, help="cycles before those (default: 400)")
+    parser.add_argument("--smoke", action="store_true", help="a few cycles: does it run?")
+    parser.add_argument("--out", type=Path, help="also write the table to this Markdown file")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # on tensors this small more threads only wait for each other
+    if arguments.smoke:
+        arguments.cycles, arguments.burn_in = 20, 20
+    table = report(arguments.seeds, arguments.cycles, arguments.burn_in)
+    print("\n" + table)
+    if arguments.out:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(table)
+
+
+if __name__ == "__main__":
+    main()

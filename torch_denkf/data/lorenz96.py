@@ -1,0 +1,60 @@
+"""The Lorenz-96 system, the usual test bed of ensemble filters: chaotic, cheap, and of any dimension.
+
+Source: Lorenz 1996, Predictability: a problem partly solved; the observed 40-variable set-up with its
+published filter scores: Lorenz & Emanuel 1998, J. Atmos. Sci. 55; Sakov & Oke 2008.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
+    """Time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
+
+    Args:
+        state: x, ``[..., N]`` with N >= 4, without units.
+        forcing: F; 8 is chaotic.
+
+    Returns:
+        dx/dt, ``[..., N]``, in one over time units (one unit stands for five days of weather).
+
+    Raises:
+        ValueError: if there are fewer than four variables.
+
+    Examples:
+        >>> import torch
+        >>> lorenz96_tendency(torch.full((4,), 8.0))  # the unstable fixed point x_i = F
+        tensor([0., 0., 0., 0.])
+    """
+    if state.ndim < 1 or state.shape[-1] < 4:
+        raise ValueError(f"state must be [..., N] with N >= 4 variables, got {list(state.shape)}")
+    previous = state.roll(1, -1)
+    return (state.roll(-1, -1) - state.roll(2, -1)) * previous - state + forcing
+
+
+def lorenz96_step(state: Tensor, dt: float = 0.05, forcing: float | Tensor = 8.0) -> Tensor:
+    """One step of the classical fourth-order Runge-Kutta scheme.
+
+    Args:
+        state: x, ``[..., N]`` with N >= 4, without units.
+        dt: step, in time units; 0.05 (six hours) is the standard set-up's.
+        forcing: F; 8 is chaotic.
+
+    Returns:
+        The state ``dt`` later, ``[..., N]``.
+
+    Raises:
+        ValueError: if there are fewer than four variables.
+
+    Examples:
+        >>> import torch
+        >>> state = lorenz96_step(torch.tensor([8.0, 8.0, 8.0, 9.0]))
+        >>> state.shape
+        torch.Size([4])
+    """
+    k1 = lorenz96_tendency(state, forcing)
+    k2 = lorenz96_tendency(state + dt / 2 * k1, forcing)
+    k3 = lorenz96_tendency(state + dt / 2 * k2, forcing)
+    k4 = lorenz96_tendency(state + dt * k3, forcing)
+    return state + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
