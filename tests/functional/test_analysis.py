@@ -6,6 +6,8 @@ import shutil
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torch_denkf.functional import (
     analyse,
@@ -35,9 +37,7 @@ class Problem:
         self.matrix = self.randn(*batch, dim, state_dim)
         self.predicted = self.forecast @ self.matrix.mT
         self.samples = self.randn(*batch, size, dim)
-        self.noise = (
-            0.1 + self.randn(*batch, dim).square() if noise is None else torch.full((*batch, dim), noise)
-        )
+        self.noise = 0.1 + self.randn(*batch, dim).square() if noise is None else torch.full((*batch, dim), noise)
         self.perturbation = self.randn(*batch, size, dim)
         self.observed = None
         if mask == "partial":
@@ -132,9 +132,7 @@ def test_log_likelihood_is_that_of_the_innovation(sizes, space):
     problem = Problem(*sizes, (2,))
     covariance = ensemble_cov(problem.predicted) + problem.noise.diag_embed()
     result = problem.analyse("sensor", space=space)
-    expected = MultivariateNormal(ensemble_mean(problem.predicted), covariance).log_prob(
-        problem.samples.mean(-2)
-    )
+    expected = MultivariateNormal(ensemble_mean(problem.predicted), covariance).log_prob(problem.samples.mean(-2))
     torch.testing.assert_close(result.log_likelihood.squeeze(-1), expected, **EXACT)
 
 
@@ -258,6 +256,44 @@ def test_compiled_equals_eager_forward_and_backward(sizes):
     gradients = [torch.autograd.grad(sum(v.square().sum() for v in out), inputs) for out in (compiled, eager)]
     for ours, theirs in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, theirs, **EXACT)
+
+
+class LargestTensor(TorchDispatchMode):
+    """Records the most elements that any operation returned."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        tensors = [value for value in tree_leaves(out) if isinstance(value, torch.Tensor)]
+        self.elements = max([self.elements, *(tensor.numel() for tensor in tensors)])
+        return out
+
+
+@pytest.mark.parametrize("sizes", [(8, 400, 300), (300, 400, 8)])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_nothing_is_larger_than_the_inputs(scheme, sizes):
+    # Forward and backward: no S x S, no O x O where O > E, no E x E where E > O.
+    problem = Problem(*sizes)
+    inputs = [tensor.requires_grad_() for tensor in problem.tensors]
+    with LargestTensor() as largest:
+        result = problem.analyse(scheme)
+        torch.autograd.grad(sum(value.square().sum() for value in result), inputs)
+    assert largest.elements == problem.forecast.numel()
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_vmap_equals_the_batch(scheme, space):
+    problem = Problem(6, 4, 3, (2,))
+    perturbation = problem.perturbation if scheme == "perturbed" else None
+
+    def call(*tensors):
+        return analyse(*tensors[:4], scheme=scheme, space=space, perturbation=(*tensors[4:], None)[0])
+
+    extra = () if perturbation is None else (perturbation,)
+    mapped = torch.func.vmap(call)(*problem.tensors, *extra)
+    torch.testing.assert_close(mapped, problem.analyse(scheme, space=space), **EXACT)
 
 
 @pytest.mark.parametrize(

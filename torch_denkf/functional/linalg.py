@@ -88,6 +88,8 @@ class _SymmetricFunction(torch.autograd.Function):
     functions, with r = sqrt(1 + λ), Γ divides only by numbers >= 1.
     """
 
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(matrix: Tensor, difference: bool) -> tuple[Tensor, Tensor, Tensor]:
         # eigh raises on the first NaN: such a matrix becomes NaN in the result, and only that one.
