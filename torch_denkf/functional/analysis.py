@@ -133,9 +133,7 @@ def analyse(
 
     in_observation_space = space == "observation" or (space == "auto" and dim < size)
     solve = _observation_space if in_observation_space else _ensemble_space
-    increment, square_root, nis, log_det = solve(
-        normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf"
-    )
+    increment, square_root, nis, log_det = solve(normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf")
     if scheme != "etkf":
         ensemble = forecast + increment
     elif rotation is None:

@@ -127,9 +127,7 @@ def kalman_update(
     keep = torch.eye(state_dim, dtype=mean.dtype, device=mean.device) - gain @ observation_matrix
     cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
-    return GaussianUpdate(
-        mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood
-    )
+    return GaussianUpdate(mean + _apply(gain, innovation), (cov + cov.mT) / 2, innovation, nis, log_likelihood)
 
 
 def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
