@@ -10,7 +10,7 @@ __all__ = ["spread_skill_ratio"]
 def spread_skill_ratio(
     mean: torch.Tensor, variance: torch.Tensor, truth: torch.Tensor, ensemble_size: int | None = None
 ):
-    r"""Spread over skill: :math:`\sqrt{\frac{E+1}{E}\,\overline{s^2}} \,/\, \mathrm{RMSE}`, one for an ensemble that is calibrated.
+    r"""Spread over skill, :math:`\sqrt{\frac{E+1}{E}\,\overline{s^2}} / \mathrm{RMSE}`: one for a calibrated ensemble.
 
     The truth of a calibrated ensemble is one more draw from its distribution; its squared distance from the mean of E
     members is then (E+1)/E times their variance, on average.
@@ -38,9 +38,8 @@ def spread_skill_ratio(
         tensor([1.])
     """
     if not mean.shape == variance.shape == truth.shape:
-        raise ValueError(
-            f"mean, variance and truth need one shape; got {list(mean.shape)}, {list(variance.shape)}, {list(truth.shape)}."
-        )
+        shapes = [list(part.shape) for part in (mean, variance, truth)]
+        raise ValueError(f"mean, variance and truth need one shape; got {shapes}.")
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
     batch = tuple(range(mean.ndim - 1))
     return (factor * variance.mean(batch)).sqrt() / (mean - truth).square().mean(batch).sqrt()
