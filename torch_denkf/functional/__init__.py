@@ -10,6 +10,7 @@ from torch_denkf.functional.moments import (
     ensemble_mean,
     ensemble_var,
 )
+from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
 from torch_denkf.functional.scores import crps_ensemble, energy_score
 
 __all__ = [
@@ -30,6 +31,9 @@ __all__ = [
     "gaussian_log_prob",
     "crps_ensemble",
     "energy_score",
+    "random_keep_mask",
+    "random_signs",
+    "representable_rate",
     "cholesky",
     "inverse_square_root",
     "inverse_square_root_difference",
