@@ -1,0 +1,170 @@
+"""Append a filter to a dm_control arm: reacher's hidden joint velocities from noisy joint positions.
+
+    python examples/append_to_env.py
+
+The encoders of the arm are made noisy (0.05 rad); the velocities are hidden from the filter. The dynamics are
+learned, with the action, from a few rollouts; then one line appends the filter to the environment, and a policy could
+read ``("belief", "mean")``. Needs no rendering and no GL library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control is imported: nothing is rendered here
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite
+from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, TransformedEnv
+from torchrl.envs.transforms import Transform
+from tqdm import tqdm
+
+from torch_denkf.filters import DEnKF
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
+from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.transforms import DEnKFTransform
+
+NOISE, DT = 0.05, 0.02  # encoder noise in rad; control step in s
+
+
+class NoisyEncoders(Transform):
+    """Adds white noise to the joint positions, as ``"encoder"`` [*B, 2] rad."""
+
+    def __init__(self, std: float):
+        super().__init__(in_keys=["position"], out_keys=["encoder"])
+        self.std = std
+
+    def _apply_transform(self, position: torch.Tensor) -> torch.Tensor:
+        return position + self.std * torch.randn_like(position)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec["encoder"] = observation_spec["position"].clone()
+        return observation_spec
+
+
+def make_env(seed: int) -> TransformedEnv:
+    """Reacher with noisy encoders; ``"state"`` is the truth, for training and scoring alone."""
+    env = TransformedEnv(
+        DMControlEnv("reacher", "easy"),
+        Compose(
+            DoubleToFloat(),
+            NoisyEncoders(NOISE),
+            CatTensors(in_keys=["position", "velocity"], out_key="state", del_keys=False),
+        ),
+    )
+    env.set_seed(seed)
+    return env
+
+
+def make_filter(states: torch.Tensor) -> DEnKF:
+    """State [q1, q2, w1, w2] in rad and rad/s; learned dynamics, known observation of the positions."""
+    loc, scale = states.mean(0), states.std(0)
+    return DEnKF(
+        transition=LearnedTransition(
+            StochasticMLP(4 + 2, 4, (64, 64), output_gain=0.1), loc=loc, scale=scale, action_key="action"
+        ),
+        sensor=None,  # the encoders are read as they are
+        observation=Select([0, 1]),
+        noise=ConstantNoise([NOISE, NOISE], in_key="encoder"),
+        analysis=EnsembleAnalysis("etkf", sensor_key="encoder"),
+        initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], sensor_key="encoder"),
+    )
+
+
+def train(denkf: DEnKF, rollouts: TensorDict, updates: int, length: int) -> None:
+    """Fits the transition through ``length`` steps of random windows."""
+    loss = DEnKFLoss(denkf, sensor=0.0, transition=0.0, state_scale=denkf["transition"].scale)
+    optimiser = torch.optim.Adam(denkf.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=updates)
+    data = rollouts.select("state", "encoder", "action")
+    for _ in (bar := tqdm(range(updates), desc="training", disable=None)):
+        rows = torch.randint(data.shape[0], (64,))
+        starts = torch.randint(data.shape[1] - length + 1, (64, 1)) + torch.arange(length)
+        total = sum(loss(data[rows[:, None], starts]).values())
+        optimiser.zero_grad()
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(denkf.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        bar.set_postfix(crps=f"{total.item():.4f}")
+
+
+def compare(rollout: TensorDict) -> str:
+    """The filter's velocities against differences of the encoders, raw and smoothed over eleven steps."""
+    truth, encoder = rollout["next", "state"], rollout["next", "encoder"]
+    raw = encoder.diff(dim=0, prepend=encoder[:1]) / DT
+    smooth = torch.stack([raw[max(0, t - 10) : t + 1].mean(0) for t in range(len(raw))])
+    mean, var = rollout["next", "belief", "mean"], rollout["next", "belief", "var"]
+    lines = ["| | positions, RMSE rad | velocities, RMSE rad/s |", "|---|---|---|"]
+    for name, position, velocity in (
+        ("encoders and their differences", encoder, raw),
+        ("mean of the last eleven differences", encoder, smooth),
+        ("**DEnKF**", mean[:, :2], mean[:, 2:]),
+    ):
+        errors = [(a - b).square().mean().sqrt() for a, b in ((position, truth[:, :2]), (velocity, truth[:, 2:]))]
+        lines.append(f"| {name} | {errors[0]:.4f} | {errors[1]:.3f} |")
+    inside = ((mean - truth).abs() <= 1.645 * var.sqrt()).float().mean()
+    return "\n".join(lines) + f"\n\n90 % intervals of the belief hold {100 * inside:.0f} % of the truth."
+
+
+def draw(rollout: TensorDict, file: Path) -> None:
+    """Draws the joint velocities over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, axes = plt.subplots(2, 1, figsize=(10, 5), sharex=True, layout="constrained")
+    seconds = torch.arange(len(rollout)) * DT
+    mean, std = rollout["next", "belief", "mean"], rollout["next", "belief", "var"].sqrt()
+    differences = rollout["next", "encoder"].diff(dim=0) / DT
+    for joint, axis in enumerate(axes):
+        dim = joint + 2
+        axis.plot(seconds[1:], differences[:, joint], "r.", markersize=2, alpha=0.5, label="encoder differences")
+        low, high = (mean[:, dim] + sign * 1.645 * std[:, dim] for sign in (-1, 1))
+        axis.fill_between(seconds, low, high, alpha=0.3, label="90 % of the belief")
+        axis.plot(seconds, rollout["next", "state"][:, dim], "k-", linewidth=1, label="truth")
+        axis.plot(seconds, mean[:, dim], "b-", linewidth=1, label="DEnKF")
+        axis.set(ylabel=f"joint {joint + 1}, rad/s", ylim=(-12, 12))
+    axes[0].legend(ncols=4, loc="upper right")
+    axes[1].set(xlabel="s")
+    fig.savefig(file, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=30, help="rollouts of 200 steps to train on")
+    parser.add_argument("--updates", type=int, default=400, help="training steps")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/append_to_env"))
+    parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
+    args = parser.parse_args()
+    if args.smoke:
+        args.episodes, args.updates, args.out = 2, 3, args.out / "smoke"
+    torch.manual_seed(args.seed)
+    args.out.mkdir(parents=True, exist_ok=True)
+
+    env = make_env(args.seed)
+    rollouts = torch.stack([env.rollout(200) for _ in tqdm(range(args.episodes), desc="collecting", disable=None)])
+    denkf = make_filter(rollouts["state"].flatten(0, 1))
+    train(denkf, rollouts, args.updates, length=25)
+
+    env = make_env(args.seed + 1000)
+    env.append_transform(DEnKFTransform(denkf))
+    rollout = env.rollout(400)
+    table = compare(rollout)
+    (args.out / "table.md").write_text(table + "\n")
+    draw(rollout, args.out / "velocities.png")
+    print(
+        f"\nUnseen episode of reacher, encoder noise {NOISE} rad:\n\n{table}\n\nPicture: {args.out / 'velocities.png'}"
+    )
+
+
+if __name__ == "__main__":
+    main()
