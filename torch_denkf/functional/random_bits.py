@@ -62,7 +62,7 @@ def random_keep_mask(
     size = prod(shape)
     words = torch.empty((size + 7) // 8, dtype=torch.int64, device=device)
     words.random_(_INT64_MIN, None, generator=generator)
-    return (words.view(torch.uint8)[:size] >= threshold).view(*shape)
+    return (words.view(torch.uint8)[:size] >= threshold).view(tuple(shape))
 
 
 def random_signs(
