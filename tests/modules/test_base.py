@@ -1,0 +1,225 @@
+"""What holds for every sub-model: missing keys are named, keys may be renamed and nested, copies compute the same."""
+
+import pickle
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    DiagonalNoise,
+    EnsembleAnalysis,
+    FromSensor,
+    GaussianPrior,
+    ImageSensor,
+    KalmanAnalysis,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+    Select,
+    StochasticMLP,
+    UnicycleTransition,
+    VectorSensor,
+)
+
+E, S, OBS = 4, 5, 2
+EYE, H = torch.eye(S), torch.eye(OBS, S)
+
+#: name: (constructor, keyword arguments that rename every key, {the renamed input: its shape})
+CASES = {
+    "learned transition": (
+        lambda **k: LearnedTransition(StochasticMLP(S + 2, S, (8,)), ensemble_size=E, **{"action_key": "action", **k}),
+        {"in_key": ("a", "b", "x"), "out_key": ("c", "f"), "action_key": ("a", "u"), "noise_key": ("n", "t")},
+        {("a", "b", "x"): (E, S), ("a", "u"): (2,)},
+    ),
+    "flipout transition": (
+        lambda **k: LearnedTransition(StochasticMLP(S, S, (8,), layer="flipout"), ensemble_size=E, **k),
+        {"in_key": ("a", "x"), "out_key": "f", "noise_key": "n"},
+        {("a", "x"): (E, S)},
+    ),
+    "unicycle": (
+        lambda **k: UnicycleTransition(StochasticMLP(2, 2, (8,)), 0.1, ensemble_size=E, **k),
+        {"in_key": ("a", "x"), "out_key": "f", "noise_key": "n"},
+        {("a", "x"): (E, S)},
+    ),
+    "select": (lambda **k: Select([3, 4], **k), {"in_key": "x", "out_key": ("p", "q")}, {"x": (E, S)}),
+    "linear observation": (
+        lambda **k: LinearObservation(H, **k),
+        {"in_key": ("a", "x"), "out_key": "y"},
+        {("a", "x"): (E, S)},
+    ),
+    "learned observation": (
+        lambda **k: LearnedObservation(nn.Linear(S, OBS), **k),
+        {"in_key": ("a", "x"), "out_key": "y"},
+        {("a", "x"): (E, S)},
+    ),
+    "diagonal noise": (
+        lambda **k: DiagonalNoise(OBS, **k),
+        {"in_key": ("s", "y"), "out_key": ("s", "r")},
+        {("s", "y"): (E, OBS)},
+    ),
+    "constant noise": (lambda **k: ConstantNoise([0.1, 0.2], **k), {"in_key": "y", "out_key": "r"}, {"y": (OBS,)}),
+    "image sensor": (
+        lambda **k: ImageSensor(OBS, image_shape=(1, 8, 8), ensemble_size=E, **k),
+        {"in_key": ("camera", "rgb"), "out_key": "y", "encoding_key": "code", "observed_key": "ok", "noise_key": "n"},
+        {("camera", "rgb"): (1, 8, 8)},
+    ),
+    "vector sensor": (
+        lambda **k: VectorSensor(3, OBS, ensemble_size=E, **k),
+        {"in_key": ("arm", "q"), "out_key": "y", "observed_key": "ok", "noise_key": "n"},
+        {("arm", "q"): (3,)},
+    ),
+    "gaussian prior": (
+        lambda **k: GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=E, **k),
+        {"out_keys": [("b", "e"), ("b", "m"), "v"]},
+        {},
+    ),
+    "around state": (
+        lambda **k: AroundState(torch.ones(S), ensemble_size=E, **k),
+        {"state_key": ("truth", "x"), "out_keys": [("b", "e"), ("b", "m"), "v"]},
+        {("truth", "x"): (S,)},
+    ),
+    "from sensor": (
+        lambda **k: FromSensor([3, 4], torch.zeros(S), torch.ones(S), ensemble_size=E, **k),
+        {
+            "sensor_key": ("s", "y"),
+            "noise_variance_key": ("s", "r"),
+            "observed_key": "ok",
+            "out_keys": [("b", "e"), ("b", "m"), "v"],
+        },
+        {("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
+    ),
+    "analysis": (
+        lambda **k: EnsembleAnalysis("perturbed", ensemble_size=E, observation_dim=OBS, **k),
+        {
+            "forecast_key": "f",
+            "predicted_key": ("p", "y"),
+            "sensor_key": ("s", "y"),
+            "noise_variance_key": ("s", "r"),
+            "observed_key": "ok",
+            "belief_key": "b",
+            "info_key": "i",
+            "noise_key": "n",
+        },
+        {"f": (E, S), ("p", "y"): (E, OBS), ("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
+    ),
+    "moment prior": (lambda **k: MomentPrior(torch.zeros(S), EYE, **k), {"belief_key": "b"}, {}),
+    "linear transition": (
+        lambda **k: LinearTransition(2 * EYE, EYE, **k),
+        {"belief_key": "b", "forecast_key": "f"},
+        {("b", "mean"): (S,), ("b", "cov"): (S, S)},
+    ),
+    "kalman analysis": (
+        lambda **k: KalmanAnalysis(H, torch.ones(OBS), **k),
+        {
+            "observation_key": ("r", "y"),
+            "observed_key": "ok",
+            "forecast_key": "f",
+            "belief_key": "b",
+            "info_key": "i",
+        },
+        {("f", "mean"): (S,), ("f", "cov"): (S, S), ("r", "y"): (OBS,)},
+    ),
+}
+every_sub_model = pytest.mark.parametrize("name", CASES)
+
+
+def make(name, batch=(3,)):
+    constructor, keys, shapes = CASES[name]
+    module = constructor(**keys)
+    td = TensorDict({}, batch)
+    for key, shape in shapes.items():
+        value = torch.rand(*batch, *shape) + 0.1
+        td[key] = torch.eye(S).expand(*batch, S, S) if "cov" in key else value
+    return module, td
+
+
+def run(module, td, noise=None):
+    td = td.copy()
+    if noise is not None:
+        td[module.noise_key] = noise
+    torch.manual_seed(1)
+    return module(td).select(*module.out_keys)
+
+
+@every_sub_model
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_renamed_and_nested_keys(name, batch):
+    module, td = make(name, batch)
+    before = td.copy()
+    out = module(td)
+    assert list(module.in_keys) == list(CASES[name][2])
+    assert set(out.keys(True, True)) == {*before.keys(True, True), *module.out_keys}
+    assert all(td[key] is before[key] for key in CASES[name][2])
+    assert all(out[key].shape[: len(batch)] == batch and out[key].isfinite().all() for key in module.out_keys)
+
+
+@every_sub_model
+def test_default_and_renamed_keys_compute_the_same(name):
+    module, td = make(name)
+    if not CASES[name][2]:
+        pytest.skip("reads nothing")
+    kwargs = {"encoding_key": "code"} if "image" in name else {}
+    plain = CASES[name][0](**kwargs)
+    plain.load_state_dict(module.state_dict())
+    renamed = TensorDict({p: td[m] for p, m in zip(plain.in_keys, module.in_keys, strict=True)}, td.batch_size)
+    outputs, expected = run(plain, renamed), run(module, td)
+    for ours, theirs in zip(plain.out_keys, module.out_keys, strict=True):
+        assert outputs[ours].equal(expected[theirs])
+
+
+@every_sub_model
+def test_missing_key_is_named(name):
+    module, td = make(name)
+    for key in CASES[name][2]:
+        with pytest.raises(KeyError) as error:
+            module(td.exclude(key))
+        assert repr(key) in str(error.value)
+        assert type(module).__name__ in str(error.value)
+        for other in CASES[name][2]:
+            assert other == key or str(other) in str(error.value), "the message lists what is there"
+
+
+NO_NOISE = {
+    "select",
+    "linear observation",
+    "learned observation",
+    "diagonal noise",
+    "constant noise",
+    "moment prior",
+    "linear transition",
+    "kalman analysis",
+}
+
+
+@every_sub_model
+def test_copies_compute_the_same(name):
+    module, td = make(name)
+    noise = module.draw_noise(td.batch_size)
+    assert (noise is None) == (name in NO_NOISE)
+    expected = run(module, td, noise)
+    other = CASES[name][0](**CASES[name][1])
+    other.load_state_dict(module.state_dict())
+    for copy in (other, pickle.loads(pickle.dumps(module)), deepcopy(module)):
+        out = run(copy, td, noise)
+        assert all(out[key].equal(expected[key]) for key in module.out_keys)
+
+
+@every_sub_model
+def test_train_and_eval_are_the_same(name):
+    module, td = make(name)
+    outputs = [run(module.train(mode), td) for mode in (True, False)]
+    assert all(outputs[0][key].equal(outputs[1][key]) for key in module.out_keys)
+
+
+@every_sub_model
+def test_float64(name):
+    module, td = make(name)
+    out = run(module.double(), td.to(torch.float64))
+    assert all(out[key].dtype == torch.float64 for key in module.out_keys)

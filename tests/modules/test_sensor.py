@@ -1,0 +1,159 @@
+"""Oracle: a naive loop over the members, one forward each."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.modules import ImageSensor, VectorSensor, convolutional_trunk
+
+SHAPE = (2, 9, 12)
+BATCHES = [(), (3,), (2, 3)]
+LAYERS = ["dropout", "flipout"]
+
+
+def image_sensor(**kwargs):
+    return ImageSensor(2, image_shape=SHAPE, ensemble_size=5, num_cells=(8, 6), rate=0.3, **kwargs)
+
+
+def naive(sensor, frames, noise):
+    """One forward of the whole network a frame and member."""
+    out = []
+    for index, frame in enumerate(frames):
+        for member in range(sensor.ensemble_size):
+            rows = noise[index, member] if isinstance(noise, torch.Tensor) else noise[index].clone()
+            if not isinstance(rows, torch.Tensor):
+                rows["signs"] = rows["signs"][member]
+            code = sensor.module["trunk"](frame.unsqueeze(0)).squeeze(0)
+            out.append(sensor.loc + sensor.scale * sensor.module["head"](code, rows))
+    return torch.stack(out).reshape(len(frames), sensor.ensemble_size, -1)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_members_are_separate_forwards_of_one_trunk(float64, layer, batch):
+    sensor = image_sensor(layer=layer, loc=[1.0, -1.0], scale=[2.0, 3.0])
+    frames = torch.rand(*batch, *SHAPE)
+    noise = sensor.draw_noise(batch)
+    calls = []
+    sensor.module["trunk"].register_forward_hook(lambda module, args, out: calls.append(args[0].shape))
+    out = sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, batch))["sensor", "ensemble"]
+    count = frames[..., 0, 0, 0].numel()
+    assert calls == [(count, *SHAPE)]  # once for all frames, and not once a member
+    flat_noise = noise.reshape(count, *noise.shape[len(batch) :]) if layer == "dropout" else noise.reshape(count)
+    expected = naive(sensor, frames.reshape(count, *SHAPE), flat_noise)
+    # Convolutions of one frame and of many may round differently.
+    torch.testing.assert_close(out.reshape(count, 5, 2), expected, rtol=0, atol=1e-12)
+    assert not out[..., 0, :].equal(out[..., 1, :])  # members differ
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_noise_given_is_noise_drawn(layer):
+    sensor, frames = image_sensor(layer=layer), torch.rand(3, *SHAPE)
+    torch.manual_seed(1)
+    drawn = sensor(TensorDict({"pixels": frames}, [3]))["sensor", "ensemble"]
+    torch.manual_seed(1)
+    noise = sensor.draw_noise([3])
+    assert sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, [3]))["sensor", "ensemble"].equal(drawn)
+
+
+def test_uint8_is_divided_by_255():
+    sensor = image_sensor(layer="none")
+    frames = torch.randint(0, 256, (3, *SHAPE), dtype=torch.uint8)
+    outputs = [sensor(TensorDict({"pixels": x}, [3]))["sensor", "ensemble"] for x in (frames, frames.float() / 255)]
+    assert outputs[0].equal(outputs[1])
+
+
+def test_deterministic_head_gives_equal_members():
+    out = image_sensor(layer="none")(TensorDict({"pixels": torch.rand(*SHAPE)}))["sensor", "ensemble"]
+    assert out.shape == (5, 2)
+    assert out.equal(out[:1].expand(5, 2))
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_unobserved_nan_frame_has_finite_output_and_gradients(columns):
+    sensor = image_sensor()
+    frames = torch.rand(3, *SHAPE)
+    noise = sensor.draw_noise([3])
+    broken = frames.clone()
+    broken[1] = torch.nan
+    observed = torch.tensor([True, False, True]).unsqueeze(-1).expand(3, columns)
+
+    def run(pixels):
+        td = TensorDict({"pixels": pixels, "observed": observed, ("noise", "sensor"): noise}, [3])
+        out = sensor(td)["sensor", "ensemble"]
+        return out, torch.autograd.grad(out.square().sum(), list(sensor.parameters()))
+
+    out, grads = run(broken)
+    zeroed = frames.clone()
+    zeroed[1] = 0
+    expected, expected_grads = run(zeroed)
+    assert out.isfinite().all()
+    assert out.equal(expected)
+    assert all(g.isfinite().all() and g.equal(e) for g, e in zip(grads, expected_grads, strict=True))
+
+
+def test_partly_observed_frame_is_read():
+    sensor = image_sensor(layer="none")
+    td = TensorDict({"pixels": torch.rand(*SHAPE)})
+    plain = sensor(td.copy())["sensor", "ensemble"]
+    td["observed"] = torch.tensor([False, True])
+    assert sensor(td)["sensor", "ensemble"].equal(plain)
+
+
+@pytest.mark.parametrize("shape", [(2, 9, 13), (9, 12, 2), (9, 12)])
+def test_wrong_image_shape_names_the_key(shape):
+    with pytest.raises(ValueError, match=r"'camera'.*image_shape"):
+        image_sensor(in_key="camera")(TensorDict({"camera": torch.zeros(shape)}))
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_encoding_is_the_mean_hidden_layer(float64, layer):
+    sensor = image_sensor(layer=layer, encoding_key=("sensor", "code"))
+    frames, noise = torch.rand(3, *SHAPE), sensor.draw_noise([3])
+    td = sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, [3]))
+    hidden = torch.stack(
+        [
+            sensor.module["head"].forward_with_hidden(
+                sensor.module["trunk"](frames),
+                noise[:, e] if layer == "dropout" else noise.clone().set("signs", noise["signs"][:, e]),
+            )[1]
+            for e in range(5)
+        ]
+    )
+    assert td["sensor", "code"].shape == (3, 6)
+    torch.testing.assert_close(td["sensor", "code"], hidden.mean(0), rtol=0, atol=1e-13)
+
+
+def test_paper_trunk():
+    trunk = convolutional_trunk(6)
+    convolutions = [part for part in trunk if isinstance(part, torch.nn.Conv2d)]
+    assert [(c.out_channels, *c.kernel_size, *c.stride) for c in convolutions] == [
+        (64, 7, 7, 2, 2),
+        (32, 3, 3, 2, 2),
+        (16, 3, 3, 2, 2),
+    ]
+    # 50 x 150 -> 25 x 75 -> 13 x 38 -> 7 x 19, 16 channels.
+    assert trunk(torch.zeros(1, 6, 50, 150)).shape == (1, 16 * 7 * 19)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_vector_sensor(float64, layer, batch):
+    sensor = VectorSensor(
+        4, 2, ensemble_size=5, num_cells=(8, 6), rate=0.5, layer=layer, loc=[1.0, 2.0], scale=[3.0, 4.0]
+    )
+    reading, noise = torch.randn(*batch, 4), sensor.draw_noise(batch)
+    out = sensor(TensorDict({"measurement": reading, ("noise", "sensor"): noise}, batch))["sensor", "ensemble"]
+    expected = sensor.module["head"](reading.unsqueeze(-2).expand(*batch, 5, 4), noise)
+    expected = torch.tensor([1.0, 2.0]) + torch.tensor([3.0, 4.0]) * expected
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
+    assert not out[..., 0, :].equal(out[..., 1, :])  # members differ
+
+
+def test_vector_sensor_unobserved_nan():
+    sensor = VectorSensor(4, 2, ensemble_size=5)
+    td = TensorDict({"measurement": torch.full((4,), torch.nan), "observed": torch.tensor([False])})
+    out = sensor(td)["sensor", "ensemble"]
+    assert out.isfinite().all()
+    grads = torch.autograd.grad(out.sum(), list(sensor.parameters()))
+    assert all(grad.isfinite().all() for grad in grads)

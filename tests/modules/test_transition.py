@@ -1,0 +1,115 @@
+"""Oracles: the formula with linear networks, the exact circular arc, finite differences."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.modules import LearnedTransition, UnicycleTransition
+
+BATCHES = [(), (3,), (2, 3)]
+
+
+def forecast(transition, ensemble, **entries):
+    td = TensorDict({("belief", "ensemble"): ensemble, **entries}, ensemble.shape[:-2])
+    return transition(td)["forecast", "ensemble"]
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("residual", [True, False])
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize("action", [True, False])
+def test_learned_transition_is_its_formula(float64, batch, residual, scaled, action):
+    state, drive = torch.randn(*batch, 5, 3), torch.randn(*batch, 2)
+    loc, scale = torch.randn(3), torch.rand(3) + 0.5
+    net = nn.Linear(5 if action else 3, 3)
+    transition = LearnedTransition(
+        net,
+        residual=residual,
+        loc=loc if scaled else None,
+        scale=scale if scaled else None,
+        action_key="action" if action else None,
+    )
+    m, s = (loc, scale) if scaled else (torch.zeros(3), torch.ones(3))
+    change = ((state - m) / s) @ net.weight[:, :3].mT + net.bias
+    if action:
+        change = change + (drive @ net.weight[:, 3:].mT).unsqueeze(-2)
+    expected = s * change + (state if residual else m)
+    torch.testing.assert_close(forecast(transition, state, action=drive), expected, rtol=0, atol=1e-13)
+
+
+def test_residual_of_a_zero_network_is_the_identity():
+    net = nn.Linear(3, 3)
+    nn.init.zeros_(net.weight), nn.init.zeros_(net.bias)
+    state = torch.randn(4, 3)
+    assert forecast(LearnedTransition(net, loc=[1.0, 2.0, 3.0], scale=[1.0, 2.0, 3.0]), state).equal(state)
+
+
+def test_missing_action_is_named():
+    with pytest.raises(KeyError, match="'torque'"):
+        forecast(LearnedTransition(nn.Linear(4, 3), action_key="torque"), torch.zeros(2, 3))
+
+
+def still(velocity):
+    return torch.zeros_like(velocity)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_unicycle_on_a_circular_arc(float64, batch):
+    dt = 0.1
+    speed, rate = 5 + 10 * torch.rand(*batch, 20), torch.randn(*batch, 20)
+    pose = torch.randn(*batch, 20, 3)
+    state = torch.cat([pose, torch.stack([speed, rate], -1)], -1)
+    out = forecast(UnicycleTransition(still, dt), state)
+    # The arc's endpoint: its chord has length 2 v / w sin(w dt / 2) and direction theta + w dt / 2.
+    heading = pose[..., 2] + rate * dt / 2
+    chord = 2 * speed / rate * (rate * dt / 2).sin()
+    exact = pose[..., :2] + chord.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], -1)
+    # The model takes v dt for the chord: 1 - sin(a)/a <= a^2 / 6 with a = w dt / 2, so v dt (w dt)^2 / 24 at most,
+    # and at least 95 % of that for a < 1 (the next term of the series is a^2 / 20 of it).
+    error = (out[..., :2] - exact).norm(dim=-1)
+    bound = speed * dt * (rate * dt) ** 2 / 24
+    assert (error <= bound + 1e-14).all()
+    assert (error >= 0.95 * bound - 1e-14).all()
+    torch.testing.assert_close(out[..., 2], pose[..., 2] + rate * dt, rtol=0, atol=1e-15)
+    assert out[..., 3:].equal(state[..., 3:])
+
+
+def test_unicycle_velocity_changes_before_the_pose_moves(float64):
+    net = nn.Linear(2, 2)
+    loc, scale = torch.tensor([8.0, 0.1]), torch.tensor([3.0, 0.2])
+    state = torch.randn(6, 5)
+    out = forecast(UnicycleTransition(net, 0.5, loc=loc, scale=scale), state)
+    velocity = state[:, 3:] + scale * net((state[:, 3:] - loc) / scale)
+    v, w = velocity.unbind(-1)
+    x, y, theta = state[:, :3].unbind(-1)
+    angle = theta + 0.25 * w
+    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
+
+
+class Forecast(nn.Module):
+    """A transition as a function of tensors."""
+
+    def __init__(self, transition):
+        super().__init__()
+        self.transition = transition
+
+    def forward(self, state):
+        return forecast(self.transition, state)
+
+
+def test_unicycle_gradients(float64):
+    model = Forecast(UnicycleTransition(nn.Linear(2, 2), 0.1, loc=[1.0, 0.1], scale=[2.0, 0.3]))
+
+    def step(state, weight, bias):
+        parameters = {"transition.module.weight": weight, "transition.module.bias": bias}
+        return torch.func.functional_call(model, parameters, (state,))
+
+    inputs = [torch.randn(*shape, requires_grad=True) for shape in ((3, 5), (2, 2), (2,))]
+    assert torch.autograd.gradcheck(step, inputs)
+
+
+def test_unicycle_needs_five_dimensions():
+    with pytest.raises(ValueError, match="4 state dimensions"):
+        forecast(UnicycleTransition(still, 0.1), torch.zeros(2, 4))
