@@ -1,1 +1,5 @@
-"""envs"""
+"""Environments: toy systems and replays. They know nothing about filters."""
+
+from torch_denkf.envs.linear import LinearGaussianEnv
+
+__all__ = ["LinearGaussianEnv"]
