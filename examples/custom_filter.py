@@ -143,7 +143,8 @@ def main() -> None:
         lines.append(f"| {name} | {error[..., :2].mean().sqrt():.2f} | {error[..., 2:].mean().sqrt():.2f} |")
     table = "\n".join(lines)
     print(
-        f"\n64 unseen boats, 50 steps:\n\n{table}\n\nLearned gusts: {model[0].log_gust.exp().item():.2f} m/s a step (0.3)"
+        f"\n64 unseen boats, 50 steps:\n\n{table}\n\n"
+        f"Learned gusts: {model[0].log_gust.exp().item():.2f} m/s a step (true: 0.30)"
     )
 
 
