@@ -1,1 +1,16 @@
-"""data"""
+"""Readers and generators of data."""
+
+from torch_denkf.data.drives import random_drive, roadside_scene, write_drives
+from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
+from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
+
+__all__ = [
+    "drive_frames",
+    "frames_at",
+    "list_kitti_drives",
+    "random_drive",
+    "read_kitti_drive",
+    "roadside_scene",
+    "sample_windows",
+    "write_drives",
+]

@@ -112,9 +112,7 @@ def scale_calibration(calibration: np.ndarray, native: tuple[int, int], size: tu
     """Scale fx, fy, cx, cy from ``native`` to ``size``, both (H, W), with pixel centres at whole numbers."""
     vertical, horizontal = size[0] / native[0], size[1] / native[1]
     fx, fy, cx, cy = calibration
-    return np.array(
-        [fx * horizontal, fy * vertical, (cx + 0.5) * horizontal - 0.5, (cy + 0.5) * vertical - 0.5]
-    )
+    return np.array([fx * horizontal, fy * vertical, (cx + 0.5) * horizontal - 0.5, (cy + 0.5) * vertical - 0.5])
 
 
 def poses_to_state(poses: np.ndarray, dt: float) -> np.ndarray:

@@ -26,8 +26,8 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     ``time``     [*B,1]       float64, s
     ============ ============ ====================================================================================
 
-    What is missing is zero: both parts where frame t is, the difference where frame t-1 is. The first row of a drive has
-    no frame before it and is not observed.
+    What is missing is zero: both parts where frame t is, the difference where frame t-1 is. The first row of a drive
+    has no frame before it and is not observed.
 
     Args:
         drive: as :func:`torch_denkf.data.read_kitti_drive` gives it, batch size ``[N]``.
@@ -103,7 +103,7 @@ def sample_windows(frames: TensorDictBase, length: int, starts: Sequence[int] | 
             f"pass [n] starts in 0 to {rows - length}"
         )
     index = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
-    windows = frames_at(frames, index) if "image" in frames.keys() else frames[index]
+    windows = frames_at(frames, index) if "image" in frames.keys() else frames[index]  # noqa: SIM118
     return _mark_start(windows)
 
 
