@@ -107,16 +107,26 @@ class Filter(TensorDictSequential):
         self.belief_keys = [key for key in provided if key in self.recursion_out_keys]
         # The first module of the recursion is the transition; what it writes is the forecast of the carry, in order.
         self._forecast_of = dict(zip(self.carry_keys, map(unravel_key, recursion[0].out_keys), strict=False))
-        size = getattr(self.initial, "ensemble_size", None)
-        for module in modules:
-            if getattr(module, "ensemble_size", size) is None:
-                module.ensemble_size = size
+        self._share_size("ensemble_size", (self.initial,))
+        self._share_size("observation_dim", modules)
+
+    def _share_size(self, name: str, sources: Iterable[TensorDictModuleBase]) -> None:
+        """Tells the modules that leave ``name`` open the size that one of ``sources`` knows."""
+        size = next((value for m in sources if (value := getattr(m, name, None)) is not None), None)
+        for module in self._module_iter():
+            if getattr(module, name, size) is None:
+                setattr(module, name, size)
 
     def __getitem__(self, index):
-        """Returns one module, or a plain ``TensorDictSequential`` of several."""
-        if isinstance(index, (int, str)):
+        """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
+        if isinstance(index, str):
             return super().__getitem__(index)
-        return TensorDictSequential(*list(self._module_iter())[index])
+        modules = list(self._module_iter())[index]
+        return TensorDictSequential(*modules) if isinstance(index, slice) else modules
+
+    def select_subsequence(self, in_keys=None, out_keys=None) -> TensorDictSequential:
+        """Returns the modules between some keys; a part of a filter is a plain ``TensorDictSequential``."""
+        return self[:].select_subsequence(in_keys, out_keys)
 
     @property
     def frame_modules(self) -> list[TensorDictModuleBase]:
@@ -142,7 +152,7 @@ class Filter(TensorDictSequential):
         """
         probe = TensorDict({}, batch_size=[])
         for key in self.initial.in_keys:
-            probe.set(key, torch.zeros(getattr(self.initial, "state_dim", 1)))
+            probe.set(key, torch.zeros(getattr(self.initial, "observation_dim", getattr(self.initial, "state_dim", 1))))
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             belief = self.initial(probe)
         primers = Composite()

@@ -161,6 +161,7 @@ class FromSensor(_InitialEnsemble):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.get_default_dtype()))
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+        self.observation_dim = len(self.dims)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief."""

@@ -17,7 +17,7 @@ __all__ = ["ConstantNoise", "DiagonalNoise"]
 class DiagonalNoise(SubModel):
     r"""A learned diagonal of R from the learned observation, with :math:`R = r^2` before training and a floor.
 
-    .. math:: R = (r^2 - c)\,(1 + g_\zeta(\tilde y / r))^2 + c
+    .. math:: R = (r^2 - c)\,(1 + g_\zeta((\tilde y - m) / s))^2 + c
 
     This is the form of Kloss et al. (2021), written so that the network's output is relative to ``r`` and the
     floor ``c`` is never larger than :math:`r^2`: no value of ``r`` gives NaN. The last layer starts at zero.
@@ -28,8 +28,8 @@ class DiagonalNoise(SubModel):
         floor: smallest variance ``c``; 1 % of :math:`r^2` by default.
         num_cells: hidden layers; Table I has (16, 16).
         in_features: size of the input, O by default; the sensor's encoding has its own.
-        loc: mean of the input ``[in_features]``; zero by default.
-        scale: standard deviation of the input ``[in_features]``; one by default.
+        loc: mean :math:`m` of the input ``[in_features]``; zero by default.
+        scale: standard deviation :math:`s` of the input ``[in_features]``; one by default.
         in_key: learned observations ``[*B, E, O]`` (their mean is used) or any ``[*B, in_features]`` entry.
         out_key: variances ``[*B, O]``.
 
@@ -62,6 +62,7 @@ class DiagonalNoise(SubModel):
         in_features = observation_dim if in_features is None else in_features
         network = StochasticMLP(in_features, observation_dim, num_cells, layer="none", output_gain=0.0)
         super().__init__(network, [in_key], [out_key])
+        self.observation_dim = observation_dim
         dtype = torch.get_default_dtype()
         variance = torch.as_tensor(r, dtype=dtype).expand(observation_dim) ** 2
         floor = 0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(observation_dim)
@@ -115,6 +116,7 @@ class ConstantNoise(SubModel):
         r = torch.as_tensor(r, dtype=torch.get_default_dtype())
         if r.ndim != 1 or not (r > 0).all():
             raise ValueError(f"ConstantNoise needs one positive standard deviation a dimension; got r = {r}.")
+        self.observation_dim = r.numel()
         log_variance = 2 * r.log()
         if trainable:
             self.log_variance = nn.Parameter(log_variance)

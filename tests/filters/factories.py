@@ -1,0 +1,130 @@
+"""Small filters for tests; importable, so that worker processes find them."""
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.modules import (
+    ConstantNoise,
+    DiagonalNoise,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    StochasticMLP,
+    SubModel,
+    VectorSensor,
+)
+
+S, M, OBS, A, E = 3, 4, 2, 2, 4  # state, measurement, observation, action, members
+
+
+def toy_denkf(scheme="sensor", layer="dropout", *, sensor_layer="dropout", ensemble_size=E, action=True, **kwargs):
+    """Four learned sub-models on a vector measurement and an action."""
+    initial, in_key = kwargs.pop("initial", None), kwargs.pop("in_key", "measurement")
+    return DEnKF(
+        transition=LearnedTransition(
+            StochasticMLP(S + A * action, S, (8, 8), layer=layer, rate=0.3, output_gain=0.5),
+            action_key="action" if action else None,
+        ),
+        sensor=VectorSensor(
+            M, OBS, ensemble_size=ensemble_size, num_cells=(8,), layer=sensor_layer, rate=0.5, in_key=in_key
+        ),
+        observation=LearnedObservation(StochasticMLP(S, OBS, (8,), layer="none")),
+        noise=DiagonalNoise(OBS, r=0.5, num_cells=(4,)),
+        analysis=EnsembleAnalysis(scheme),
+        initial=GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=ensemble_size)
+        if initial is None
+        else initial,
+        **kwargs,
+    )
+
+
+def toy_frames(batch, *, masks=1, resets=True):
+    """Measurements, actions, masks of width ``masks`` and starts that differ between rows, for ``[*B, T]``."""
+    frames = TensorDict({"measurement": torch.randn(*batch, M), "action": torch.randn(*batch, A)}, batch)
+    if masks:
+        frames["observed"] = torch.rand(*batch, masks) < 0.7
+    if resets:
+        frames["is_init"] = torch.rand(*batch, 1) < 0.2
+        frames["is_init"][..., 0, :] = True
+    return frames
+
+
+class NoisyLinear(SubModel):
+    """x' = F x + B a + N(0, Q) for every member; without ``root`` deterministic."""
+
+    def __init__(self, matrix, root=None, ensemble_size=None, control=None):
+        keys = [("belief", "ensemble")] + ["action"] * (control is not None)
+        super().__init__(nn.Identity(), keys, [("forecast", "ensemble")], noise_key=("noise", "transition"))
+        self.ensemble_size = ensemble_size
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("root", root)
+        self.register_buffer("control", control)
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        if self.root is None:
+            return None
+        shape = (*batch_size, self.ensemble_size, self.matrix.shape[0])
+        return torch.randn(shape, device=device, dtype=dtype, generator=generator)
+
+    def forward(self, tensordict):
+        state = self.read(tensordict, self.in_keys[0])
+        out = state @ self.matrix.mT
+        if self.control is not None:
+            out = out + (self.read(tensordict, "action") @ self.control.mT).unsqueeze(-2)
+        if self.root is not None:
+            noise = self.read_noise(tensordict)
+            noise = self.draw_noise(tensordict.batch_size, dtype=state.dtype) if noise is None else noise
+            out = out + noise @ self.root.mT
+        return tensordict.set(self.out_keys[0], out)
+
+
+class FixedEnsemble(SubModel):
+    """An initial belief without randomness: always the same members."""
+
+    def __init__(self, members):
+        super().__init__(nn.Identity(), [], [("belief", name) for name in ("ensemble", "mean", "var")])
+        self.register_buffer("members", members)
+        self.ensemble_size, self.state_dim = members.shape
+
+    def forward(self, tensordict):
+        ensemble = self.members.expand(*tensordict.batch_size, *self.members.shape)
+        for key, value in zip(self.out_keys, (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+def linear_system(dtype=None):
+    """F, Q, H, R (variances), all of two dimensions."""
+    dtype = torch.get_default_dtype() if dtype is None else dtype
+    return (
+        torch.tensor([[0.9, 0.3], [-0.2, 0.8]], dtype=dtype),
+        torch.tensor([[0.2, 0.05], [0.05, 0.1]], dtype=dtype),
+        torch.tensor([[1.0, 0.5], [0.0, 1.0]], dtype=dtype),
+        torch.tensor([0.5, 0.3], dtype=dtype),
+    )
+
+
+def linear_kalman(**kwargs):
+    F, Q, H, R = linear_system()
+    return KalmanFilter(F, Q, H, R, mean=torch.tensor([1.0, -1.0]), cov=torch.diag(torch.tensor([1.0, 2.0])), **kwargs)
+
+
+def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, initial=None, r=None, **kwargs):
+    """An ensemble filter of :func:`linear_system`, free of randomness unless ``noisy`` or ``initial`` say so."""
+    F, Q, H, R = linear_system()
+    generator = torch.Generator().manual_seed(0)
+    members = torch.randn(ensemble_size, 2, generator=generator, dtype=F.dtype)
+    return DEnKF(
+        transition=NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None, ensemble_size, control),
+        sensor=None,
+        observation=LinearObservation(H),
+        noise=ConstantNoise(R.sqrt() if r is None else r, in_key="observation"),
+        analysis=EnsembleAnalysis(scheme, sensor_key="observation"),
+        initial=FixedEnsemble(members) if initial is None else initial,
+        **kwargs,
+    )
