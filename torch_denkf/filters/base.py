@@ -22,8 +22,9 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.modules import SubModel
 
-__all__ = ["Filter"]
+__all__ = ["Filter", "submodels"]
 
 #: What follows from what: the summaries of a belief that a filter carries under these names.
 _SUMMARIES = {
@@ -111,11 +112,13 @@ class Filter(TensorDictSequential):
         self._share_size("observation_dim", modules)
 
     def _share_size(self, name: str, sources: Iterable[TensorDictModuleBase]) -> None:
-        """Tells the modules that leave ``name`` open the size that one of ``sources`` knows."""
-        size = next((value for m in sources if (value := getattr(m, name, None)) is not None), None)
-        for module in self._module_iter():
-            if getattr(module, name, size) is None:
-                setattr(module, name, size)
+        """Tells the sub-models that leave ``name`` open the size on which all ``sources`` agree, if they do."""
+        sizes = {getattr(part, name, None) for source in sources for part in submodels(source)} - {None}
+        if len(sizes) != 1:
+            return
+        for part in submodels(self.module):
+            if hasattr(part, name) and getattr(part, name) is None:
+                setattr(part, name, *sizes)
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
@@ -249,8 +252,8 @@ class Filter(TensorDictSequential):
         Noise that is there already is kept.
         """
         dtype = next((p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()), None)
-        for module in (*self._module_iter(), self.initial):
-            key = getattr(module, "noise_key", None)
+        for module in submodels(self):
+            key = module.noise_key
             if key is not None and tensordict.get(key, None) is None:
                 size, device = tensordict.batch_size, tensordict.device
                 noise = module.draw_noise(size, device=device, dtype=dtype, generator=generator)
@@ -322,11 +325,17 @@ class Filter(TensorDictSequential):
     def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
         """The entries of ``tensordict`` that the recursion reads and does not write."""
         modules = (self.transition_module, *self.update_modules)
-        keys = [key for m in modules for key in (*m.in_keys, *getattr(m, "optional_keys", ()))]
-        keys += [m.noise_key for m in modules if getattr(m, "noise_key", None) is not None]
+        keys = [key for module in modules for key in module.in_keys]
+        for part in (part for module in modules for part in submodels(module)):
+            keys += [*part.optional_keys, *([] if part.noise_key is None else [part.noise_key])]
         own = {*self.recursion_out_keys, *self.carry_keys}
         keys = [key for key in dict.fromkeys(map(unravel_key, keys)) if key not in own]
         return [key for key in keys if tensordict.get(key, None) is not None]
+
+
+def submodels(module: torch.nn.Module) -> list[SubModel]:
+    """Returns the sub-models inside ``module``, also those inside a nested sequence."""
+    return [part for part in module.modules() if isinstance(part, SubModel)]
 
 
 def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.modules.transition import LearnedTransition, UnicycleTransition
+from torch_denkf.modules.transition import LearnedTransition, UnicycleMotion, UnicycleTransition
 
 __all__ = [
     "SubModel",
@@ -20,6 +20,7 @@ __all__ = [
     "deterministic",
     "LearnedTransition",
     "UnicycleTransition",
+    "UnicycleMotion",
     "LearnedObservation",
     "LinearObservation",
     "Select",

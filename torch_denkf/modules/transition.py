@@ -8,10 +8,11 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import nn
 
+from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.stochastic import StochasticMLP
 
-__all__ = ["LearnedTransition", "UnicycleTransition"]
+__all__ = ["LearnedTransition", "UnicycleMotion", "UnicycleTransition"]
 
 
 class _StochasticTransition(SubModel):
@@ -167,8 +168,60 @@ class UnicycleTransition(_StochasticTransition):
             )
         pose, velocity = state.split([3, 2], -1)
         velocity = velocity + self.scale * self._run((velocity - self.loc) / self.scale, tensordict)
-        step = velocity * self.dt
-        heading = pose[..., 2] + 0.5 * step[..., 1]
-        moved = torch.stack([step[..., 0] * heading.cos(), step[..., 0] * heading.sin(), step[..., 1]], -1)
-        tensordict.set(self.out_keys[0], torch.cat([pose + moved, velocity], -1))
+        tensordict.set(self.out_keys[0], _move(pose, velocity, self.dt))
         return tensordict
+
+
+class UnicycleMotion(SubModel):
+    r"""Moves the pose of the last belief with the velocities of the analysis, put *after* an :class:`EnsembleAnalysis`.
+
+    The analysis of an ensemble corrects the pose through sample correlations. Over a long drive the members' poses
+    spread over many metres, and a spurious correlation of :math:`1/\sqrt{E}` between them and the velocity's
+    innovation makes the mean pose jump. This module takes from the analysis the velocities alone and lets the known
+    motion carry each member's pose, which is localisation in the state: an innovation of the velocities at t acts on
+    the step from t-1 to t.
+
+    Use with ``EnsembleAnalysis(..., belief_key="analysis")``, and not with ``update_at_reset``.
+
+    Args:
+        dt: time step in seconds.
+        before_key: ensemble of the belief at t-1, ``[*B, E, 5]``, see :class:`UnicycleTransition`.
+        analysis_key: ensemble of the analysis at t, ``[*B, E, 5]``.
+        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> before, analysis = torch.zeros(2, 5), torch.tensor([[9.0, 9.0, 9.0, 10.0, 0.0]] * 2)
+        >>> td = TensorDict({"belief": {"ensemble": before}, "analysis": {"ensemble": analysis}})
+        >>> UnicycleMotion(0.1)(td)["belief", "mean"].tolist()
+        [1.0, 0.0, 0.0, 10.0, 0.0]
+    """
+
+    def __init__(
+        self,
+        dt: float,
+        *,
+        before_key: NestedKey = ("belief", "ensemble"),
+        analysis_key: NestedKey = ("analysis", "ensemble"),
+        belief_key: str = "belief",
+    ):
+        out_keys = [(belief_key, name) for name in ("ensemble", "mean", "var")]
+        super().__init__(nn.Identity(), [before_key, analysis_key], out_keys)
+        self.dt = dt
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        before, analysis = (self.read(tensordict, key) for key in self.in_keys)
+        ensemble = _move(before[..., :3], analysis[..., 3:], self.dt)
+        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+def _move(pose: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:
+    """The state [x, y, theta, v, theta_dot] after ``dt`` at constant ``velocity``, with the heading at mid-step."""
+    step = velocity * dt
+    heading = pose[..., 2] + 0.5 * step[..., 1]
+    moved = torch.stack([step[..., 0] * heading.cos(), step[..., 0] * heading.sin(), step[..., 1]], -1)
+    return torch.cat([pose + moved, velocity], -1)

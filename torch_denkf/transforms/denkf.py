@@ -14,6 +14,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
+from torch_denkf.filters.base import submodels
 
 __all__ = ["DEnKFTransform"]
 
@@ -95,7 +96,7 @@ class DEnKFTransform(Transform):
         self._dropped_keys = dropped
         self.filter = filter
         self._controls = [key for key in reads if key in filter.control_keys]
-        optional = [key for module in filter._module_iter() for key in getattr(module, "optional_keys", ())]
+        optional = [key for part in submodels(filter.module) for key in part.optional_keys]
         self._optional = list(dict.fromkeys(optional))
 
     # ----------------------------------------------------------------------------------------- in an environment

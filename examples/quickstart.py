@@ -1,0 +1,261 @@
+"""Track a car from its camera: train a DEnKF, append it to an environment, roll out an unseen drive.
+
+    python examples/quickstart.py                                                  # drives that are generated here
+    python examples/quickstart.py --root KITTI --train 00 02 05 --test 09          # real KITTI odometry drives
+
+Four steps, each a function below:
+
+1. ``read_drives``    frames and true states of the drives, in KITTI's layout
+2. ``train_sensor``   the image sensor alone: (v, theta_dot) from a frame and its difference to the one before
+3. ``train_filter``   transition and noise model on drives the sensor has not seen, through 32 steps
+4. ``track``          DEnKFTransform in a replay environment of the test drive, 30 % of the frames missing
+
+It prints a table against the sensor alone and against dead reckoning, and leaves a picture in ``--out``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import Compose, TransformedEnv
+from tqdm import tqdm
+
+from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
+from torch_denkf.envs import KITTIReplayEnv
+from torch_denkf.filters import DEnKF
+from torch_denkf.functional import crps_ensemble
+from torch_denkf.metrics import dead_reckoning, kitti_endpoint_error
+from torch_denkf.modules import (
+    AroundState,
+    DiagonalNoise,
+    EnsembleAnalysis,
+    ImageSensor,
+    Select,
+    StochasticMLP,
+    UnicycleMotion,
+    UnicycleTransition,
+)
+from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.transforms import DEnKFTransform, MissingFrames
+
+ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
+
+
+def read_drives(args: argparse.Namespace) -> tuple[list[TensorDict], TensorDict]:
+    """Returns the training drives and the test drive; generates them where no --root is given."""
+    if args.root is None:
+        args.root = args.out / "drives"
+        args.train, args.test = [f"{i:02d}" for i in range(args.drives)], f"{args.drives:02d}"
+        write_drives(args.root, [*args.train, args.test], frames=args.frames, seed=args.seed)
+    drives = [
+        read_kitti_drive(args.root, name)
+        for name in tqdm([*args.train, args.test], desc="reading drives", disable=None)
+    ]
+    return drives[:-1], drives[-1]
+
+
+def make_filter(frames: TensorDict, dt: float) -> DEnKF:
+    """The paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
+    velocity = frames["state"][:, VELOCITIES]
+    loc, scale = velocity.mean(0), velocity.std(0)
+    return DEnKF(
+        transition=UnicycleTransition(StochasticMLP(2, 2, output_gain=0.1), dt=dt, loc=loc, scale=scale),
+        sensor=ImageSensor(2, image_shape=tuple(frames["pixels"].shape[1:]), loc=loc, scale=scale),
+        observation=Select(VELOCITIES),
+        noise=DiagonalNoise(2, r=0.3 * scale, loc=loc, scale=scale),
+        # Innovations correct the velocities, and each member's pose moves with them.
+        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(dt)),
+        initial=AroundState(INITIAL_STD, ensemble_size=ENSEMBLE),
+    )
+
+
+def mirrored(batch: TensorDict) -> TensorDict:
+    """Flips a random half of the frames left to right, and with them the sign of theta_dot."""
+    flip = torch.rand(batch.shape) < 0.5
+    pixels = torch.where(flip[:, None, None, None], batch["pixels"].flip(-1), batch["pixels"])
+    sign = torch.where(flip[:, None], torch.tensor([1.0, -1.0]), 1.0)
+    return TensorDict({"pixels": pixels, "target": batch["state"][:, VELOCITIES] * sign}, batch.batch_size)
+
+
+def train_sensor(denkf: DEnKF, frames: TensorDict, seconds: float) -> None:
+    """Fits the sensor's samples to the true velocities, scored by the CRPS, for a given time."""
+    sensor, frames = denkf["sensor"], frames[frames["observed"].squeeze(-1)]
+    optimiser = torch.optim.AdamW(sensor.parameters(), lr=1e-3, weight_decay=1e-2)
+    began, share = time.perf_counter(), 0.0
+    with tqdm(desc="training the sensor", unit="step", disable=None) as bar:
+        while share < 1.0:
+            for group in optimiser.param_groups:  # warm up, then decay to zero
+                group["lr"] = 1e-3 * min(10 * share + 0.02, 1.0 - share)
+            batch = mirrored(frames[torch.randint(len(frames), (64,))])
+            samples = sensor(batch)["sensor", "ensemble"]
+            loss = (crps_ensemble(samples, batch["target"]) / sensor.scale).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            share = (time.perf_counter() - began) / seconds
+            bar.update()
+            bar.set_postfix(crps=f"{loss.item():.3f}")
+
+
+def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: int = 32) -> None:
+    """Fits transition and noise model, end to end through ``length`` steps, on the frozen sensor's readings."""
+    with torch.no_grad():  # the sensor reads every frame once; the filter without it trains on these readings
+        readings = [denkf["sensor"](frames.copy()).exclude("pixels") for frames in drives]
+    # Windows start from a velocity that is wrong by as much as velocities vary: a filter that starts at the truth
+    # learns to hold on to it, and not to listen to its sensor.
+    start_std = torch.cat([torch.zeros(3), denkf["sensor"].scale])
+    recursion = DEnKF(
+        sensor=None, **{name: denkf[name] for name in ("transition", "observation", "noise", "analysis")},
+        initial=AroundState(start_std, ensemble_size=ENSEMBLE, state_key="start"),
+    )  # fmt: skip
+    error = torch.cat([r["sensor", "ensemble"].mean(1) - r["state"][:, VELOCITIES] for r in readings])
+    scale = torch.cat([torch.full((3,), torch.inf), error.std(0)])  # the pose follows from the velocities
+    loss = DEnKFLoss(recursion, sensor=0.0, state_scale=scale, angles=[2])
+    optimiser = torch.optim.Adam(recursion.parameters(), lr=2e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=updates)
+    windows = torch.stack([r[i : i + length] for r in readings for i in range(len(r) - length + 1)])
+    windows["is_init"] = torch.zeros_like(windows["is_init"])
+    for _ in (bar := tqdm(range(updates), desc="training the filter", disable=None)):
+        batch = windows[torch.randint(len(windows), (64,))]
+        batch["start"] = batch["state"] + start_std * torch.randn(64, 1, 5)
+        missing = torch.rand(64, 1, 1) * 0.6  # from none to many
+        batch["observed"] = batch["observed"] & (torch.rand(64, length, 1) >= missing)
+        terms = loss(batch)
+        optimiser.zero_grad()
+        sum(terms.values()).backward()
+        torch.nn.utils.clip_grad_norm_(recursion.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        bar.set_postfix({name: f"{value.item():.3f}" for name, value in terms.items()})
+
+
+def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
+    """Appends the filter to the replay of a drive and rolls it out."""
+    env = TransformedEnv(
+        KITTIReplayEnv(drive),
+        Compose(MissingFrames(missing), DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")])),
+    )
+    return env.rollout(len(drive))["next"]
+
+
+def held_readings(rollout: TensorDict, missing_value: torch.Tensor | None) -> torch.Tensor:
+    """The sensor's mean readings [T, 2]; where a frame is missing, ``missing_value`` or the last reading."""
+    readings, last = [], rollout["state"][0, VELOCITIES]
+    for reading, observed in zip(rollout["sensor", "ensemble"].mean(1), rollout["observed"], strict=True):
+        value = reading if observed else (last if missing_value is None else missing_value)
+        readings.append(value)
+        last = value if missing_value is None else last
+    return torch.stack(readings)
+
+
+def compare(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float, window: int) -> tuple[str, dict]:
+    """Scores the filter, the sensor alone and dead reckoning; returns the table and each one's path and velocities."""
+    truth = rollout["state"]
+
+    def integrated(velocity: torch.Tensor) -> torch.Tensor:
+        return torch.cat([dead_reckoning(velocity, truth[0, :3], dt), velocity], -1)
+
+    estimates = {
+        "sensor alone (training mean where a frame is missing)": integrated(held_readings(rollout, mean_velocity)),
+        "dead reckoning (last reading where a frame is missing)": integrated(held_readings(rollout, None)),
+        "**DEnKF**": rollout["belief", "mean"],
+        "floor: dead reckoning with the true velocities": integrated(truth[:, VELOCITIES]),
+    }
+    lines = [
+        f"| | translation, m/m over {window} steps | rotation, deg/m | v, RMSE m/s | theta_dot, RMSE deg/s |",
+        "|---|---|---|---|---|",
+    ]
+    for name, estimate in estimates.items():
+        error = kitti_endpoint_error(estimate[:, :3], truth[:, :3], window=window)
+        v, theta_dot = (estimate - truth)[:, VELOCITIES].square().mean(0).sqrt() * torch.tensor([1.0, 57.2958])
+        lines.append(f"| {name} | {error.translation:.3f} | {error.rotation:.3f} | {v:.2f} | {theta_dot:.2f} |")
+    std = rollout["belief", "var"][:, VELOCITIES].sqrt()
+    inside = ((rollout["belief", "mean"] - truth)[:, VELOCITIES].abs() <= 1.645 * std).float().mean(0) * 100
+    lines.append(f"\nThe DEnKF's 90 % intervals hold {inside[0]:.0f} % of v and {inside[1]:.0f} % of theta_dot.")
+    return "\n".join(lines), estimates
+
+
+def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:
+    """Draws the path on the ground plane with the belief's uncertainty, and the velocities over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    truth, members = rollout["state"], rollout["belief", "ensemble"]
+    sensor, _, belief, _ = estimates.values()
+    fig, axes = plt.subplot_mosaic("pv;pw", figsize=(13, 6), width_ratios=[1, 1.4], layout="constrained")
+    axes["p"].plot(-members[..., 1], members[..., 0], color="tab:blue", alpha=0.08, linewidth=1)
+    for name, path, style in (("truth", truth, "k-"), ("DEnKF", belief, "b-"), ("sensor alone", sensor, "r--")):
+        axes["p"].plot(-path[:, 1], path[:, 0], style, label=name)
+    axes["p"].plot([], [], color="tab:blue", alpha=0.4, label="ensemble members")
+    axes["p"].set(xlabel="right, m", ylabel="forward, m", title="path on the ground plane")
+    axes["p"].axis("equal")
+    axes["p"].legend()
+    seconds = torch.arange(len(truth)) * dt
+    seen = rollout["observed"].squeeze(-1)
+    for axis, dim, unit, factor in (("v", 3, "v, m/s", 1.0), ("w", 4, "theta_dot, deg/s", 57.2958)):
+        mean = belief[:, dim] * factor
+        band = 1.645 * rollout["belief", "var"][:, dim].sqrt() * factor
+        reading = rollout["sensor", "ensemble"][..., dim - 3].mean(1) * factor
+        axes[axis].fill_between(
+            seconds, mean - band, mean + band, color="tab:blue", alpha=0.25, label="90 % of the belief"
+        )
+        axes[axis].plot(seconds[seen], reading[seen], "r.", markersize=3, label="sensor readings")
+        axes[axis].plot(seconds, truth[:, dim] * factor, "k-", linewidth=1, label="truth")
+        axes[axis].plot(seconds, mean, "b-", linewidth=1, label="DEnKF")
+        axes[axis].set(xlabel="s", ylabel=unit)
+    axes["v"].legend(ncols=4, loc="lower center")
+    fig.suptitle(f"Unseen drive, {100 * (1 - seen.float().mean()):.0f} % of the frames missing")
+    fig.savefig(file, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, help="folder in KITTI odometry layout; drives are generated without it")
+    parser.add_argument("--train", nargs="+", help="drives to train on; the last trains the filter alone")
+    parser.add_argument("--test", help="unseen drive")
+    parser.add_argument("--missing", type=float, default=0.3, help="probability that a test frame is missing")
+    parser.add_argument("--sensor-seconds", type=float, default=90.0, help="training time of the sensor")
+    parser.add_argument("--updates", type=int, default=200, help="training steps of the filter")
+    parser.add_argument("--drives", type=int, default=8, help="generated drives to train on")
+    parser.add_argument("--frames", type=int, default=300, help="frames of a generated drive")
+    parser.add_argument("--window", type=int, default=100, help="steps of the endpoint error")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/quickstart"))
+    parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
+    args = parser.parse_args()
+    if args.smoke:
+        args.sensor_seconds, args.updates, args.drives, args.frames, args.window = 2.0, 5, 3, 60, 20
+        args.out = args.out / "smoke"
+    if args.root is not None and (not args.train or len(args.train) < 2 or not args.test):
+        parser.error("--root needs --train with two drives or more, and --test")
+    torch.manual_seed(args.seed)
+    args.out.mkdir(parents=True, exist_ok=True)
+
+    training, test = read_drives(args)
+    dt = float(test["dt"][0])
+    frames = [drive_frames(drive) for drive in training]
+    held = 1 if len(frames) < 6 else 2  # drives that the sensor does not see, so that its errors there are honest
+    sensor_frames = torch.cat(frames[:-held])
+    denkf = make_filter(sensor_frames, dt)
+    train_sensor(denkf, sensor_frames, args.sensor_seconds)
+    train_filter(denkf, frames[-held:], args.updates)
+    rollout = track(denkf, test, args.missing)
+    table, estimates = compare(rollout, denkf["sensor"].loc, dt, args.window)
+    draw(rollout, estimates, dt, args.out / "quickstart.png")
+    (args.out / "table.md").write_text(table + "\n")
+    print(
+        f"\nUnseen drive {args.test}, {args.missing:.0%} of the frames missing:\n\n{table}\n\n"
+        f"Picture: {args.out / 'quickstart.png'}"
+    )
+
+
+if __name__ == "__main__":
+    main()
