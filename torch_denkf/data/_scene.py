@@ -9,83 +9,19 @@ business.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from torch_denkf.data import _textures as textures
+from torch_denkf.data._camera import Camera, ground_homography
 
 RESOLUTION = 0.1  # m for each pixel of the ground's texture
 PATCH = 1536  # pixels: the piece of ground that is drawn at a time, 154 m wide
 GRID = 16.0  # m: a new piece is drawn when the camera has moved that far
 HAZE = 140.0  # m: distance at which haze hides 63 %
 NEAR, FAR = 1.0, 90.0  # m
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera; pixel centres are at whole numbers.
-
-    Attributes:
-        size: (H, W) in pixels.
-        fx: focal length in pixels of the width; fy of the height; (cx, cy) the principal point.
-        height: of the camera above the ground, in m.
-    """
-
-    size: tuple[int, int]
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    height: float = 1.65
-
-    @classmethod
-    def kitti(cls, size: tuple[int, int]) -> Camera:
-        """KITTI's left colour camera (1242 x 375), scaled to ``size``."""
-        height, width = size
-        return cls(
-            size=(height, width),
-            fx=721.5 * width / 1242,
-            fy=721.5 * height / 375,
-            cx=610.1 * width / 1242 - 0.5,
-            cy=173.4 * height / 375 - 0.5,
-        )
-
-    def supersampled(self, down: int, across: int) -> Camera:
-        """The same camera with ``down`` x ``across`` pixels for each one."""
-        return dataclasses.replace(
-            self,
-            size=(self.size[0] * down, self.size[1] * across),
-            fx=self.fx * across,
-            fy=self.fy * down,
-            cx=(self.cx + 0.5) * across - 0.5,
-            cy=(self.cy + 0.5) * down - 0.5,
-        )
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """Intrinsics, ``[3, 3]``."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
-
-
-def ground_homography(camera: Camera, pose: np.ndarray, origin=(0.0, 0.0), scale: float = 1.0) -> np.ndarray:
-    """Homography from ground coordinates to pixels.
-
-    Args:
-        camera: the camera.
-        pose: camera-to-world matrix, ``[3, 4]``.
-        origin: (x, z) of ground coordinate (0, 0), in m.
-        scale: m for each unit of the ground coordinates.
-
-    Returns:
-        ``[3, 3]``, from (x, z, 1) to homogeneous pixels, whose third entry is the depth in m.
-    """
-    rotation, position = pose[:, :3], pose[:, 3]
-    plane = np.array([[scale, 0, origin[0]], [0, 0, camera.height], [0, scale, origin[1]]])
-    plane[:, 2] -= position
-    return camera.matrix @ rotation.T @ plane
 
 
 @dataclass

@@ -19,8 +19,9 @@ import cv2
 import numpy as np
 
 from torch_denkf.data import _textures as textures
+from torch_denkf.data._camera import Camera
 from torch_denkf.data._kitti_files import DEFAULT_DT, state_to_poses, write_poses
-from torch_denkf.data._scene import Box, Camera, Card, Renderer, Scene
+from torch_denkf.data._scene import Box, Card, Renderer, Scene
 
 __all__ = ["random_drive", "roadside_scene", "write_drives"]
 
@@ -30,7 +31,7 @@ _MARKER = "drive.json"
 
 def write_drives(
     root: str | Path,
-    names: Iterable[str],
+    names: str | Iterable[str],
     *,
     frames: int = 300,
     size: tuple[int, int] = (50, 150),
@@ -44,7 +45,7 @@ def write_drives(
 
     Args:
         root: folder to write ``sequences/NAME/image_2``, ``calib.txt``, ``times.txt`` and ``poses/NAME.txt`` to.
-        names: names of the drives; each is another road.
+        names: names of the drives, or one name; each is another road.
         frames: images of a drive, at 0.103 s.
         size: (H, W) of the images; the field of view is KITTI's.
         seed: another seed gives other drives of the same names.
@@ -58,14 +59,15 @@ def write_drives(
         FileExistsError: if there is another drive of that name.
 
     Examples:
-        >>> folder = getfixture("tmp_path")
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
         >>> write_drives(folder, ["town"], frames=5)
         ['town']
         >>> from torch_denkf.data import read_kitti_drive
         >>> read_kitti_drive(folder, "town", cache=None)["image"].shape
         torch.Size([5, 3, 50, 150])
     """
-    root, names = Path(root).expanduser(), list(names)
+    root, names = Path(root).expanduser(), [names] if isinstance(names, str) else list(names)
     if frames < 2:
         raise ValueError(f"a drive needs at least 2 frames, got {frames}")
     for name in names:

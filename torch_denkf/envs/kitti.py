@@ -65,7 +65,8 @@ class KITTIReplayEnv(EnvBase):
 
     Examples:
         >>> from torch_denkf.data import write_drives
-        >>> folder = getfixture("tmp_path")
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
         >>> write_drives(folder, ["town"], frames=20)
         ['town']
         >>> env = KITTIReplayEnv(folder, "town", batch_size=[2], start=[0, 5], length=10, cache=None)
