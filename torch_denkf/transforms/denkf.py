@@ -42,7 +42,8 @@ class DEnKFTransform(Transform):
         initial: the initial belief of a plain ``TensorDictSequential``.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
         store_ensemble: if ``False``, rollouts and collected data hold the belief's mean and variance alone; the
-            ensemble still flows from step to step. Only outside a ``SerialEnv`` or ``ParallelEnv``.
+            ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
+            collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
         check_finite: whether a non-finite observation, forecast or belief raises. Costs one synchronisation a step.
@@ -94,6 +95,7 @@ class DEnKFTransform(Transform):
             out_keys=[key for key in self._keep if key not in dropped],
         )
         self._dropped_keys = dropped
+        self._names = {key: (*key[:-1], "_" + key[-1]) if key in dropped else key for key in self._keep}
         self.filter = filter
         self._controls = [key for key in reads if key in filter.control_keys]
         optional = [key for part in submodels(filter.module) for key in part.optional_keys]
@@ -107,10 +109,11 @@ class DEnKFTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         row = next_tensordict.empty()
         for key in self.filter.carry_keys:
-            value = tensordict.get(key, None)
+            name = self._names[key]
+            value = tensordict.get(name, None)
             if value is None:
                 raise KeyError(
-                    f"DEnKFTransform carries the belief in {key!r}, but the tensordict passed to env.step() lacks it. "
+                    f"DEnKFTransform carries the belief in {name!r}, but the tensordict passed to env.step() lacks it. "
                     "Start from env.reset(), and pass on what step_mdp() or env.step_and_maybe_reset() return."
                 )
             row.set(key, value)
@@ -124,8 +127,8 @@ class DEnKFTransform(Transform):
             row = self.filter.step(row)
         if self.check_finite:
             self._assert_finite(row)
-        for key in self._keep:
-            next_tensordict.set(key, row.get(key))
+        for key, name in self._names.items():
+            next_tensordict.set(name, row.get(key))
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -142,8 +145,10 @@ class DEnKFTransform(Transform):
             for key, value in given.items():
                 start.set(key, value if mask is None else _where(mask, start.get(key), value))
             start = self.filter.summarise(start)
-        for key in self._keep:
-            tensordict_reset.set(key, start.get(key))
+        if self.check_finite:
+            self._assert_finite(start)
+        for key, name in self._names.items():
+            tensordict_reset.set(name, start.get(key))
         return tensordict_reset
 
     def _reset_on_native_autoreset(self, tensordict, tensordict_reset):
@@ -229,9 +234,18 @@ class DEnKFTransform(Transform):
     # --------------------------------------------------------------------------------------------------- storage
 
     def _post_step_mdp_hooks(self, tensordict, tensordict_):
-        # What is stored loses the ensemble; what flows on to the next step keeps it.
-        stored = tensordict.exclude(*self._dropped_keys, *(("next", *key) for key in self._dropped_keys))
-        return stored, tensordict_
+        # What is stored loses the ensemble, in place, because that is what collectors look at; what flows on to the
+        # next step gets it here, because torchrl's step_mdp takes over what the specs hold, and no more.
+        if not self._dropped_keys:
+            return tensordict, tensordict_
+        names = [self._names[key] for key in self._dropped_keys]
+        next_names = [unravel_key(("next", name)) for name in names]
+        tensordict_ = tensordict_.copy()  # the two may share sub-tensordicts
+        values = [tensordict.get(name) for name in next_names]
+        tensordict.exclude(*names, *next_names, inplace=True)
+        for name, value in zip(names, values, strict=True):
+            tensordict_.set(name, value)
+        return tensordict, tensordict_
 
     def _check_batched_worker_compat(self) -> None:
         if not self.store_ensemble:

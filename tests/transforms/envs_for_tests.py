@@ -1,0 +1,58 @@
+"""Environments for tests; importable, so that worker processes find them."""
+
+import torch
+from torchrl.envs import TransformedEnv
+
+from tests.filters.factories import A, M, S, linear_denkf, linear_system, toy_denkf
+from torch_denkf.envs.linear import LinearGaussianEnv
+from torch_denkf.modules import GaussianPrior
+from torch_denkf.transforms import DEnKFTransform
+
+PRIOR_MEAN = [0.5, -0.25]
+
+
+def base_env(**kwargs):
+    """The system of :func:`linear_system` as an environment; emits "observation", "observed" and "state"."""
+    F, Q, H, R = linear_system()
+    return LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), **kwargs)
+
+
+def known_start_filter(**kwargs):
+    """A noisy ensemble filter whose prior has no spread: the belief after a reset is known exactly."""
+    prior = GaussianPrior(PRIOR_MEAN, [0.0, 0.0], ensemble_size=6)
+    return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
+
+
+def fixed_filter(**kwargs):
+    """An ensemble filter without any randomness."""
+    return linear_denkf("etkf", **kwargs)
+
+
+def random_filter(**kwargs):
+    """An ensemble filter with a random prior, random forecasts and random perturbations."""
+    prior = GaussianPrior(PRIOR_MEAN, [1.0, 1.0], ensemble_size=6)
+    return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
+
+
+def filtered_env(make_filter=known_start_filter, *, transform=None, **kwargs):
+    """The transform right on the environment."""
+    return TransformedEnv(base_env(**kwargs), DEnKFTransform(make_filter(), **(transform or {})))
+
+
+def toy_base_env(**kwargs):
+    """A stable system with S states, M measurements and A actions, for :func:`toy_denkf`."""
+    generator = torch.Generator().manual_seed(0)
+    matrix = 0.5 * torch.randn(S, S, generator=generator)
+    return LinearGaussianEnv(
+        matrix / torch.linalg.matrix_norm(matrix, 2).clamp_min(1.0),
+        torch.randn(M, S, generator=generator),
+        [0.3] * S,
+        [0.1] * M,
+        control=torch.randn(S, A, generator=generator),
+        **kwargs,
+    )
+
+
+def toy_filter(**kwargs):
+    """Four learned sub-models that read "observation"."""
+    return toy_denkf(in_key="observation", **kwargs)
