@@ -24,6 +24,7 @@ class MissingFrames(Transform):
 
     Raises:
         ValueError: if ``p`` is no probability.
+        KeyError: if an entry of the frame is missing.
 
     Example:
         >>> from tensordict import TensorDict
@@ -51,7 +52,10 @@ class MissingFrames(Transform):
         observed = next_tensordict.get(self.observed_key, None)
         next_tensordict.set(self.observed_key, kept if observed is None else observed & kept)
         for key in self.in_keys:
-            frame = next_tensordict.get(key)
+            frame = next_tensordict.get(key, None)
+            if frame is None:
+                present = sorted(map(str, next_tensordict.keys(True, True)))
+                raise KeyError(f"MissingFrames drops {key!r}, which is not there; there are {present}. Set in_keys=.")
             mask = kept.reshape(*next_tensordict.batch_size, *(1,) * (frame.ndim - next_tensordict.ndim))
             next_tensordict.set(key, torch.where(mask, frame, torch.zeros_like(frame)))
         return next_tensordict

@@ -1,0 +1,99 @@
+"""Oracles: the discrete Lyapunov equation, the binomial distribution, the recursion written out."""
+
+import pytest
+import torch
+from torchrl.envs import check_env_specs
+
+from torch_denkf.envs.linear import LinearGaussianEnv
+
+F = torch.tensor([[0.9, 0.3], [-0.2, 0.7]])
+H = torch.tensor([[1.0, 0.5], [0.0, 1.0], [1.0, -1.0]])
+
+
+def make(**kwargs):
+    return LinearGaussianEnv(F, H, [0.3, 0.5], [0.1, 0.2, 0.4], **kwargs)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("missing", [0.0, 0.5])
+def test_specs(batch, missing):
+    check_env_specs(make(batch_size=batch, missing=missing, control=torch.ones(2, 4)))
+
+
+def test_stationary_moments():
+    # From the stationary distribution N(0, P), P = F P F' + Q; 20,000 independent rows.
+    n = 20_000
+    Q, R = torch.diag(torch.tensor([0.09, 0.25])), torch.diag(torch.tensor([0.01, 0.04, 0.16]))
+    kron = torch.eye(4) - torch.kron(F, F)
+    P = torch.linalg.solve(kron, Q.flatten()).reshape(2, 2)
+    torch.testing.assert_close(F @ P @ F.mT + Q, P)
+    last = make(batch_size=[n], max_steps=1000).rollout(60)["next"][:, -1]  # 0.85^60 = 6e-5 of the start is left
+
+    def close(samples, covariance):
+        """Sample covariances have variance (C_ii C_jj + C_ij^2) / n."""
+        sample = samples.mT @ samples / n
+        diagonal = covariance.diagonal()
+        error = ((diagonal.outer(diagonal) + covariance**2) / n).sqrt()
+        assert ((sample - covariance).abs() < 5 * error).all()
+        assert (samples.mean(0).abs() < 5 * (diagonal / n).sqrt()).all()
+
+    close(last["state"], P)
+    close(last["observation"], H @ P @ H.mT + R)
+    close(last["observation"] - last["state"] @ H.mT, R)
+
+
+def test_transition_and_control_without_noise():
+    control = torch.tensor([[1.0], [-2.0]])
+    env = LinearGaussianEnv(F, H, [0.0, 0.0], [0.0] * 3, control=control, batch_size=[3])
+    rollout = env.rollout(6)
+    state, action = rollout["state"], rollout["action"]
+    torch.testing.assert_close(rollout["next", "state"], state @ F.mT + action @ control.mT)
+    torch.testing.assert_close(rollout["observation"], state @ H.mT)
+    assert rollout["next", "state"][:, :-1].equal(state[:, 1:])
+
+
+def test_initial_state():
+    state = make(batch_size=[20_000], initial_std=[0.5, 3.0]).reset()["state"]
+    # The standard error of a standard deviation is sigma / sqrt(2 n).
+    assert ((state.std(0) / torch.tensor([0.5, 3.0]) - 1).abs() < 5 / 40_000**0.5).all()
+
+
+def test_seeds():
+    def run(set_seed=None, **kwargs):
+        env = make(batch_size=[2], missing=0.3, **kwargs)
+        if set_seed is not None:
+            env.set_seed(set_seed)
+        torch.manual_seed(0)  # of the random actions
+        return env.rollout(5)["next", "state"]
+
+    assert run(1).equal(run(1))
+    assert not run(1).equal(run(2))
+    assert run(seed=3).equal(run(seed=3))
+    assert not run(seed=3).equal(run(seed=4))
+    state = torch.get_rng_state()
+    make().reset()
+    assert torch.get_rng_state().equal(state), "its own generator"
+
+
+def test_missing_readings():
+    rollout = make(batch_size=[200], missing=0.3).rollout(100)
+    observed = rollout["observed"].squeeze(-1)
+    n = observed.numel()
+    assert abs((~observed).sum() - 0.3 * n) < 5 * (n * 0.3 * 0.7) ** 0.5
+    assert rollout["observation"].isnan().all(-1).equal(~observed)
+    assert rollout["observation"].isnan().any(-1).equal(~observed)
+
+
+def test_episode_lengths_of_rows():
+    rollout = make(batch_size=[3], max_steps=[2, 3, 50]).rollout(7, break_when_any_done=False)
+    done = rollout["next", "done"].squeeze(-1)
+    assert [(row.nonzero().flatten() + 1).tolist() for row in done] == [[2, 4, 6], [3, 6], []]
+    assert rollout["next", "truncated"].equal(rollout["next", "done"])
+    assert not rollout["next", "terminated"].any()
+    assert make(max_steps=4).rollout(50).shape == (4,)
+
+
+def test_float64(float64):
+    env = LinearGaussianEnv(F.double(), H.double(), [0.3, 0.5], [0.1, 0.2, 0.4])
+    check_env_specs(env)
+    assert env.rollout(2)["next", "observation"].dtype == torch.float64

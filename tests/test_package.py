@@ -1,0 +1,80 @@
+"""The package as a user gets it: what a wheel holds, and what an import costs."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Built from a copy: setuptools writes build/ and *.egg-info beside the sources."""
+    source = tmp_path_factory.mktemp("source")
+    files = ["setup.py", "pyproject.toml", "README.md", "LICENSE", "torch_denkf", "modules", "tests", "benchmarks"]
+    names = [name for name in [*files, "examples"] if (ROOT / name).exists()]
+    pack = subprocess.Popen(["tar", "-C", ROOT, "-c", "--exclude=__pycache__", *names], stdout=subprocess.PIPE)
+    subprocess.run(["tar", "-C", source, "-x"], stdin=pack.stdout, check=True)
+    assert pack.wait() == 0
+    out = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", out, source]
+    subprocess.run(command, check=True, capture_output=True, cwd=out)
+    (path,) = out.glob("*.whl")
+    with zipfile.ZipFile(path) as archive:
+        yield archive
+
+
+# All that needs the wheel is in one test, so that pytest-xdist builds it in one process alone.
+def test_point_10_the_wheel_holds_the_package_alone(wheel):
+    names = wheel.namelist()
+    top = {name.split("/")[0] for name in names}
+    (info,) = (name for name in top if name.endswith(".dist-info"))
+    assert top == {"torch_denkf", info}
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "torch_denkf").rglob("*.py")}
+    assert {name for name in names if name.startswith("torch_denkf/")} == sources
+    assert any(name.startswith(info) and name.endswith("LICENSE") for name in names)
+    metadata = wheel.read(f"{info}/METADATA").decode()
+    assert "License-Expression: MIT" in metadata or "License: MIT" in metadata
+    assert "License-File: LICENSE" in metadata
+    for pin in ("torch<2.14,>=2.13", "torchrl<0.15,>=0.14.1", "tensordict<0.15,>=0.14.3", "mujoco<4"):
+        assert f"Requires-Dist: {pin}" in metadata
+    assert "Name: torch_denkf" in metadata or "Name: torch-denkf" in metadata
+
+
+def test_modules_is_a_relative_link():
+    link = ROOT / "modules"
+    assert link.is_symlink()
+    assert link.readlink() == Path("torch_denkf/modules")
+    assert (link / "stochastic.py").samefile(ROOT / "torch_denkf" / "modules" / "stochastic.py")
+
+
+@pytest.mark.parametrize(
+    ("packages", "may"),
+    [
+        (["functional", "metrics"], set()),
+        (["functional", "metrics", "modules", "filters", "transforms", "objectives"], {"mujoco"}),
+        (["data", "envs"], {"mujoco", "cv2"}),
+    ],
+)
+def test_importing_costs_no_simulator_and_no_opencv(packages, may):
+    # torchrl.envs itself imports mujoco where it is installed; data sets and their environments read images.
+    code = f"""
+import sys
+if {"mujoco" in may}:
+    import torchrl.envs
+before = set(sys.modules)
+{"".join(f"import torch_denkf.{name};" for name in packages)}
+print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib', 'tqdm'}} & (set(sys.modules) - before)))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(result.stdout.split()) <= may - {"mujoco"}
+
+
+def test_every_public_name_is_there():
+    for name in ("functional", "metrics", "modules", "filters", "transforms", "objectives", "data", "envs"):
+        package = __import__(f"torch_denkf.{name}", fromlist=["*"])
+        for public in getattr(package, "__all__", ()):
+            assert hasattr(package, public), f"torch_denkf.{name}.{public}"

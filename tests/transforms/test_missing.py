@@ -1,0 +1,110 @@
+"""Oracle: the binomial distribution, five standard deviations."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.transforms import MissingFrames
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
+def test_rate_mask_and_zeros(p):
+    n = 20_000
+    td = TensorDict({"pixels": torch.rand(n, 2, 3, 3) + 0.1, "gps": torch.rand(n, 2) + 0.1}, [n])
+    out = MissingFrames(p, in_keys=["pixels", "gps"])(td.clone())
+    observed = out["observed"].squeeze(-1)
+    assert abs((~observed).sum() - n * p) <= 5 * (n * p * (1 - p)) ** 0.5
+    for key in ("pixels", "gps"):
+        assert (out[key][~observed] == 0).all()
+        assert out[key][observed].equal(td[key][observed])
+
+
+def test_frames_are_dropped_independently():
+    observed = MissingFrames(0.5)(TensorDict({"pixels": torch.ones(100_001, 1, 1, 1)}, [100_001]))["observed"]
+    both = (observed[1:] & observed[:-1]).float().mean()
+    assert abs(both - 0.25) < 5 * (3 * 0.25 * 0.75 / 100_000) ** 0.5  # overlapping pairs: at most three times
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_what_is_missing_already_stays_missing(width):
+    before = torch.rand(5000, width) < 0.5
+    td = TensorDict({"gps": torch.ones(5000, 2), "observed": before}, [5000])
+    out = MissingFrames(0.3, in_keys=["gps"])(td.clone())
+    assert not (out["observed"] & ~before).any()
+    kept = (out["gps"] != 0).any(-1, keepdim=True)
+    assert out["observed"].equal(before & kept)
+    assert abs((~kept).sum() - 1500) < 5 * (5000 * 0.3 * 0.7) ** 0.5
+
+
+def test_integer_images_and_nan():
+    td = TensorDict(
+        {"pixels": torch.full((4, 1, 2, 2), 200, dtype=torch.uint8), "gps": torch.full((4, 2), torch.nan)}, [4]
+    )
+    out = MissingFrames(1.0, in_keys=["pixels", "gps"])(td)
+    assert out["pixels"].dtype == torch.uint8
+    assert (out["pixels"] == 0).all()
+    assert (out["gps"] == 0).all()
+
+
+def test_generator():
+    def draw(seed):
+        transform = MissingFrames(0.5, generator=torch.Generator().manual_seed(seed))
+        return transform(TensorDict({"pixels": torch.ones(100, 1, 1, 1)}, [100]))["observed"]
+
+    state = torch.get_rng_state()
+    assert draw(1).equal(draw(1))
+    assert not draw(1).equal(draw(2))
+    assert torch.get_rng_state().equal(state)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_in_an_environment(batch):
+    env = TransformedEnv(base_env(batch_size=batch, missing=0.3), MissingFrames(0.4, in_keys=["observation"]))
+    check_env_specs(env)
+    rollout = env.rollout(100)
+    observed = rollout["observed"].squeeze(-1)
+    n, p = observed.numel(), 1 - 0.7 * 0.6
+    assert abs((~observed).sum() - n * p) < 5 * (n * p * (1 - p)) ** 0.5
+    # Readings that the environment lost are NaN, those that the transform dropped are zero.
+    missing = rollout["observation"][~observed]
+    assert ((missing == 0) | missing.isnan()).all()
+    assert rollout["observation"][observed].isfinite().all()
+    assert (rollout["observation"][observed] != 0).all()
+    # The frame of a reset counts like any other.
+    resets = torch.stack([env.reset()["observed"] for _ in range(60)])
+    assert resets.any()
+    assert not resets.all()
+
+
+def test_adds_the_mask_to_the_specs():
+    env = TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"], observed_key="seen"))
+    check_env_specs(env)
+    assert env.observation_spec["seen"].shape == (1,)
+    assert env.rollout(3)["seen"].dtype == torch.bool
+    batched = SerialEnv(
+        2, lambda: TransformedEnv(ContinuousActionVecMockEnv(), MissingFrames(0.5, in_keys=["observation"]))
+    )
+    check_env_specs(batched)
+
+
+def test_in_a_replay_buffer():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=MissingFrames(1.0, in_keys=["gps"]), batch_size=4)
+    buffer.extend(TensorDict({"gps": torch.ones(10, 2)}, [10]))
+    sample = buffer.sample()
+    assert (sample["gps"] == 0).all()
+    assert not sample["observed"].any()
+
+
+@pytest.mark.parametrize("p", [-0.1, 1.1])
+def test_no_probability(p):
+    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
+        MissingFrames(p)
+
+
+def test_missing_key_is_named():
+    with pytest.raises(KeyError, match="'pixels'"):
+        MissingFrames(0.5)(TensorDict({"gps": torch.ones(2)}))
