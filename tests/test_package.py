@@ -67,7 +67,7 @@ if {"mujoco" in may}:
     import torchrl.envs
 before = set(sys.modules)
 {"".join(f"import torch_denkf.{name};" for name in packages)}
-print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib', 'tqdm'}} & (set(sys.modules) - before)))
+print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib'}} & (set(sys.modules) - before)))
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert set(result.stdout.split()) <= may - {"mujoco"}

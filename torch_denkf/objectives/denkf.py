@@ -253,8 +253,8 @@ class DEnKFLoss(LossModule):
     def _entry(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         value = tensordict.get(key, None)
         if value is None:
+            present = ", ".join(sorted(map(str, tensordict.keys(True, True))))
             raise KeyError(
-                f"DEnKFLoss reads {key!r}, which is missing; there are {sorted(map(str, tensordict.keys(True, True)))}. "
-                "Rename it with loss.set_keys(...)."
+                f"DEnKFLoss reads {key!r}, which is missing; there are {present}. Rename it with loss.set_keys(...)."
             )
         return value
