@@ -36,6 +36,8 @@ from torch_denkf.modules import (
     ImageSensor,
     LinearObservation,
     Select,
+    UnicycleMotion,
+    UnicycleTransition,
 )
 from torch_denkf.transforms import DEnKFTransform
 
@@ -387,6 +389,41 @@ def test_modules_are_sorted_by_their_keys_whatever_their_order(float64):
     )
     assert other.frame_modules == [filter["sensor"], filter["noise"]]
     assert_equal(other.sequence(frames.copy()), filter.sequence(frames.copy()), filter.out_keys)
+
+
+def test_nested_sequences_are_the_flat_filter(float64):
+    flat = toy_denkf("perturbed")
+    front = TensorDictSequential(flat["sensor"], flat["noise"])
+    back = TensorDictSequential(flat["observation"], TensorDictSequential(flat["analysis"]))
+    nested = Filter(front, flat["transition"], back, initial=flat.initial)
+    frames = toy_frames((3, 9), masks=OBS)
+    nested.draw_noise(frames)
+    assert set(frames["noise"].keys()) == {"sensor", "initial", "transition", "analysis"}
+    assert_equal(nested.sequence(frames.copy()), flat.sequence(frames.copy()), flat.out_keys)
+    assert_equal(stepwise(nested, frames), nested.sequence(frames.copy()), BELIEF, atol=1e-12)
+
+
+def test_motion_behind_the_analysis(float64):
+    # The velocities of every step are those of the analysis, and the pose is their sum from the start.
+    members = torch.randn(6, 5)
+    filter = DEnKF(
+        UnicycleTransition(torch.nn.Linear(2, 2), 0.1),
+        None,
+        Select([3, 4]),
+        ConstantNoise([0.5, 0.5], in_key="y"),
+        TensorDictSequential(EnsembleAnalysis("etkf", sensor_key="y", belief_key="analysis"), UnicycleMotion(0.1)),
+        initial=FixedEnsemble(members),
+    )
+    frames = TensorDict({"y": torch.randn(3, 9, 2), "is_init": torch.zeros(3, 9, 1, dtype=torch.bool)}, [3, 9])
+    frames["is_init"][:, 0] = frames["is_init"][1, 4] = True
+    out = filter.sequence(frames.copy())
+    assert_equal(stepwise(filter, frames), out, BELIEF)
+    belief, velocity = out["belief", "ensemble"], out["analysis", "ensemble"][..., 3:]
+    going = ~frames["is_init"].squeeze(-1)
+    assert belief[..., 3:][going].equal(velocity[going])
+    heading = members[:, 2] + 0.1 * velocity[0, 1:, :, 1].sum(0)
+    torch.testing.assert_close(belief[0, -1, :, 2], heading, rtol=0, atol=1e-13)
+    assert belief[1, 4].equal(members)
 
 
 def test_unrelated_initial_belief():

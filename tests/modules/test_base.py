@@ -24,6 +24,7 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     StochasticMLP,
+    UnicycleMotion,
     UnicycleTransition,
     VectorSensor,
 )
@@ -47,6 +48,11 @@ CASES = {
         lambda **k: UnicycleTransition(StochasticMLP(2, 2, (8,)), 0.1, ensemble_size=E, **k),
         {"in_key": ("a", "x"), "out_key": "f", "noise_key": "n"},
         {("a", "x"): (E, S)},
+    ),
+    "unicycle motion": (
+        lambda **k: UnicycleMotion(0.1, **k),
+        {"before_key": ("a", "x"), "analysis_key": "z", "belief_key": "b"},
+        {("a", "x"): (E, S), "z": (E, S)},
     ),
     "select": (lambda **k: Select([3, 4], **k), {"in_key": "x", "out_key": ("p", "q")}, {"x": (E, S)}),
     "linear observation": (
@@ -187,6 +193,7 @@ def test_missing_key_is_named(name):
 
 
 NO_NOISE = {
+    "unicycle motion",
     "select",
     "linear observation",
     "learned observation",

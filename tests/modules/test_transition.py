@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.modules import LearnedTransition, UnicycleTransition
+from torch_denkf.modules import LearnedTransition, UnicycleMotion, UnicycleTransition
 
 BATCHES = [(), (3,), (2, 3)]
 
@@ -113,3 +113,25 @@ def test_unicycle_gradients(float64):
 def test_unicycle_needs_five_dimensions():
     with pytest.raises(ValueError, match="4 state dimensions"):
         forecast(UnicycleTransition(still, 0.1), torch.zeros(2, 4))
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_belief(float64, batch):
+    before, analysis = torch.randn(*batch, 6, 5), torch.randn(*batch, 6, 5)
+    td = TensorDict({"belief": {"ensemble": before}, "analysis": {"ensemble": analysis}}, batch)
+    out = UnicycleMotion(0.5)(td)["belief"]
+    v, w = analysis[..., 3], analysis[..., 4]
+    x, y, theta = before[..., :3].unbind(-1)
+    angle = theta + 0.25 * w
+    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
+    torch.testing.assert_close(out["ensemble"], expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(out["mean"], expected.mean(-2), rtol=0, atol=1e-14)
+    torch.testing.assert_close(out["var"], expected.var(-2), rtol=0, atol=1e-13)
+
+
+def test_motion_of_an_unchanged_forecast_is_the_forecast(float64):
+    # Where the analysis changes nothing, motion and transition agree.
+    state = torch.randn(6, 5)
+    moved = forecast(UnicycleTransition(still, 0.1), state)
+    td = TensorDict({"belief": {"ensemble": state}, "analysis": {"ensemble": moved}})
+    torch.testing.assert_close(UnicycleMotion(0.1)(td)["belief", "ensemble"], moved, rtol=0, atol=1e-15)
