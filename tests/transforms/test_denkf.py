@@ -559,6 +559,25 @@ def test_reset_of_some_rows_leaves_the_others(float64):
     assert (after["var"][1] == 0).all()
 
 
+@pytest.mark.parametrize("shape", [(3,), (3, 1)])
+def test_reset_mask_of_the_transform_alone(float64, shape):
+    # An environment merges the rows once more; the transform does not rely on it.
+    given = torch.randn(3, 6, 2)
+    mask = torch.tensor([False, True, False]).reshape(shape)
+    td = TensorDict({("belief", "ensemble"): given, "_reset": mask}, [3])
+    observed = TensorDict({"observation": torch.zeros(3, 2)}, [3])
+    transform = DEnKFTransform(known_start_filter())
+    out = transform._reset(td, observed.copy())
+    expected = given.clone()
+    expected[1] = torch.tensor(PRIOR_MEAN)
+    # Environments that reset by themselves hand over one tensordict for both.
+    both = td.copy().update(observed)
+    assert transform._reset_on_native_autoreset(both, both)["belief", "ensemble"].equal(expected)
+    assert out["belief", "ensemble"].equal(expected)
+    torch.testing.assert_close(out["belief", "mean"], expected.mean(-2), rtol=0, atol=1e-15)
+    torch.testing.assert_close(out["belief", "var"], expected.var(-2), rtol=0, atol=1e-15)
+
+
 def test_nested_reset_key(float64):
     # done and _reset inside of a group, as in multi-agent environments: the mask is agent-wise.
     env = TransformedEnv(

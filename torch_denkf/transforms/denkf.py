@@ -31,7 +31,8 @@ class DEnKFTransform(Transform):
     The belief is part of the observation spec and of the state spec, so batched environments, collectors, partial
     resets and replay buffers carry it; nothing is kept on the transform. A belief that is passed to
     ``env.reset(tensordict)`` without a ``"_reset"`` mask is taken as the prior. Randomness comes from torch's global
-    generator and does not depend on ``.training``.
+    generator and does not depend on ``.training``. Workers differ; those that are *forked* (spawning is torchrl's
+    default) start from copies of one generator and draw the same noise until ``env.set_seed`` is called.
 
     In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
     :class:`~torch_denkf.filters.Filter`.
@@ -240,7 +241,6 @@ class DEnKFTransform(Transform):
             return tensordict, tensordict_
         names = [self._names[key] for key in self._dropped_keys]
         next_names = [unravel_key(("next", name)) for name in names]
-        tensordict_ = tensordict_.copy()  # the two may share sub-tensordicts
         values = [tensordict.get(name) for name in next_names]
         tensordict.exclude(*names, *next_names, inplace=True)
         for name, value in zip(names, values, strict=True):
