@@ -42,3 +42,19 @@ def test_learned(float64, scaled):
 def test_double_moves_a_known_matrix():
     model = LinearObservation(torch.eye(2)).double()
     assert observe(model, torch.ones(1, 2, dtype=torch.float64)).dtype == torch.float64
+
+
+def test_a_network_may_have_attributes_that_are_named_like_our_buffers():
+    class Affine(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.register_buffer("loc", torch.tensor([5.0]))
+            self.scale = 3.0
+
+        def forward(self, state):
+            return self.scale * state + self.loc
+
+    observation = LearnedObservation(Affine(), loc=[1.0], scale=[2.0])
+    states = torch.tensor([[3.0], [7.0]])  # standardised: 1 and 3
+    predicted = observation(TensorDict({("forecast", "ensemble"): states}))["forecast", "observation"]
+    torch.testing.assert_close(predicted, torch.tensor([[8.0], [14.0]]))

@@ -157,3 +157,19 @@ def test_vector_sensor_unobserved_nan():
     assert out.isfinite().all()
     grads = torch.autograd.grad(out.sum(), list(sensor.parameters()))
     assert all(grad.isfinite().all() for grad in grads)
+
+
+def test_pixels_are_standardised_channel_by_channel():
+    """(x - loc) / scale in front of the trunk: the same as a sensor without it on pixels standardised by hand."""
+    torch.manual_seed(0)
+    loc, scale = torch.tensor([0.5, 0.0]), torch.tensor([0.2, 0.1])
+    plain = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4)
+    standard = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4, pixel_loc=loc, pixel_scale=scale)
+    standard.module.load_state_dict(plain.module.state_dict())
+    pixels, noise = torch.rand(3, 2, 12, 16), plain.draw_noise([3])
+    by_hand = (pixels - loc[:, None, None]) / scale[:, None, None]
+    outs = [
+        sensor(TensorDict({"pixels": x, ("noise", "sensor"): noise}, [3]))["sensor", "ensemble"]
+        for sensor, x in ((standard, pixels), (plain, by_hand))
+    ]
+    torch.testing.assert_close(*outs)

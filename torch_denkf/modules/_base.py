@@ -44,6 +44,9 @@ class SubModel(TensorDictModule):
         self.optional_keys = [unravel_key(key) for key in optional_keys]
         self.noise_key = None if noise_key is None else unravel_key(noise_key)
 
+    # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would hide our buffers.
+    __getattr__ = nn.Module.__getattr__
+
     def read(self, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         """Returns the entry ``key``.
 

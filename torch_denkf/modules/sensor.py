@@ -112,6 +112,8 @@ class ImageSensor(_Sensor):
         rate: drop probability of the head's hidden units.
         loc: mean of the observation ``[O]`` in its units; the head's output is standardised.
         scale: standard deviation of the observation ``[O]``.
+        pixel_loc: mean of each channel ``[C]``, after the division by 255 of uint8 images.
+        pixel_scale: standard deviation of each channel ``[C]``; the trunk reads standardised pixels.
         in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point.
         out_key: learned observations ``[*B, E, O]``.
         encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
@@ -141,6 +143,8 @@ class ImageSensor(_Sensor):
         rate: float = 0.1,
         loc: Sequence[float] | torch.Tensor | None = None,
         scale: Sequence[float] | torch.Tensor | None = None,
+        pixel_loc: Sequence[float] | torch.Tensor | None = None,
+        pixel_scale: Sequence[float] | torch.Tensor | None = None,
         in_key: NestedKey = "pixels",
         out_key: NestedKey = ("sensor", "ensemble"),
         encoding_key: NestedKey | None = None,
@@ -156,6 +160,10 @@ class ImageSensor(_Sensor):
             trunk, head, ensemble_size, in_key, out_key, encoding_key, noise_key, loc, scale, 3, observed_key
         )
         self.image_shape = tuple(image_shape)
+        for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
+            channels = torch.as_tensor(default if value is None else value, dtype=torch.get_default_dtype())
+            self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
+        self.standardise = pixel_loc is not None or pixel_scale is not None
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         if tuple(measurement.shape[-3:]) != self.image_shape:
@@ -164,8 +172,8 @@ class ImageSensor(_Sensor):
                 f"{self.in_keys[0]!r} has shape {list(measurement.shape)}. Pass image_shape=, or resize the images."
             )
         if measurement.dtype == torch.uint8:
-            return measurement.to(self.loc.dtype) / 255
-        return measurement
+            measurement = measurement.to(self.loc.dtype) / 255
+        return (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
 
 
 class VectorSensor(_Sensor):
