@@ -1,4 +1,4 @@
-"""Track a car from its camera: train a DEnKF, append it to an environment, roll out an unseen drive.
+"""Track a car from its camera: train a DEnKF, append it to an environment, roll out unseen drives.
 
     python examples/quickstart.py                                                  # drives that are generated here
     python examples/quickstart.py --root KITTI --train 00 02 05 --test 09          # real KITTI odometry drives
@@ -8,7 +8,7 @@ Four steps, each a function below:
 1. ``read_drives``    frames and true states of the drives, in KITTI's layout
 2. ``train_sensor``   the image sensor alone: (v, theta_dot) from a frame and its difference to the one before
 3. ``train_filter``   transition and noise model on drives the sensor has not seen, through 32 steps
-4. ``track``          DEnKFTransform in a replay environment of the test drive, 30 % of the frames missing
+4. ``track``          DEnKFTransform in a replay environment of each test drive, 30 % of the frames missing
 
 It prints a table against the sensor alone and against dead reckoning, and leaves a picture in ``--out``.
 """
@@ -50,16 +50,25 @@ ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
 
 
-def read_drives(args: argparse.Namespace) -> tuple[list[TensorDict], TensorDict]:
-    """Returns the training drives and the test drive; generates them where no --root is given."""
+def read_drives(args: argparse.Namespace) -> tuple[list[TensorDict], list[TensorDict]]:
+    """Returns the training and the test drives; generates them where no --root is given."""
     if args.root is None:
-        args.root = args.out / "drives"
-        args.train, args.test = [f"{i:02d}" for i in range(args.drives)], f"{args.drives:02d}"
-        for name in tqdm([*args.train, args.test], desc="rendering drives", disable=None):
-            write_drives(args.root, [name], frames=args.frames * (2 if name == args.test else 1), seed=args.seed)
-    names = tqdm([*args.train, args.test], desc="reading drives", disable=None)
-    drives = [read_kitti_drive(args.root, name) for name in names]
-    return drives[:-1], drives[-1]
+        args.pixel_noise = 0.05 if args.pixel_noise is None else args.pixel_noise
+        args.root, names = args.out / "drives", [f"{i:02d}" for i in range(args.drives + 4)]
+        args.train, args.test = names[:-4], names[-4:]
+        for name in tqdm(names, desc="rendering drives", disable=None):
+            write_drives(args.root, [name], frames=args.frames, seed=args.seed)
+    names = tqdm([*args.train, *args.test], desc="reading drives", disable=None)
+    drives = [with_noise(read_kitti_drive(args.root, name), args.pixel_noise or 0.0) for name in names]
+    return drives[: len(args.train)], drives[len(args.train) :]
+
+
+def with_noise(drive: TensorDict, std: float) -> TensorDict:
+    """Adds white noise to every image, as a cheap camera does; ``std`` is a share of full scale."""
+    drive = drive.clone()  # in memory: what was read is a memory map
+    for image in drive["image"]:
+        image.copy_((image + 255 * std * torch.randn(image.shape)).clamp(0, 255).round())
+    return drive
 
 
 def make_filter(frames: TensorDict, dt: float) -> DEnKF:
@@ -100,12 +109,12 @@ class SensorCurve(nn.Module):
         return torch.cat([v + self.scale * self.correction((v - self.loc) / self.scale), theta_dot], -1)
 
 
-def mirrored(frames: TensorDict) -> TensorDict:
-    """Flips a random half of the frames left to right, and with them the sign of theta_dot."""
-    flip = torch.rand(frames.shape) < 0.5
-    pixels = torch.where(flip[:, None, None, None], frames["pixels"].flip(-1), frames["pixels"])
-    sign = torch.where(flip[:, None], torch.tensor([1.0, -1.0]), 1.0)
-    return TensorDict({"pixels": pixels, "target": frames["state"][:, VELOCITIES] * sign}, frames.batch_size)
+def mirror(frames: TensorDict) -> TensorDict:
+    """Flips frames left to right, and with them the signs of y, theta and theta_dot."""
+    frames = frames.copy()
+    frames["pixels"] = frames["pixels"].flip(-1)
+    frames["state"] = frames["state"] * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0])
+    return frames
 
 
 def train_sensor(denkf: DEnKF, frames: TensorDict, updates: int) -> None:
@@ -114,9 +123,10 @@ def train_sensor(denkf: DEnKF, frames: TensorDict, updates: int) -> None:
     optimiser = torch.optim.AdamW(sensor.parameters(), lr=2e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=updates, pct_start=0.1)
     for _ in (bar := tqdm(range(updates), desc="training the sensor", disable=None)):
-        batch = mirrored(frames[torch.randint(len(frames), (64,))])
+        batch = frames[torch.randint(len(frames), (64,))]
+        batch = torch.cat([batch[:32], mirror(batch[32:])])
         samples = sensor(batch)["sensor", "ensemble"]
-        loss = (crps_ensemble(samples, batch["target"]) / sensor.scale).mean()
+        loss = (crps_ensemble(samples, batch["state"][:, VELOCITIES]) / sensor.scale).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -127,20 +137,12 @@ def train_sensor(denkf: DEnKF, frames: TensorDict, updates: int) -> None:
 def read_windows(sensor: ImageSensor, drives: list[TensorDict], length: int) -> tuple[TensorDict, torch.Tensor]:
     """Returns all windows of the sensor's readings, and mirrored ones; and the standard deviation of its errors."""
     with torch.no_grad():  # the sensor reads every frame once; the filter without it trains on the readings
-        readings = [sensor(frames.copy()).exclude("pixels", "is_init") for frames in drives]
-    mean = [reading["sensor", "ensemble"].mean(1) for reading in readings]
-    errors = torch.cat([z - reading["state"][:, VELOCITIES] for z, reading in zip(mean, readings, strict=True)])
-    for z, reading in zip(mean, readings, strict=True):
-        reading["target_observation"] = z  # what h is to predict
-    windows = torch.stack([r[i : i + length] for r in readings for i in range(1, len(r) - length + 1)])
-    mirror = windows.clone()
-    for key, sign in (
-        ("state", [1.0, -1.0, -1.0, 1.0, -1.0]),
-        (("sensor", "ensemble"), [1.0, -1.0]),
-        ("target_observation", [1.0, -1.0]),
-    ):
-        mirror[key] = mirror[key] * torch.tensor(sign)
-    return torch.cat([windows, mirror]), errors.std(0)
+        readings = [sensor(d.copy()).exclude("pixels", "is_init") for drive in drives for d in (drive, mirror(drive))]
+    for reading in readings:
+        reading["target_observation"] = reading["sensor", "ensemble"].mean(1)  # what h is to predict
+    errors = torch.cat([reading["target_observation"] - reading["state"][:, VELOCITIES] for reading in readings])
+    windows = [r[i : i + length] for r in readings for i in range(1, len(r) - length + 1)]
+    return torch.stack(windows), errors.std(0)
 
 
 def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: int = 32) -> None:
@@ -189,31 +191,45 @@ def held_readings(rollout: TensorDict, missing_value: torch.Tensor | None) -> to
     return torch.stack(readings)
 
 
-def compare(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float, window: int) -> tuple[str, dict]:
-    """Scores the filter, the sensor alone and dead reckoning; returns the table and each one's path and velocities."""
-    truth = rollout["state"]
+def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dict[str, torch.Tensor]:
+    """The states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
+    start = rollout["state"][0, :3]
 
     def integrated(velocity: torch.Tensor) -> torch.Tensor:
-        return torch.cat([dead_reckoning(velocity, truth[0, :3], dt), velocity], -1)
+        return torch.cat([dead_reckoning(velocity, start, dt), velocity], -1)
 
-    estimates = {
-        "sensor alone (training mean where a frame is missing)": integrated(held_readings(rollout, mean_velocity)),
-        "dead reckoning (last reading where a frame is missing)": integrated(held_readings(rollout, None)),
+    return {
+        "sensor alone (training mean where it is blind)": integrated(held_readings(rollout, mean_velocity)),
+        "dead reckoning (last reading where it is blind)": integrated(held_readings(rollout, None)),
         "**DEnKF**": rollout["belief", "mean"],
-        "floor: dead reckoning with the true velocities": integrated(truth[:, VELOCITIES]),
+        "floor: dead reckoning with the true velocities": integrated(rollout["state"][:, VELOCITIES]),
     }
+
+
+def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> str:
+    """A Markdown table of errors, averaged over the drives."""
     lines = [
         f"| | translation, m/m over {window} steps | rotation, deg/m | v, RMSE m/s | theta_dot, RMSE deg/s |",
         "|---|---|---|---|---|",
     ]
-    for name, estimate in estimates.items():
-        error = kitti_endpoint_error(estimate[:, :3], truth[:, :3], window=window)
-        v, theta_dot = (estimate - truth)[:, VELOCITIES].square().mean(0).sqrt() * torch.tensor([1.0, 57.2958])
-        lines.append(f"| {name} | {error.translation:.3f} | {error.rotation:.3f} | {v:.2f} | {theta_dot:.2f} |")
-    std = rollout["belief", "var"][:, VELOCITIES].sqrt()
-    inside = ((rollout["belief", "mean"] - truth)[:, VELOCITIES].abs() <= 1.645 * std).float().mean(0) * 100
-    lines.append(f"\nThe DEnKF's 90 % intervals hold {inside[0]:.0f} % of v and {inside[1]:.0f} % of theta_dot.")
-    return "\n".join(lines), estimates
+    for name in estimates[0]:
+        scores = []
+        for rollout, states in zip(rollouts, estimates, strict=True):
+            error = kitti_endpoint_error(states[name][:, :3], rollout["state"][:, :3], window=window)
+            velocity = (states[name] - rollout["state"])[:, VELOCITIES].square().mean(0).sqrt()
+            scores.append([float(error.translation), float(error.rotation), *velocity.tolist()])
+        translation, rotation, v, theta_dot = torch.tensor(scores).mean(0).tolist()
+        lines.append(f"| {name} | {translation:.3f} | {rotation:.3f} | {v:.2f} | {theta_dot * 57.2958:.2f} |")
+    inside = [
+        (r["belief", "mean"] - r["state"]).abs()[:, VELOCITIES] <= 1.645 * r["belief", "var"][:, VELOCITIES].sqrt()
+        for r in rollouts
+    ]
+    v, theta_dot = 100 * torch.cat(inside).float().mean(0)
+    blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
+    lines.append(
+        f"\nThe sensor is blind in {blind:.0f} % of the steps. The DEnKF's 90 % intervals hold {v:.0f} % of v and "
+    )
+    return "\n".join(lines) + f"{theta_dot:.0f} % of theta_dot."
 
 
 def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:
@@ -247,7 +263,8 @@ def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:
         axes[axis].plot(seconds, mean, "b-", linewidth=1, label="DEnKF")
         axes[axis].set(xlabel="s", ylabel=unit)
     axes["v"].legend(ncols=4, loc="lower center")
-    fig.suptitle(f"Unseen drive, {100 * (1 - seen.float().mean()):.0f} % of the frames missing")
+    unseen = 100 * (1 - seen.float().mean())
+    fig.suptitle(f"An unseen drive; missing frames leave the sensor blind in {unseen:.0f} % of the steps")
     fig.savefig(file, dpi=110)
 
 
@@ -255,12 +272,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, help="folder in KITTI odometry layout; drives are generated without it")
     parser.add_argument("--train", nargs="+", help="drives to train on; the last quarter trains the filter alone")
-    parser.add_argument("--test", help="unseen drive")
+    parser.add_argument("--test", nargs="+", help="unseen drives")
+    parser.add_argument("--pixel-noise", type=float, help="camera noise, share of full scale; 0.05 on generated drives")
     parser.add_argument("--missing", type=float, default=0.3, help="probability that a test frame is missing")
     parser.add_argument("--sensor-updates", type=int, default=1000, help="training steps of the sensor")
     parser.add_argument("--updates", type=int, default=200, help="training steps of the filter")
-    parser.add_argument("--drives", type=int, default=28, help="generated drives to train on")
-    parser.add_argument("--frames", type=int, default=200, help="frames of a generated drive; twice that of the test's")
+    parser.add_argument("--drives", type=int, default=24, help="generated drives to train on")
+    parser.add_argument("--frames", type=int, default=250, help="frames of a generated drive")
     parser.add_argument("--window", type=int, default=100, help="steps of the endpoint error")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/quickstart"))
@@ -275,22 +293,21 @@ def main() -> None:
     torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))  # small steps: threads that wait for cores cost more
     args.out.mkdir(parents=True, exist_ok=True)
 
-    training, test = read_drives(args)
-    dt = float(test["dt"][0])
+    training, tests = read_drives(args)
+    dt = float(tests[0]["dt"][0])
     frames = [drive_frames(drive) for drive in training]
     held = max(1, len(frames) // 4)  # drives that the sensor does not see, so that its errors there are honest
     sensor_frames = torch.cat(frames[:-held])
     denkf = make_filter(sensor_frames, dt)
     train_sensor(denkf, sensor_frames, args.sensor_updates)
     train_filter(denkf, frames[-held:], args.updates)
-    rollout = track(denkf, test, args.missing)
-    table, estimates = compare(rollout, denkf["sensor"].loc, dt, args.window)
-    draw(rollout, estimates, dt, args.out / "quickstart.png")
+    rollouts = [track(denkf, drive, args.missing) for drive in tests]
+    estimates = [estimate(rollout, denkf["sensor"].loc, dt) for rollout in rollouts]
+    table = compare(rollouts, estimates, args.window)
+    draw(rollouts[0], estimates[0], dt, args.out / "quickstart.png")
     (args.out / "table.md").write_text(table + "\n")
-    print(
-        f"\nUnseen drive {args.test}, {args.missing:.0%} of the frames missing:\n\n{table}\n\n"
-        f"Picture: {args.out / 'quickstart.png'}"
-    )
+    print(f"\nUnseen drives {' '.join(args.test)}, {args.missing:.0%} of the frames missing:\n\n{table}\n")
+    print(f"Picture of drive {args.test[0]}: {args.out / 'quickstart.png'}")
 
 
 if __name__ == "__main__":
