@@ -3,11 +3,14 @@
 from torch_denkf.data.drives import random_drive, roadside_scene, write_drives
 from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
 from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
+from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
 
 __all__ = [
     "drive_frames",
     "frames_at",
     "list_kitti_drives",
+    "lorenz96_step",
+    "lorenz96_tendency",
     "random_drive",
     "read_kitti_drive",
     "roadside_scene",
