@@ -102,7 +102,7 @@ def evaluate(denkf: DEnKF, data: TensorDict, seed: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--updates", type=int, default=1500)
+    parser.add_argument("--updates", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/calibration.md"))
     parser.add_argument("--smoke", action="store_true", help="a few updates, nothing written")

@@ -7,7 +7,7 @@ Four steps, each a function below:
 
 1. ``read_drives``    frames and true states of the drives, in KITTI's layout
 2. ``train_sensor``   the image sensor alone: (v, theta_dot) from a frame and its difference to the one before
-3. ``train_filter``   transition and noise model on drives the sensor has not seen, through 32 steps
+3. ``train_filter``   transition, sensor curve h and noise model on drives the sensor has not seen, through 32 steps
 4. ``track``          DEnKFTransform in a replay environment of each test drive, 30 % of the frames missing
 
 It prints a table against the sensor alone and against dead reckoning, and leaves a picture in ``--out``.
@@ -45,7 +45,7 @@ from torch_denkf.modules import (
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.transforms import DEnKFTransform
 
-TRUNK = ((24, 5, 2), (32, 3, 2), (48, 3, 2), (64, 3, 2))  # a fifth of the work of Table I's, which is the default
+TRUNK = ((24, 5, 2), (32, 3, 2), (48, 3, 2), (64, 3, 2))  # a third of the work of Table I's, which is the default
 ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
 

@@ -235,16 +235,21 @@ def test_flat_slices_are_the_slices(float64):
 # ------------------------------------------------------------------------------------------------- controls
 
 
-def test_action_is_read_one_step_earlier(float64):
-    # x_t = x_{t-1} + a_{t-1} and no information from readings: x_t is the sum of all actions before t.
-    filter = DEnKF(
+def adds_up_actions(**kwargs) -> DEnKF:
+    return DEnKF(
         NoisyLinear(torch.eye(2), control=torch.eye(2)),
         None,
         LinearObservation(torch.eye(2)),
         ConstantNoise([1e6, 1e6], in_key="observation"),
         EnsembleAnalysis("etkf", sensor_key="observation"),
         initial=FixedEnsemble(torch.zeros(3, 2)),
+        **kwargs,
     )
+
+
+def test_action_is_read_one_step_earlier(float64):
+    # x_t = x_{t-1} + a_{t-1} and no information from readings: x_t is the sum of all actions before t.
+    filter = adds_up_actions()
     td = TensorDict({"observation": torch.randn(2, 6, 2), "action": torch.randn(2, 6, 2)}, [2, 6])
     expected = torch.cat([torch.zeros(2, 1, 2), td["action"].cumsum(1)[:, :-1]], 1)
     out = filter.sequence(td.copy())
@@ -256,15 +261,7 @@ def test_action_is_read_one_step_earlier(float64):
 
 
 def test_control_keys_may_be_empty(float64):
-    filter = DEnKF(
-        NoisyLinear(torch.eye(2), control=torch.eye(2)),
-        None,
-        LinearObservation(torch.eye(2)),
-        ConstantNoise([1e6, 1e6], in_key="observation"),
-        EnsembleAnalysis("etkf", sensor_key="observation"),
-        initial=FixedEnsemble(torch.zeros(3, 2)),
-        control_keys=(),
-    )
+    filter = adds_up_actions(control_keys=())
     td = TensorDict({"observation": torch.randn(6, 2), "action": torch.randn(6, 2)}, [6])
     expected = td["action"].cumsum(0) - td["action"][0]
     torch.testing.assert_close(filter.sequence(td)["belief", "mean"], expected, rtol=0, atol=1e-14)

@@ -24,7 +24,7 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules import SubModel
 
-__all__ = ["Filter", "submodels"]
+__all__ = ["Filter", "submodels", "where_rows"]
 
 #: What follows from what: the summaries of a belief that a filter carries under these names.
 _SUMMARIES = {
@@ -234,14 +234,14 @@ class Filter(TensorDictSequential):
         """One step of the recursion, except that rows in ``reset`` forecast their ``start``, and believe it."""
         row = self.transition_module(row)
         for key, forecast_key in self._forecast_of.items():
-            row.set(forecast_key, _where(reset, start.get(key), row.get(forecast_key)))
+            row.set(forecast_key, where_rows(reset, start.get(key), row.get(forecast_key)))
         for key in self.carry_keys:
             if key not in self._forecast_of:
-                row.set(key, _where(reset, start.get(key), row.get(key)))
+                row.set(key, where_rows(reset, start.get(key), row.get(key)))
         row = self._run(self.update_modules, row)
         if not update_at_reset:
             for key in self.belief_keys:
-                row.set(key, _where(reset, start.get(key), row.get(key)))
+                row.set(key, where_rows(reset, start.get(key), row.get(key)))
         return row
 
     # --------------------------------------------------------------------------------------------- a sequence
@@ -338,5 +338,6 @@ def submodels(module: torch.nn.Module) -> list[SubModel]:
     return [part for part in module.modules() if isinstance(part, SubModel)]
 
 
-def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+def where_rows(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+    """Takes ``new`` in the rows that ``mask`` ``[*B]`` or ``[*B, 1]`` marks, ``old`` ``[*B, ...]`` in the others."""
     return torch.where(expand_as_right(mask, old), new, old)

@@ -8,13 +8,12 @@ from contextlib import nullcontext
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from tensordict.utils import expand_as_right
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters.base import submodels
+from torch_denkf.filters.base import submodels, where_rows
 
 __all__ = ["DEnKFTransform"]
 
@@ -144,7 +143,7 @@ class DEnKFTransform(Transform):
         if given and all(value is not None for value in given.values()):
             mask = self._reset_mask(tensordict)
             for key, value in given.items():
-                start.set(key, value if mask is None else _where(mask, start.get(key), value))
+                start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
             start = self.filter.summarise(start)
         if self.check_finite:
             self._assert_finite(start)
@@ -197,10 +196,8 @@ class DEnKFTransform(Transform):
     def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
         """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
         dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
-        probe, row = (
-            observation_spec.zero(),
-            TensorDict({}, observation_spec.shape, device=observation_spec.device),
-        )
+        probe = observation_spec.zero()
+        row = TensorDict({}, observation_spec.shape, device=observation_spec.device)
         self._copy(probe, row, self.in_keys, f"{type(self.parent.base_env).__name__}'s observation spec")
         for key in self.in_keys:
             value = row.get(key)
@@ -261,10 +258,6 @@ class DEnKFTransform(Transform):
         """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`."""
         with self._grad_mode(), set_recurrent_mode(True):
             return self.filter(tensordict)
-
-
-def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
-    return torch.where(expand_as_right(mask, old), new, old)
 
 
 def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:
