@@ -4,6 +4,7 @@ from torch_denkf.data.drives import random_drive, roadside_scene, write_drives
 from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
 from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
+from torch_denkf.data.motion import with_motion
 
 __all__ = [
     "drive_frames",
@@ -15,5 +16,6 @@ __all__ = [
     "read_kitti_drive",
     "roadside_scene",
     "sample_windows",
+    "with_motion",
     "write_drives",
 ]

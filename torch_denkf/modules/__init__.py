@@ -6,6 +6,7 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
@@ -28,6 +29,7 @@ __all__ = [
     "ConstantNoise",
     "ImageSensor",
     "VectorSensor",
+    "FlowSensor",
     "convolutional_trunk",
     "GaussianPrior",
     "AroundState",

@@ -1,6 +1,17 @@
 """What torchrl environments see of a filter, and what disturbs its frames."""
 
 from torch_denkf.transforms.denkf import DEnKFTransform
+from torch_denkf.transforms.disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+from torch_denkf.transforms.flow import OpticalFlow
 from torch_denkf.transforms.missing import MissingFrames
 
-__all__ = ["DEnKFTransform", "MissingFrames"]
+__all__ = [
+    "BlackFrames",
+    "Blur",
+    "Brightness",
+    "DEnKFTransform",
+    "MissingFrames",
+    "OccludingBox",
+    "OpticalFlow",
+    "SaltAndPepper",
+]

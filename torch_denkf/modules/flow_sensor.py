@@ -1,0 +1,193 @@
+r"""A learned sensor for a car's motion from optical flow: :math:`\tilde y^i_t \sim s_\xi(\tilde y^i_t \mid y_t)`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
+
+__all__ = ["FlowSensor"]
+
+_FLOW_UNIT, _TURN_UNIT = 0.1, 0.02  # tangents and rad a frame: about a standard deviation on KITTI
+_ROAD_LOC, _ROAD_SCALE = 0.9, 0.2  # where correlations of the road lie
+
+
+class _MotionTrunk(nn.Module):
+    """Distance and turn between two frames by geometry, and features that say how to correct them.
+
+    The road's correlations become a distribution over pitch and distance, by a small convolutional network that may
+    look at the neighbours of each and by a preference for pitches that comes from the flow.
+    """
+
+    def __init__(self, features: int, dropout: float):
+        super().__init__()
+        channels, height, width = FLOW_SHAPE
+        pitches, shifts = ROAD_SHAPE
+        self.flow = nn.Sequential(
+            nn.Conv2d(channels + 2, 16, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(16, 24, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(24, 32, 3, 2, 1),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Dropout(dropout),
+            nn.Linear(32 * -(-height // 8) * -(-width // 8), features),
+            nn.ReLU(),
+        )
+        self.road = nn.Sequential(
+            nn.Conv2d(3, 16, 3, 1, 1), nn.ReLU(), nn.Conv2d(16, 16, 3, 1, 1), nn.ReLU(), nn.Conv2d(16, 1, 3, 1, 1)
+        )
+        self.pitch = nn.Linear(features, pitches)
+        self.log_sharpness = nn.Parameter(torch.tensor(3.0))
+        self.register_buffer("distances", torch.as_tensor(ROAD_SHIFTS, dtype=torch.float32))
+        self.register_buffer("pitches", torch.as_tensor(ROAD_PITCHES / ROAD_PITCHES.max(), dtype=torch.float32))
+        self.register_buffer("flow_grid", _grid(height, width))
+        self.register_buffer("road_grid", _grid(pitches, shifts))
+        self.out_features = features + 4
+
+    def forward(self, flow: torch.Tensor, road: torch.Tensor):
+        count = len(flow)
+        turned = _median_turn(flow)
+        scaled = torch.cat([flow[:, :2] / _FLOW_UNIT, flow[:, 2:]], 1)
+        code = self.flow(torch.cat([scaled, self.flow_grid.expand(count, -1, -1, -1)], 1))
+        table = ((road - _ROAD_LOC) / _ROAD_SCALE).unsqueeze(1)
+        score = self.road(torch.cat([table, self.road_grid.expand(count, -1, -1, -1)], 1)).squeeze(1)
+        score = score + self.log_sharpness.exp() * road + self.pitch(code).unsqueeze(-1)
+        belief = score.flatten(1).softmax(1).view_as(score)
+        of_distance, of_pitch = belief.sum(1), belief.sum(2)
+        moved = of_distance @ self.distances
+        spread = ((of_distance @ self.distances**2 - moved**2).clamp_min(0) + 1e-6).sqrt()
+        facts = [spread / 0.2, of_pitch @ self.pitches, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE]
+        facts = torch.stack([*facts, turned / _TURN_UNIT], 1)
+        return moved, turned, torch.cat([code, facts], 1)
+
+
+class FlowSensor(SubModel):
+    """Speed and turn rate of a car from optical flow and the road's correlation, for each ensemble member.
+
+    Geometry gives a first reading: the distance at which the road of two frames agrees (over the camera's pitch,
+    which is unknown), and the median flow far ahead for the turn. A small network weighs the distances, and a
+    stochastic head corrects both readings for each member. What it reads is in angles and metres, so that one sensor
+    serves cameras with other intrinsics and resolutions, and what it learned on rendered drives holds on real ones.
+
+    Args:
+        dt: time between frames in s.
+        ensemble_size: E.
+        features: of the flow's code.
+        num_cells: widths of the head's hidden layers.
+        layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
+        rate: drop probability of the head's hidden units.
+        trunk_dropout: drop probability of the flow's code, in training mode only.
+        in_keys: the flow ``[*B, 3, 25, 79]`` and the road's correlation ``[*B, 13, 69]``, any floating type, as
+            written by :class:`torch_denkf.transforms.OpticalFlow` or :func:`torch_denkf.data.with_motion`.
+        out_key: learned observations (v m/s, θ_dot rad/s) ``[*B, E, 2]``.
+        encoding_key: where to write what the head reads, ``[*B, encoding_features]``; the noise model can tell a
+            blurred frame from a sharp one by it. None for nowhere.
+        observed_key: optional mask ``[*B, 1]``; frames that are not observed are not read.
+        noise_key: optional noise (see :class:`StochasticMLP`).
+
+    Raises:
+        ValueError: if an input does not have the shape above.
+
+    Source:
+        The paper's sensor (section III, eq. 8) with another trunk; the plane of the road as in Geiger, Ziegler &
+        Stiller 2011, "StereoScan", for monocular scale.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> sensor = FlowSensor(dt=0.1, ensemble_size=8)
+        >>> frames = TensorDict({"flow": torch.zeros(4, 3, 25, 79), "road": torch.zeros(4, 13, 69)}, [4])
+        >>> sensor(frames)["sensor", "ensemble"].shape
+        torch.Size([4, 8, 2])
+    """
+
+    observation_dim = 2
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        ensemble_size: int = 32,
+        features: int = 32,
+        num_cells: Sequence[int] = (32, 32),
+        layer: Literal["dropout", "flipout", "none"] = "dropout",
+        rate: float = 0.1,
+        trunk_dropout: float = 0.2,
+        in_keys: tuple[NestedKey, NestedKey] = ("flow", "road"),
+        out_key: NestedKey = ("sensor", "ensemble"),
+        encoding_key: NestedKey | None = ("sensor", "encoding"),
+        observed_key: NestedKey = "observed",
+        noise_key: NestedKey = ("noise", "sensor"),
+    ):
+        trunk = _MotionTrunk(features, trunk_dropout)
+        head = StochasticMLP(trunk.out_features, 2, num_cells, layer=layer, rate=rate, output_gain=0.1)
+        super().__init__(
+            nn.ModuleDict({"trunk": trunk, "head": head}),
+            in_keys,
+            [out_key] if encoding_key is None else [out_key, encoding_key],
+            optional_keys=[observed_key],
+            noise_key=noise_key,
+        )
+        self.dt, self.ensemble_size, self.encoding_features = float(dt), ensemble_size, trunk.out_features
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws the head's noise for ``[*batch_size, E]`` rows."""
+        return self.module["head"].draw_noise(
+            batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the learned observations of every member."""
+        flow, road = (self._read_frames(tensordict, *pair) for pair in zip(self.in_keys, (3, 2), strict=True))
+        batch_size, head = tensordict.batch_size, self.module["head"]
+        moved, turned, encoding = self.module["trunk"](flow, road)
+        encoding = encoding.reshape(*batch_size, -1)
+        noise = self.read_noise(tensordict)
+        if noise is None and head.sample:
+            noise = self.draw_noise(batch_size, device=encoding.device, dtype=encoding.dtype)
+        correction = head(encoding.unsqueeze(-2), noise)
+        moved, turned = (value.reshape(*batch_size, 1) for value in (moved, turned))
+        distance = moved * (1 + correction[..., 0].tanh())
+        angle = turned + _TURN_UNIT * correction[..., 1]
+        samples = torch.stack([distance, angle], -1) / self.dt
+        tensordict.set(self.out_keys[0], samples.expand(*batch_size, self.ensemble_size, -1))
+        if len(self.out_keys) > 1:
+            tensordict.set(self.out_keys[1], encoding)
+        return tensordict
+
+    def _read_frames(self, tensordict: TensorDictBase, key: NestedKey, event_ndim: int) -> torch.Tensor:
+        value = self.read(tensordict, key)
+        expected = FLOW_SHAPE if event_ndim == 3 else ROAD_SHAPE
+        if tuple(value.shape) != (*tensordict.batch_size, *expected):
+            raise ValueError(
+                f"FlowSensor reads {key!r} of shape [*B, {', '.join(map(str, expected))}], got {list(value.shape)} in "
+                f"a batch {list(tensordict.batch_size)}. OpticalFlow and with_motion write it."
+            )
+        value = value.to(self.module["trunk"].distances.dtype)
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observed is not None:
+            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
+            seen = observed.any(-1).reshape(*tensordict.batch_size, *(1,) * event_ndim)
+            value = torch.where(seen, value, 0.0)
+        return value.reshape(-1, *expected)
+
+
+def _grid(height: int, width: int) -> torch.Tensor:
+    """Where a cell lies: two channels from -1 to 1, ``[1, 2, height, width]``."""
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    return torch.stack([columns, rows]).unsqueeze(0)
+
+
+def _median_turn(flow: torch.Tensor) -> torch.Tensor:
+    """Like :func:`torch_denkf.vision.median_turn`, to the left, on a batch of coarse flows."""
+    height, width = flow.shape[-2:]
+    ahead = flow[:, 0, int(0.33 * height) : int(0.5 * height), int(0.375 * width) : int(0.625 * width)]
+    return ahead.flatten(1).median(1).values
