@@ -1,0 +1,348 @@
+"""Oracles: counts and pictures by hand, OpenCV's box filter, the binomial distribution."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tensordict import MemoryMappedTensor, TensorDict
+from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
+
+from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
+from torch_denkf.envs import KITTIReplayEnv
+from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames
+
+ALL = [SaltAndPepper, Blur, Brightness, BlackFrames, OccludingBox]
+
+
+class Pictures(EnvBase):
+    """Shows one constant picture per step, whose brightness counts the steps; rows end after 3 + row steps."""
+
+    def __init__(self, dtype=torch.uint8, batch_size=()):
+        super().__init__(batch_size=torch.Size(batch_size))
+        shape = self.batch_size
+        self.white = 255 if dtype == torch.uint8 else 1
+        self.observation_spec = Composite(
+            pixels=Bounded(0, self.white, (*shape, 3, 8, 12), dtype=dtype),
+            clock=Bounded(0, 100, (*shape, 1), dtype=torch.int64),
+            shape=shape,
+        )
+        self.action_spec = Unbounded((*shape, 1))
+        self.reward_spec = Unbounded((*shape, 1))
+        self.limit = 3 + torch.arange(shape.numel()).reshape(*shape, 1)
+
+    def _show(self, clock, **more):
+        value = (clock + 1).float() / 10 * self.white
+        shape, dtype = self.observation_spec["pixels"].shape, self.observation_spec["pixels"].dtype
+        return TensorDict(
+            {"pixels": value[..., None, None].to(dtype).expand(shape).clone(), "clock": clock, **more}, self.batch_size
+        )
+
+    def _reset(self, tensordict):
+        clock = torch.zeros(*self.batch_size, 1, dtype=torch.int64)
+        if tensordict is not None and "_reset" in tensordict:
+            clock = torch.where(tensordict["_reset"].reshape(clock.shape), clock, self.clock)
+        self.clock = clock
+        return self._show(clock, done=torch.zeros_like(clock, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        clock = self.clock = self.clock + 1
+        done = clock >= self.limit
+        return self._show(clock, done=done, terminated=done.clone(), reward=torch.zeros_like(clock).float())
+
+    def _set_seed(self, seed):
+        pass
+
+
+def rng(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def pictures(*batch, size=(3, 10, 30), seed=0):
+    return torch.randint(1, 255, (*batch, *size), dtype=torch.uint8, generator=rng(seed))
+
+
+def disturb(transform, image, batch=None):
+    return transform(TensorDict({"pixels": image}, image.shape[:-3] if batch is None else batch))["pixels"]
+
+
+def test_salt_and_pepper_counts_of_the_paper():
+    image = torch.full((1, 375, 1242), 100, dtype=torch.uint8)
+    out = disturb(SaltAndPepper(generator=rng()), image)
+    assert ((out == 255).sum(), (out == 0).sum(), (out == 100).sum()) == (9000, 9000, 1242 * 375 - 18000)
+
+
+def test_salt_and_pepper_hits_all_channels_and_is_spread_evenly():
+    image = pictures(4000, size=(2, 4, 5))
+    out = disturb(SaltAndPepper(0.15, generator=rng()), image)
+    white, black = out == 255, out == 0
+    assert (white.sum((-1, -2)) == 3).all()  # 0.15 x 20
+    assert (black.sum((-1, -2)) == 3).all()
+    assert white[:, 0].equal(white[:, 1])
+    assert black[:, 0].equal(black[:, 1])
+    untouched = ~(white | black)
+    assert out[untouched].equal(image[untouched])
+    for kind in (white, black):  # each place is hit by 600 frames of 4000, binomially
+        hits = kind[:, 0].sum(0)
+        assert ((hits - 600).abs() < 5 * (4000 * 0.15 * 0.85) ** 0.5).all()
+
+
+def test_salt_and_pepper_limits():
+    image = pictures(size=(1, 3, 3))
+    assert disturb(SaltAndPepper(0.0), image).equal(image)
+    full = disturb(SaltAndPepper(0.5, generator=rng()), image)  # nine pixels: four of each, one is left
+    assert ((full == 255).sum(), (full == 0).sum()) == (4, 4)
+    with pytest.raises(ValueError, match=r"<= 0\.5; got 0\.6"):
+        SaltAndPepper(0.6)
+
+
+def test_blur_of_impulses_by_hand():
+    image = torch.zeros(1, 7, 9, dtype=torch.float64)
+    image[0, 3, 4] = 1.0
+    expected = torch.zeros(1, 7, 9, dtype=torch.float64)
+    expected[0, 2:5, 2:7] = 1 / 15
+    torch.testing.assert_close(disturb(Blur((3, 5)), image), expected)
+    corner = torch.zeros(1, 7, 9)
+    corner[0, 0, 0] = 1.0
+    out = disturb(Blur(3), corner)  # 4, 6 and 9 pixels of the box are inside
+    torch.testing.assert_close(out[0, :3, :3], torch.tensor([[1 / 4, 1 / 6, 0], [1 / 6, 1 / 9, 0], [0, 0, 0]]))
+
+
+@pytest.mark.parametrize(("width", "side"), [(40, 3), (150, 3), (332, 5), (414, 5), (640, 7), (1242, 15)])
+def test_blur_follows_the_width(width, side):
+    image = torch.zeros(1, 1, 31, width)
+    image[..., 15, width // 2] = 1.0
+    out = disturb(Blur(), image)
+    assert (out > 0).sum() == side * side
+    torch.testing.assert_close(out.max().item(), 1 / side**2)
+
+
+def test_blur_agrees_with_opencv_inside():
+    image = pictures(size=(1, 20, 30))
+    ours = disturb(Blur(5), image)[0, 2:-2, 2:-2].numpy().astype(int)
+    theirs = cv2.blur(image[0].numpy(), (5, 5))[2:-2, 2:-2].astype(int)
+    assert np.abs(ours - theirs).max() <= 1  # of 255: ties may round otherwise
+    assert (ours == theirs).mean() > 0.99
+    exact = cv2.blur(image[0].numpy().astype(np.float64), (5, 5))[2:-2, 2:-2]
+    np.testing.assert_allclose(disturb(Blur(5), image.double() / 255)[0, 2:-2, 2:-2].numpy(), exact / 255, atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", [4, 0, -3, (3, 2), (3, 3, 3)])
+def test_blur_kernels_are_odd(kernel):
+    with pytest.raises(ValueError, match="positive odd"):
+        Blur(kernel)
+
+
+def test_brightness_by_hand():
+    image = torch.tensor([[[0.0, 0.2, 0.5, 0.9]]])
+    out = disturb(Brightness((2.0, 2.0), (-0.1, -0.1)), image)
+    torch.testing.assert_close(out, torch.tensor([[[0.0, 0.3, 0.9, 1.0]]]))
+    out = disturb(Brightness((0.5, 0.5), (0.1, 0.1)), torch.tensor([[[0, 101, 255]]], dtype=torch.uint8))
+    assert out.tolist() == [[[26, 76, 153]]]  # 25.5 and 50.5 + 25.5; halves to even
+
+
+def test_brightness_draws_for_each_frame_within_its_bounds():
+    image = torch.tensor([0.25, 0.75], dtype=torch.float64).expand(20_000, 1, 1, 2)
+    out = disturb(Brightness((0.6, 1.0), (0.0, 0.2), generator=rng()), image)[:, 0, 0]
+    gain = (out[:, 1] - out[:, 0]) / 0.5
+    offset = out[:, 0] - 0.25 * gain
+    for value, low, high in ((gain, 0.6, 1.0), (offset, 0.0, 0.2)):
+        assert low <= value.min() + 1e-12
+        assert value.max() <= high + 1e-12
+        sigma = (high - low) / 12**0.5
+        assert abs(value.mean() - (low + high) / 2) < 5 * sigma / 20_000**0.5
+        assert abs(value.std() / sigma - 1) < 0.03
+    assert abs(torch.corrcoef(torch.stack([gain, offset]))[0, 1]) < 5 / 20_000**0.5
+    with pytest.raises(ValueError, match=r"gain is \(lowest, highest\)"):
+        Brightness((1.0, 0.5))
+    with pytest.raises(ValueError, match="cannot be negative"):
+        Brightness((-1.0, 0.5))
+
+
+def test_box_of_the_paper():
+    image = torch.full((1, 375, 1242), 7, dtype=torch.uint8)
+    expected = image.clone()
+    expected[:, 100:250, 500:650] = 0
+    assert disturb(OccludingBox(), image).equal(expected)
+
+
+def test_box_is_cut_off_at_the_edge():
+    image = torch.ones(2, 10, 10)
+    expected = image.clone()
+    expected[:, 8:, 9:] = 0
+    assert disturb(OccludingBox((0.5, 0.5), (0.8, 0.9)), image).equal(expected)
+    with pytest.raises(ValueError, match="size is a share"):
+        OccludingBox((1.5, 0.5))
+
+
+def test_random_boxes_are_whole_and_everywhere():
+    image = torch.ones(6000, 1, 4, 5)
+    covered = disturb(OccludingBox((0.5, 0.4), None, generator=rng()), image)[:, 0] == 0
+    assert (covered.sum((-1, -2)) == 4).all()  # 2 x 2
+    rows, columns = covered.any(-1), covered.any(-2)
+    assert (rows.sum(-1) == 2).all()
+    assert (columns.sum(-1) == 2).all()
+    first = rows.int().argmax(-1) * 4 + columns.int().argmax(-1)  # 3 x 4 places
+    counts = torch.bincount(first, minlength=12)
+    assert len(counts) == 12
+    assert ((counts - 500).abs() < 5 * (6000 / 12 * 11 / 12) ** 0.5).all()
+
+
+def test_black_frames_say_nothing():
+    image = pictures(20_000, size=(1, 1, 2))
+    out = BlackFrames(0.3, generator=rng())(
+        TensorDict({"pixels": image, "observed": torch.ones(20_000, 1).bool()}, [20_000])
+    )
+    black = (out["pixels"] == 0).flatten(1).all(-1)
+    assert abs(black.sum() - 6000) < 5 * (20_000 * 0.3 * 0.7) ** 0.5
+    assert out["pixels"][~black].equal(image[~black])
+    assert out["observed"].all()
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_what_holds_for_all(kind):
+    image = pictures(2, 3, size=(3, 10, 30))
+    before = image.clone()
+    td = TensorDict({"pixels": image}, [2])
+    out = kind(p=1.0, generator=rng(1))(td)["pixels"]
+    assert (out.dtype, out.shape) == (image.dtype, image.shape)
+    assert td["pixels"] is image  # the argument keeps its entry,
+    assert image.equal(before)  # and that its values
+    assert not out.equal(image)
+    # Same seed, same frames, whatever the batch dimensions; torch's own generator is left alone.
+    state = torch.get_rng_state()
+    assert disturb(kind(p=1.0, generator=rng(1)), image.flatten(0, 1)).equal(out.flatten(0, 1))
+    assert torch.get_rng_state().equal(state)
+    single = disturb(kind(p=1.0, generator=rng(1)), image[0, 0])
+    assert single.shape == (3, 10, 30)
+    # Floating images show the same, in their own dtype.
+    half = 0.5 / 255  # the uint8 result is rounded
+    for dtype, atol in (
+        (torch.float64, half + 1e-6),
+        (torch.float32, half + 1e-6),
+        (torch.float16, half + 2.5 * 2**-12),  # its values are rounded too: before, times at most 1.5, and after
+    ):
+        floating = disturb(kind(p=1.0, generator=rng(1)), (image.double() / 255).to(dtype))
+        assert floating.dtype == dtype
+        assert floating.min() >= 0
+        assert floating.max() <= 1
+        torch.testing.assert_close(floating.double(), out.double() / 255, atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_chance_of_each_frame(kind):
+    image = pictures(4000, size=(1, 4, 8))
+    hit = (disturb(kind(p=0.25, generator=rng()), image) != image).flatten(1).any(-1)
+    assert abs(hit.sum() - 1000) < 5 * (4000 * 0.25 * 0.75) ** 0.5
+    assert disturb(kind(p=0.0), image).equal(image)
+    with pytest.raises(ValueError, match=r"in \[0, 1\]; got 1\.5"):
+        kind(p=1.5)
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_in_chunks(kind, monkeypatch):
+    image = pictures(7, size=(3, 6, 20))
+    seen, original = [], kind._disturb
+    monkeypatch.setattr(_frames, "CHUNK", 2 * 3 * 6 * 20 + 5)
+    monkeypatch.setattr(kind, "_disturb", lambda self, frames: seen.append(len(frames)) or original(self, frames))
+    out = disturb(kind(p=1.0, generator=rng()), image)
+    assert seen == [2, 2, 2, 1]
+    assert (out != image).flatten(1).any(-1).all()
+    # Chunks of one draw as one frame after the other; here the same as two by two where nothing is drawn.
+    if kind in (Blur, BlackFrames, OccludingBox):
+        assert out.equal(torch.stack([disturb(kind(p=1.0), frame) for frame in image]))
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_in_an_environment(kind, dtype, batch):
+    base = Pictures(dtype, batch)
+    env = TransformedEnv(base, kind(p=1.0))
+    check_env_specs(env)
+    assert env.observation_spec == base.observation_spec
+    plain, rollout = base.rollout(3), env.rollout(3)
+    assert rollout["clock"].equal(plain["clock"])
+    if kind is BlackFrames:
+        assert (rollout["pixels"] == 0).all()
+        assert (rollout["next", "pixels"] == 0).all()
+    elif kind is SaltAndPepper:
+        count = round(9000 / (1242 * 375) * 96)
+        for pixels in (rollout["pixels"], rollout["next", "pixels"]):  # resets and steps
+            assert ((pixels == base.white).sum((-1, -2)) == count).all()
+            assert ((pixels == 0).sum((-1, -2)) == count).all()
+    elif kind is OccludingBox:
+        hidden = round(0.4 * 8) * round(150 / 1242 * 12)
+        for pixels in (rollout["pixels"], rollout["next", "pixels"]):
+            assert ((pixels == 0).sum((-1, -2)) == hidden).all()
+    elif kind is Blur:  # of constant pictures
+        torch.testing.assert_close(rollout["next", "pixels"], plain["next", "pixels"])
+
+
+def test_a_partial_reset_leaves_the_other_rows():
+    env = TransformedEnv(Pictures(batch_size=(2,)), SaltAndPepper(0.2))
+    td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
+    assert td["done"].flatten().tolist() == [True, False]
+    before = td["pixels"].clone()
+    after = env.reset(td.set("_reset", td["done"].clone()))
+    assert after["pixels"][1].equal(before[1])
+    assert after["clock"].flatten().tolist() == [0, 3]
+    assert ((after["pixels"] == 255).sum((-1, -2)) == 19).all()  # 0.2 x 96
+
+
+def test_in_batched_environments_and_copies():
+    env = SerialEnv(2, lambda: TransformedEnv(Pictures(), SaltAndPepper(0.1)))
+    check_env_specs(env)
+    assert ((env.rollout(2)["next", "pixels"] == 255).sum((-1, -2)) == 10).all()
+    copy = OccludingBox((0.5, 0.5), (0.0, 0.0)).clone()
+    assert disturb(copy, torch.ones(1, 4, 4)).sum() == 12
+
+
+def test_in_a_replay_buffer():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=SaltAndPepper(0.25), batch_size=4)
+    image = torch.full((10, 1, 4, 4), 100, dtype=torch.uint8)
+    buffer.extend(TensorDict({"pixels": image}, [10]))
+    assert ((buffer.sample()["pixels"] == 255).sum((-1, -2)) == 4).all()
+    assert (buffer[:]["pixels"] != 100).any()
+    assert (buffer.storage[:]["pixels"] == 100).all()  # what is stored stays
+
+
+def test_whole_drives_that_are_read_only(tmp_path):
+    write_drives(tmp_path, ["town"], frames=6, size=(20, 60))
+    drive = read_kitti_drive(tmp_path, "town", size=(20, 60), cache=tmp_path / "cache")
+    assert isinstance(drive["image"], MemoryMappedTensor)
+    drive.lock_()
+    before = drive["image"].clone()
+    out = SaltAndPepper(0.1, in_keys=["image"], generator=rng())(drive)
+    assert drive["image"].equal(before)
+    again = read_kitti_drive(tmp_path, "town", size=(20, 60), cache=tmp_path / "cache")
+    assert again["image"].equal(before)
+    assert ((out["image"] != before).any(1).sum((-1, -2)) >= 200).all()  # 120 and 120, but for those that were so
+    assert out.batch_size == drive.batch_size
+    assert set(out.keys()) == set(drive.keys())
+    # What is made of the disturbed frames is consistent: the difference is that of the frames shown.
+    pixels = drive_frames(out)["pixels"]
+    torch.testing.assert_close(pixels[1:, 3:], pixels[1:, :3] - pixels[:-1, :3])
+    env = KITTIReplayEnv(out)
+    check_env_specs(env)
+    assert env.rollout(3)["next", "pixels"].equal(pixels[1:4])
+
+
+def test_difference_images_are_refused(tmp_path):
+    write_drives(tmp_path, ["town"], frames=4, size=(20, 60))
+    env = KITTIReplayEnv(tmp_path, "town", size=(20, 60), cache=None)
+    with pytest.raises(ValueError, match="'pixels' can be negative"):
+        TransformedEnv(env, Blur()).observation_spec  # noqa: B018
+
+
+def test_errors_name_key_dtype_and_shape():
+    with pytest.raises(KeyError, match=r"Blur reads 'pixels', which is not there; there are \['image'\]"):
+        Blur()(TensorDict({"image": torch.ones(1, 4, 4)}))
+    with pytest.raises(ValueError, match=r"'pixels' is torch\.int32 \[3, 4, 4\]"):
+        Blur()(TensorDict({"pixels": torch.ones(3, 4, 4, dtype=torch.int32)}))
+    with pytest.raises(ValueError, match=r"\[4, 4\]"):
+        Blur()(TensorDict({"pixels": torch.ones(4, 4)}))
+
+
+def test_no_frames_are_no_trouble():
+    assert disturb(SaltAndPepper(), torch.zeros(0, 3, 4, 4)).shape == (0, 3, 4, 4)

@@ -1,0 +1,116 @@
+"""What transforms of frames share: keys, chance, resets, data, and pictures by the chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import Transform
+
+CHUNK = 2**20  # values in work at a time: 4 MB in float32
+
+
+class FrameTransform(Transform):
+    """Does something to frames, each with probability ``p``, in an environment (steps, resets) and in data.
+
+    Subclasses write ``_call``. Data are never changed themselves: :meth:`forward` works on a shallow copy, since a
+    drive is a read-only memory map.
+
+    Args:
+        p: probability that a frame is hit.
+        in_keys: entries of the frame.
+        generator: source of randomness; torch's global one by default.
+
+    Raises:
+        ValueError: if ``p`` is no probability.
+    """
+
+    def __init__(self, p: float, *, in_keys: Sequence[NestedKey], generator: torch.Generator | None):
+        if not 0.0 <= p <= 1.0:
+            raise ValueError(f"p is the probability that {type(self).__name__} hits a frame, in [0, 1]; got {p}.")
+        super().__init__(in_keys=list(in_keys), out_keys=list(in_keys))
+        self.p, self.generator = p, generator
+
+    def _hit(self, shape: Sequence[int], device: torch.device | None) -> Tensor:
+        return torch.rand(tuple(shape), generator=self.generator, device=device) < self.p
+
+    def _frame(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        frame = tensordict.get(key, None)
+        if frame is None:
+            present = sorted(map(str, tensordict.keys(True, True)))
+            raise KeyError(
+                f"{type(self).__name__} reads {key!r}, which is not there; there are {present}. Set in_keys=."
+            )
+        return frame
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument stays as it is."""
+        return self._call(tensordict.copy())
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+class ImageDisturbance(FrameTransform):
+    """Changes pictures ``[*B, C, H, W]``: uint8 in [0, 255] or floating in [0, 1], whatever the batch dimensions.
+
+    Subclasses write ``_disturb``, of frames ``[n, C, H, W]`` to new ones of the same shape and dtype; it gets as many
+    frames at a time as :data:`CHUNK` allows. Each entry of ``in_keys`` is a camera of its own, with its own draws.
+    """
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.in_keys:
+            next_tensordict.set(key, self._picture(key, self._frame(next_tensordict, key)))
+        return next_tensordict
+
+    def _picture(self, key: NestedKey, image: Tensor) -> Tensor:
+        if image.ndim < 3 or not (image.dtype == torch.uint8 or image.is_floating_point()):
+            raise ValueError(
+                f"{type(self).__name__} takes images [*B, C, H, W], uint8 or floating; {key!r} is {image.dtype} "
+                f"{list(image.shape)}."
+            )
+        frames = image.unsqueeze(0).flatten(0, -4)
+        hit = self._hit(frames.shape[:1], image.device).nonzero().squeeze(-1)
+        out = frames.clone()
+        for part in hit.split(max(1, CHUNK // max(1, frames[:1].numel()))):
+            if part.numel():
+                out[part] = self._disturb(frames[part])
+        return out.reshape(image.shape)
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Changes nothing, but refuses entries that can be negative: those are no pictures.
+
+        Raises:
+            ValueError: if an entry's lowest value is negative.
+        """
+        for key in self.in_keys:
+            spec = observation_spec[key] if key in observation_spec.keys(True, True) else None
+            if isinstance(spec, Bounded) and bool((spec.space.low < 0).any()):
+                raise ValueError(
+                    f"{type(self).__name__} takes images in [0, 1], and {key!r} can be negative. Difference images and "
+                    "standardised ones follow from disturbed frames: disturb those first, of a replayed drive its "
+                    "'image', as in KITTIReplayEnv(SaltAndPepper(in_keys=['image'])(drive))."
+                )
+        return observation_spec
+
+
+def scale_of(frames: Tensor) -> float:
+    """The value of white: 255 in integer images, 1 in floating ones."""
+    return 1.0 if frames.is_floating_point() else 255.0
+
+
+def to_float(frames: Tensor) -> Tensor:
+    """Frames in a dtype to calculate in: float64 stays, all else becomes float32; values keep their scale."""
+    return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
+
+
+def to_dtype(values: Tensor, like: Tensor) -> Tensor:
+    """Values back in the dtype of the frames, rounded and held in [0, white]."""
+    values = values if like.is_floating_point() else values.round()
+    return values.clamp(0.0, scale_of(like)).to(like.dtype)

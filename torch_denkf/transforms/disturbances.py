@@ -1,0 +1,248 @@
+"""What happens to a camera's pictures: dead and hot pixels, a lens out of focus, light, blackouts, dirt.
+
+The first two and the box are the robustness tests of the DEnKF paper's KITTI code, as shares of the picture instead of
+pixels of 1242 x 375, so that they fit any size. Pictures are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in
+[0, 1], and keep their dtype; every frame has its own draws. Append a disturbance to an environment that emits frames
+(after ``ToTensorImage``), or call it on data. What follows from frames must be made of the disturbed ones: of a drive
+disturb the ``image``, whose difference images :func:`torch_denkf.data.drive_frames` and
+:class:`torch_denkf.envs.KITTIReplayEnv` make afterwards.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from torch_denkf.transforms._frames import ImageDisturbance, scale_of, to_dtype, to_float
+
+__all__ = ["BlackFrames", "Blur", "Brightness", "OccludingBox", "SaltAndPepper"]
+
+
+class SaltAndPepper(ImageDisturbance):
+    """Makes a share of the pixels white and as many others black, in all channels.
+
+    The counts are exact: ``round(fraction * H * W)`` of each, drawn anew for each frame.
+
+    Args:
+        fraction: share of white pixels, and of black ones; by default 9000 each of 1242 x 375 (the paper's code draws
+            8000 to 10000).
+        p: probability that a frame is disturbed.
+        in_keys: entries of the frame ``[*B, C, H, W]``.
+        generator: source of randomness, on the images' device; torch's global one by default.
+
+    Raises:
+        ValueError: if ``fraction`` is not in [0, 0.5] or ``p`` not in [0, 1].
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"pixels": torch.full((2, 3, 10, 20), 0.5)}, [2])
+        >>> pixels = SaltAndPepper(0.1)(td)["pixels"]
+        >>> (pixels == 1).sum((-1, -2)).tolist(), (pixels == 0).sum((-1, -2)).tolist()
+        ([[20, 20, 20], [20, 20, 20]], [[20, 20, 20], [20, 20, 20]])
+    """
+
+    def __init__(
+        self,
+        fraction: float = 9000 / (1242 * 375),
+        *,
+        p: float = 1.0,
+        in_keys: tuple[NestedKey, ...] = ("pixels",),
+        generator: torch.Generator | None = None,
+    ):
+        if not 0.0 <= fraction <= 0.5:
+            raise ValueError(f"fraction is the share of white pixels and that of black ones, <= 0.5; got {fraction}.")
+        super().__init__(p, in_keys=in_keys, generator=generator)
+        self.fraction = fraction
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        n, channels, height, width = frames.shape
+        count = min(round(self.fraction * height * width), height * width // 2)
+        noise = torch.rand(n, height * width, generator=self.generator, device=frames.device)
+        # Sorted by value: the order of the places is random, so the first half is a fair choice for the white ones.
+        place = noise.topk(2 * count, -1).indices.unsqueeze(1).expand(-1, channels, -1)
+        value = torch.zeros(2 * count, dtype=frames.dtype, device=frames.device)
+        value[:count] = scale_of(frames)
+        return frames.flatten(-2).scatter(-1, place, value.expand(n, channels, -1)).reshape(frames.shape)
+
+
+class Blur(ImageDisturbance):
+    """Box blur: each pixel becomes the mean of the ``kernel`` around it, as far as the picture goes.
+
+    Args:
+        kernel: side in pixels, odd, or (height, width); by default the odd number next to 15/1242 of the frame's width
+            and at least 3: the paper's code blurs KITTI's 1242 columns with 15 x 15.
+        p: probability that a frame is disturbed.
+        in_keys: entries of the frame ``[*B, C, H, W]``.
+        generator: source of randomness, on the images' device; torch's global one by default.
+
+    Raises:
+        ValueError: if a side is not odd and positive or ``p`` not in [0, 1].
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> image = torch.zeros(1, 5, 5)
+        >>> image[0, 2, 2] = 0.9
+        >>> Blur(3)(TensorDict({"pixels": image}))["pixels"][0, 1]
+        tensor([0.0000, 0.1000, 0.1000, 0.1000, 0.0000])
+    """
+
+    def __init__(
+        self,
+        kernel: int | tuple[int, int] | None = None,
+        *,
+        p: float = 1.0,
+        in_keys: tuple[NestedKey, ...] = ("pixels",),
+        generator: torch.Generator | None = None,
+    ):
+        sides = (kernel, kernel) if isinstance(kernel, int) else kernel
+        if sides is not None and (len(sides) != 2 or any(side < 1 or side % 2 == 0 for side in sides)):
+            raise ValueError(
+                f"kernel is a positive odd number of pixels, or one each for height and width; got {kernel}."
+            )
+        super().__init__(p, in_keys=in_keys, generator=generator)
+        self.kernel = sides
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        side = max(3, 2 * int(15 / 1242 * frames.shape[-1] / 2) + 1)
+        height, width = (side, side) if self.kernel is None else self.kernel
+        # A box is the product of a column and a row, and so is the number of pixels of it inside the picture.
+        values = _mean_filter(to_float(frames), (height, 1))
+        return to_dtype(_mean_filter(values, (1, width)), frames)
+
+
+def _mean_filter(values: Tensor, kernel: tuple[int, int]) -> Tensor:
+    padding = (kernel[0] // 2, kernel[1] // 2)
+    return avg_pool2d(values, kernel, stride=1, padding=padding, count_include_pad=False)
+
+
+class Brightness(ImageDisturbance):
+    """Another exposure for each frame: ``gain * value + offset``, cut off at black and white.
+
+    Args:
+        gain: bounds of the uniform factor.
+        offset: bounds of the uniform summand, as a share of white.
+        p: probability that a frame is disturbed.
+        in_keys: entries of the frame ``[*B, C, H, W]``.
+        generator: source of randomness, on the images' device; torch's global one by default.
+
+    Raises:
+        ValueError: if an upper bound is below the lower one, a gain is negative, or ``p`` is not in [0, 1].
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"pixels": torch.tensor([[[0, 100, 200]]], dtype=torch.uint8)})
+        >>> Brightness(gain=(1.5, 1.5), offset=(0.2, 0.2))(td)["pixels"]
+        tensor([[[ 51, 201, 255]]], dtype=torch.uint8)
+    """
+
+    def __init__(
+        self,
+        gain: tuple[float, float] = (0.5, 1.5),
+        offset: tuple[float, float] = (-0.1, 0.1),
+        *,
+        p: float = 1.0,
+        in_keys: tuple[NestedKey, ...] = ("pixels",),
+        generator: torch.Generator | None = None,
+    ):
+        for name, bounds in (("gain", gain), ("offset", offset)):
+            if len(bounds) != 2 or bounds[0] > bounds[1]:
+                raise ValueError(f"{name} is (lowest, highest), equal for a constant; got {bounds}.")
+        if gain[0] < 0:
+            raise ValueError(f"a gain cannot be negative; got {gain}.")
+        super().__init__(p, in_keys=in_keys, generator=generator)
+        self.gain, self.offset = tuple(gain), tuple(offset)
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        values = to_float(frames)
+        draw = torch.rand(2, len(frames), 1, 1, 1, generator=self.generator, device=frames.device).to(values.dtype)
+        gain = torch.lerp(*values.new_tensor(self.gain), draw[0])
+        offset = torch.lerp(*values.new_tensor(self.offset), draw[1])
+        return to_dtype(gain * values + offset * scale_of(frames), frames)
+
+
+class BlackFrames(ImageDisturbance):
+    """Makes whole frames black without a word: other than with ``MissingFrames``, no mask tells the filter.
+
+    Args:
+        p: probability that a frame is black.
+        in_keys: entries of the frame ``[*B, C, H, W]``.
+        generator: source of randomness, on the images' device; torch's global one by default.
+
+    Raises:
+        ValueError: if ``p`` is no probability.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = BlackFrames(1.0)(TensorDict({"pixels": torch.ones(2, 3, 4, 4)}, [2]))
+        >>> float(td["pixels"].sum()), "observed" in td
+        (0.0, False)
+    """
+
+    def __init__(
+        self,
+        p: float = 0.3,
+        *,
+        in_keys: tuple[NestedKey, ...] = ("pixels",),
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__(p, in_keys=in_keys, generator=generator)
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        return torch.zeros_like(frames)
+
+
+class OccludingBox(ImageDisturbance):
+    """Hides a part of the picture behind a black box.
+
+    Args:
+        size: shares of the frame's height and width; by default 150 x 150 pixels of KITTI's 375 x 1242.
+        position: the box's upper left corner as shares of the height and the width, by default row 100 and column 500
+            of 375 x 1242, as in the paper's code; what would stick out is cut off. ``None`` draws a place for each
+            frame, uniformly over those where the box is whole.
+        p: probability that a frame is disturbed.
+        in_keys: entries of the frame ``[*B, C, H, W]``.
+        generator: source of randomness, on the images' device; torch's global one by default.
+
+    Raises:
+        ValueError: if a share or ``p`` is not in [0, 1].
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"pixels": torch.ones(1, 4, 4)})
+        >>> OccludingBox(size=(0.5, 0.25), position=(0.25, 0.5))(td)["pixels"].int().tolist()
+        [[[1, 1, 1, 1], [1, 1, 0, 1], [1, 1, 0, 1], [1, 1, 1, 1]]]
+    """
+
+    def __init__(
+        self,
+        size: tuple[float, float] = (150 / 375, 150 / 1242),
+        position: tuple[float, float] | None = (100 / 375, 500 / 1242),
+        *,
+        p: float = 1.0,
+        in_keys: tuple[NestedKey, ...] = ("pixels",),
+        generator: torch.Generator | None = None,
+    ):
+        for name, shares in (("size", size), ("position", position)):
+            if shares is not None and (len(shares) != 2 or not all(0.0 <= share <= 1.0 for share in shares)):
+                raise ValueError(f"{name} is a share of the height and one of the width, in [0, 1]; got {shares}.")
+        super().__init__(p, in_keys=in_keys, generator=generator)
+        self.size, self.position = tuple(size), position
+
+    def _disturb(self, frames: Tensor) -> Tensor:
+        rows, columns = (self._side(axis, frames) for axis in (0, 1))
+        return frames.masked_fill((rows[:, :, None] & columns[:, None, :]).unsqueeze(1), 0)
+
+    def _side(self, axis: int, frames: Tensor) -> Tensor:
+        """Which rows, or columns, of each frame the box covers, ``[n, H]`` or ``[n, W]``."""
+        length, count = frames.shape[axis - 2], len(frames)
+        side = round(self.size[axis] * length)
+        if self.position is None:
+            free = length - side
+            draw = torch.rand(count, 1, generator=self.generator, device=frames.device)
+            first = (draw * (free + 1)).long()
+        else:
+            first = torch.full((count, 1), round(self.position[axis] * length), device=frames.device)
+        place = torch.arange(length, device=frames.device)
+        return (place >= first) & (place < first + side)
