@@ -26,6 +26,6 @@ setup(
     ],
     extras_require={
         "examples": ["tqdm", "matplotlib"],
-        "test": ["pytest", "pytest-xdist", "ruff", "import-linter", "build", "wheel", "pre-commit"],
+        "test": ["evo", "pytest", "pytest-xdist", "ruff", "import-linter", "build", "wheel", "pre-commit"],
     },
 )

@@ -1,6 +1,29 @@
 """Error and calibration metrics, on plain tensors."""
 
-from torch_denkf.metrics.calibration import spread_skill_ratio
+from torch_denkf.metrics.benchmark import WindowErrors, kitti_endpoint_errors, kitti_pathlength_error
+from torch_denkf.metrics.calibration import ensemble_interval_coverage, interval_coverage, spread_skill_ratio
+from torch_denkf.metrics.consistency import NEES, gaussian_nll, nees
+from torch_denkf.metrics.devkit import DevkitError, kitti_devkit_error
 from torch_denkf.metrics.odometry import EndpointError, dead_reckoning, kitti_endpoint_error, wrap_angle
+from torch_denkf.metrics.state import StateErrors, state_difference, state_errors
 
-__all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error", "spread_skill_ratio", "wrap_angle"]
+__all__ = [
+    "DevkitError",
+    "EndpointError",
+    "NEES",
+    "StateErrors",
+    "WindowErrors",
+    "dead_reckoning",
+    "ensemble_interval_coverage",
+    "gaussian_nll",
+    "interval_coverage",
+    "kitti_devkit_error",
+    "kitti_endpoint_error",
+    "kitti_endpoint_errors",
+    "kitti_pathlength_error",
+    "nees",
+    "spread_skill_ratio",
+    "state_difference",
+    "state_errors",
+    "wrap_angle",
+]

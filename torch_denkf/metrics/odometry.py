@@ -10,11 +10,12 @@ the reference script of the DEnKF paper computes.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from torch_denkf.metrics._paths import check_paths, relative_pose_error, step_lengths, wrap_angle
 
 __all__ = ["EndpointError", "dead_reckoning", "kitti_endpoint_error", "wrap_angle"]
 
@@ -35,22 +36,6 @@ class EndpointError(NamedTuple):
     window_translation: Tensor
     window_rotation: Tensor
     windows: Tensor
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """Bring angles to [-π, π).
-
-    Args:
-        angle: in rad, any shape.
-
-    Returns:
-        The same directions in [-π, π), in rad.
-
-    Examples:
-        >>> wrap_angle(torch.tensor([0.5, 4.0, -4.0]))
-        tensor([ 0.5000, -2.2832,  2.2832])
-    """
-    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def kitti_endpoint_error(
@@ -98,11 +83,7 @@ def kitti_endpoint_error(
         >>> round(error.translation.item(), 6), error.rotation.item(), error.windows.item()
         (0.1, 0.0, 101)
     """
-    if truth.ndim < 2 or truth.shape[-1] != 3 or estimated.shape != truth.shape:
-        raise ValueError(
-            "estimated and truth must both be [*B, T, 3] = (x, y, theta), got "
-            f"{list(estimated.shape)} and {list(truth.shape)}; of a state, pass state[..., :3]"
-        )
+    check_paths(estimated, truth)
     if window < 1 or stride < 1:
         raise ValueError(f"window and stride count steps and must be at least 1, got {window} and {stride}")
     steps = truth.shape[-2] - 1
@@ -112,16 +93,15 @@ def kitti_endpoint_error(
             "a smaller window"
         )
     first = torch.arange(0, steps - window + 1, stride, device=truth.device)
-    true_shift, true_turn = _displacement(truth, first, window)
-    shift, turn = _displacement(estimated, first, window)
-    start, start_true = estimated[..., first, :], truth[..., first, :]
+    last = first + window
     if align:
-        shift = _rotate(shift, start_true[..., 2] - start[..., 2])
+        distance, angle = relative_pose_error(
+            estimated[..., first, :], estimated[..., last, :], truth[..., first, :], truth[..., last, :]
+        )
     else:
-        shift = shift + start[..., :2] - start_true[..., :2]
-        turn = turn + start[..., 2] - start_true[..., 2]
-    step_length = torch.linalg.vector_norm(truth[..., 1:, :2] - truth[..., :-1, :2], dim=-1)
-    length = step_length.unfold(-1, window, stride).sum(-1)
+        difference = estimated[..., last, :] - truth[..., last, :]
+        distance, angle = torch.linalg.vector_norm(difference[..., :2], dim=-1), wrap_angle(difference[..., 2]).abs()
+    length = step_lengths(truth).unfold(-1, window, stride).sum(-1)
     counts = length >= min_length
     windows = counts.sum(-1)
     if bool((windows == 0).any()):
@@ -130,20 +110,8 @@ def kitti_endpoint_error(
             "leave such paths out, or pass a larger window or a smaller min_length"
         )
     length = torch.where(counts, length, torch.nan)
-    translation = torch.linalg.vector_norm(shift - true_shift, dim=-1) / length
-    rotation = torch.rad2deg(wrap_angle(turn - true_turn).abs()) / length
+    translation, rotation = distance / length, torch.rad2deg(angle) / length
     return EndpointError(translation.nanmean(-1), rotation.nanmean(-1), translation, rotation, windows)
-
-
-def _displacement(poses: Tensor, first: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    difference = poses[..., first + window, :] - poses[..., first, :]
-    return difference[..., :2], difference[..., 2]
-
-
-def _rotate(vectors: Tensor, angle: Tensor) -> Tensor:
-    cos, sin = angle.cos(), angle.sin()
-    x, y = vectors.unbind(-1)
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
 
 def dead_reckoning(velocities: Tensor, initial: Tensor, dt: float | Tensor) -> Tensor:
