@@ -1,0 +1,124 @@
+"""Errors of a trained filter on the drive that was left out, beside dead reckoning and its floor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from kitti_study.filters import VELOCITIES, Statistics
+from kitti_study.streams import CONDITIONS, DISTURBANCES, Stream
+from kitti_study.training import lose_frames, read_sensor, run_filter
+from torch_denkf.filters import Filter
+from torch_denkf.functional import crps_ensemble
+from torch_denkf.metrics import (
+    dead_reckoning,
+    gaussian_nll,
+    interval_coverage,
+    kitti_devkit_error,
+    kitti_endpoint_error,
+    kitti_pathlength_error,
+    nees,
+    spread_skill_ratio,
+    state_errors,
+)
+
+WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
+COLUMNS = (
+    "filter sensor drive condition window seed translation_m_per_m rotation_deg_per_m coverage90 coverage90_v "
+    "coverage90_theta_dot rmse_v_m_per_s mae_v_m_per_s rmse_theta_dot_deg_per_s mae_theta_dot_deg_per_s "
+    "crps_v_m_per_s nll nees spread_skill pathlength_m_per_m pathlength_deg_per_m devkit_t_rel_percent "
+    "devkit_r_rel_deg_per_m blind"
+).split()
+
+
+def hold_last(reading: TensorDict) -> Tensor:
+    """The sensor's mean velocities ``[N, 2]``; where it is blind the last one, at the start the true one."""
+    mean, observed = reading["sensor", "ensemble"].mean(1), reading["observed"].squeeze(-1)
+    index = torch.where(observed, torch.arange(len(mean)), -1).cummax(0).values
+    return torch.where(index.unsqueeze(-1) < 0, reading["state"][0, VELOCITIES], mean[index.clamp_min(0)])
+
+
+def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
+    """The states ``[N, 5]`` that velocities lead to from the true first pose."""
+    return torch.cat([dead_reckoning(velocity.double(), truth[0, :3].double(), dt), velocity.double()], -1)
+
+
+def evaluate(
+    model: Filter, facts: Statistics, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
+) -> tuple[list[dict], dict[str, TensorDict]]:
+    """All rows of the table for one drive, and its beliefs by condition, for the plots."""
+    clean = read_sensor(model["sensor"], stream.read(cache), kind)
+    readings = {"clean": clean, "missing": lose_frames(clean, seed=stream.seed())}
+    for condition in DISTURBANCES:
+        data = Stream(**{**stream.__dict__, "condition": condition}).read(cache)
+        readings[condition] = read_sensor(model["sensor"], data, kind)
+    conditions = [condition for condition in CONDITIONS if condition in readings]
+    out = run_filter(model, [readings[condition] for condition in conditions])
+    table = []
+    for number, condition in enumerate(conditions):
+        reading, belief, truth = readings[condition], out[number], clean["state"].double()
+        common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
+        common["blind"] = 1 - float(reading["observed"][1:].float().mean())
+        estimates = {filter_name: belief["belief", "mean"].double()}
+        estimates["dead_reckoning"] = integrate(hold_last(reading), truth, facts.dt)
+        if condition == "clean":
+            estimates["floor"] = integrate(truth[:, VELOCITIES], truth, facts.dt)
+        for name, states in estimates.items():
+            scores = calibration(belief, truth) if name == filter_name else {}
+            table += [{**common, **scores, "filter": name, **row} for row in errors(states, truth)]
+    return table, {condition: out[number] for number, condition in enumerate(conditions)}
+
+
+def errors(states: Tensor, truth: Tensor) -> list[dict]:
+    """Errors of a path by window; those that know no window stand in each row."""
+    velocity = state_errors(states[1:, VELOCITIES], truth[1:, VELOCITIES])
+    whole = {
+        "rmse_v_m_per_s": float(velocity.rmse[0]),
+        "mae_v_m_per_s": float(velocity.mae[0]),
+        "rmse_theta_dot_deg_per_s": float(velocity.rmse[1].rad2deg()),
+        "mae_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
+    }
+    try:
+        devkit = kitti_devkit_error(states[:, :3], truth[:, :3])
+        whole |= {
+            "devkit_t_rel_percent": float(devkit.translation),
+            "devkit_r_rel_deg_per_m": float(devkit.rotation),
+        }
+    except ValueError:  # shorter than 100 m
+        pass
+    table = []
+    for window in WINDOWS:
+        if window < len(truth):
+            end = kitti_endpoint_error(states[:, :3], truth[:, :3], window=window)
+            length = kitti_pathlength_error(states[:, :3], truth[:, :3], windows=[window])
+            table.append(
+                {
+                    **whole,
+                    "window": window,
+                    "translation_m_per_m": float(end.translation),
+                    "rotation_deg_per_m": float(end.rotation),
+                    "pathlength_m_per_m": float(length.translation),
+                    "pathlength_deg_per_m": float(length.rotation),
+                }
+            )
+    return table
+
+
+def calibration(belief: TensorDict, truth: Tensor) -> dict[str, float]:
+    """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
+    members = belief["belief", "ensemble"][1:, :, VELOCITIES].double()
+    mean, variance, truth = members.mean(1), members.var(1), truth[1:, VELOCITIES]
+    covered = interval_coverage(mean, variance, truth, level=0.9)
+    covariance = torch.diag_embed(variance)
+    return {
+        "coverage90": float(covered.mean()),
+        "coverage90_v": float(covered[0]),
+        "coverage90_theta_dot": float(covered[1]),
+        "crps_v_m_per_s": float(crps_ensemble(members, truth)[:, 0].mean()),
+        "nll": float(gaussian_nll(mean, covariance, truth).mean()),
+        "nees": float(nees(mean, covariance, truth).mean),
+        "spread_skill": float(spread_skill_ratio(mean, variance, truth, members.shape[1]).mean()),
+    }

@@ -1,0 +1,119 @@
+"""Sensors and filters by name. A filter of your own: one function here, with ``@register``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torch import nn
+
+from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.modules import (
+    AroundState,
+    DiagonalNoise,
+    EnsembleAnalysis,
+    FlowSensor,
+    ImageSensor,
+    LearnedObservation,
+    StochasticMLP,
+    SubModel,
+    UnicycleMotion,
+    UnicycleTransition,
+    convolutional_trunk,
+)
+
+ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
+# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
+UNITS = (0.1, 0.03)
+
+
+@dataclass
+class Statistics:
+    """Means and standard deviations of the training drives alone."""
+
+    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
+    scale: torch.Tensor
+    pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
+    pixel_scale: torch.Tensor
+    dt: float  # s
+
+    @property
+    def unit(self) -> torch.Tensor:
+        """What counts as an error of one, in (m/s, rad/s)."""
+        return self.scale * torch.tensor(UNITS)
+
+
+def flow_sensor(statistics: Statistics) -> SubModel:
+    """Optical flow and road correlation."""
+    return FlowSensor(dt=statistics.dt, ensemble_size=ENSEMBLE)
+
+
+def image_sensor(statistics: Statistics) -> SubModel:
+    """The paper's: Table I on a grey frame and its difference to the one before."""
+    return ImageSensor(
+        2,
+        image_shape=(2, 50, 150),
+        trunk=convolutional_trunk(2),
+        ensemble_size=ENSEMBLE,
+        loc=statistics.loc,
+        scale=statistics.scale,
+        pixel_loc=statistics.pixel_loc,
+        pixel_scale=statistics.pixel_scale,
+        encoding_key=("sensor", "encoding"),
+    )
+
+
+SENSORS: dict[str, Callable[[Statistics], SubModel]] = {"flow": flow_sensor, "image": image_sensor}
+FILTERS: dict[str, Callable[[SubModel | None, Statistics], Filter]] = {}
+
+
+def register(build: Callable[[SubModel | None, Statistics], Filter]):
+    """Makes a filter available to all commands under its function's name."""
+    FILTERS[build.__name__] = build
+    return build
+
+
+class SensorCurve(nn.Module):
+    """h of the paper: what the sensor reads at a true speed; one that hedges reads slow as faster, fast as slower."""
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor):
+        super().__init__()
+        self.correction = StochasticMLP(1, 1, (), layer="none", output_gain=0.0)  # linear; starts at "as it is"
+        self.register_buffer("loc", loc[:1].clone())
+        self.register_buffer("scale", scale[:1].clone())
+
+    def forward(self, state: torch.Tensor) -> torch.Tensor:
+        """Predicts (v, theta_dot) ``[*, 2]``."""
+        v, theta_dot = state[..., VELOCITIES].split(1, -1)
+        return torch.cat([v + self.scale * self.correction((v - self.loc) / self.scale), theta_dot], -1)
+
+
+@register
+def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
+    """The differentiable ensemble Kalman filter with known motion of the pose."""
+    encoding = (
+        sensor.encoding_features if isinstance(sensor, FlowSensor) else sensor.module["head"].layers[-1].in_features
+    )
+    return DEnKF(
+        transition=UnicycleTransition(
+            StochasticMLP(2, 2, output_gain=0.1), dt=statistics.dt, loc=statistics.loc, scale=statistics.scale
+        ),
+        sensor=sensor,
+        observation=LearnedObservation(SensorCurve(statistics.loc, statistics.scale)),
+        noise=DiagonalNoise(2, r=statistics.unit, in_features=encoding, in_key=("sensor", "encoding")),
+        # Innovations correct the velocities, and each member's pose moves with them.
+        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(statistics.dt)),
+        initial=AroundState(INITIAL_STD, ensemble_size=ENSEMBLE),
+    )
+
+
+def without_sensor(model: Filter, start_std: torch.Tensor | None = None) -> Filter:
+    """The same filter on readings of its sensor, sharing all parameters; windows may start from a wrong velocity."""
+    parts = {name: model[name] for name in ("transition", "observation", "noise", "analysis")}
+    initial = model.initial
+    if start_std is not None:
+        initial = AroundState(start_std, ensemble_size=ENSEMBLE, state_key="start")
+    return DEnKF(sensor=None, **parts, initial=initial)

@@ -1,0 +1,134 @@
+"""Who trains, who tunes, who validates and who is tested; and the batches drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from kitti_study.filters import VELOCITIES, Statistics
+from kitti_study.streams import DISTURBANCES, Stream, mirror, rows
+from tensordict import TensorDict
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a stream, with the share of the batches that it gets."""
+
+    stream: Stream
+    begin: float = 0.0  # shares of its rows
+    end: float = 1.0
+    weight: float = 1.0
+
+    def read(self, cache: Path) -> TensorDict:
+        """The stretch, ``[n]``."""
+        data = self.stream.read(cache)
+        return data[int(self.begin * len(data)) : int(self.end * len(data))]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One drive is left out for the test. No drive but it may be missing from the other lists, and it may not be there.
+
+    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones.
+    """
+
+    name: str
+    train: list[Part]  # of the sensor
+    tune: list[Part]  # of the filter
+    validation: list[Part]
+    test: list[Stream] = field(default_factory=list)
+
+    def __post_init__(self):
+        tested = {stream.drive for stream in self.test}
+        leaked = {part.stream.drive for part in (*self.train, *self.tune, *self.validation)} & tested
+        if leaked:
+            raise ValueError(f"fold {self.name}: {sorted(leaked)} would be trained and tested on")
+
+
+def with_disturbances(parts: Sequence[Part]) -> list[Part]:
+    """Each part clean, and with half as much weight again in all disturbances together."""
+    disturbed = []
+    for part in parts:
+        disturbed.append(part)
+        for condition in DISTURBANCES:
+            stream = Stream(**{**part.stream.__dict__, "condition": condition})
+            disturbed.append(Part(stream, part.begin, part.end, 0.5 * part.weight / len(DISTURBANCES)))
+    return disturbed
+
+
+def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
+    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    data = [part.read(cache) for part in parts if part.stream.condition == "clean"]
+    velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
+    loc, scale = velocity.mean(0), velocity.std(0)
+    loc[1], scale[1] = 0.0, velocity[:, 1].square().mean().sqrt()
+    frames = [rows(part, torch.arange(1, len(part), max(len(part) // 50, 1)), "image")["pixels"] for part in data]
+    frames = torch.cat(frames)
+    dt = torch.stack([part["dt"][0, 0] for part in data])
+    if (dt / dt[0] - 1).abs().max() > 0.01:
+        raise ValueError(f"the drives have frame times of {dt.unique().tolist()} s; a study needs the same")
+    return Statistics(loc, scale, frames.mean((0, 2, 3)), frames.std((0, 2, 3)), float(dt[0]))
+
+
+class FrameSampler:
+    """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
+
+    def __init__(self, parts: Sequence[Part], cache: Path, sensor: str, streams_per_batch: int = 8):
+        self.data, self.sensor, self.count = [part.read(cache) for part in parts], sensor, streams_per_batch
+        self.weight = torch.tensor([part.weight for part in parts])
+
+    def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
+        """Observed frames ``[batch]``, every second one mirrored."""
+        chosen = []
+        for number in torch.multinomial(self.weight, self.count, replacement=True, generator=generator).tolist():
+            data = self.data[number]
+            index = torch.randint(1, len(data), (batch // self.count,), generator=generator)
+            frames = rows(data, index, self.sensor)
+            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
+        return torch.cat(chosen)
+
+    def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
+        """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
+        chosen = []
+        for number in torch.multinomial(self.weight, self.count, replacement=True, generator=generator).tolist():
+            data = self.data[number]
+            first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
+            frames = rows(data, torch.arange(first, first + length), self.sensor)
+            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
+        return with_start(torch.stack(chosen), start_std, generator)
+
+
+class ReadingSampler:
+    """Draws windows of a frozen sensor's readings."""
+
+    def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int):
+        self.readings, self.length, starts, weight = torch.cat(list(readings)), length, [], []
+        offset = 0
+        for reading, share in zip(readings, weights, strict=True):
+            count = len(reading) - length
+            if count > 0:  # row 0 has no reading
+                starts.append(offset + 1 + torch.arange(count))
+                weight.append(torch.full((count,), share / count))
+            offset += len(reading)
+        self.starts, self.weight = torch.cat(starts), torch.cat(weight)
+
+    def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 64) -> TensorDict:
+        """Windows ``[batch, length]``, of which up to half of the frames do not arrive."""
+        start = self.starts[torch.multinomial(self.weight, batch, replacement=True, generator=generator)]
+        windows = self.readings[start.unsqueeze(-1) + torch.arange(self.length)]
+        share = 0.5 * torch.rand(batch, 1, 1, generator=generator)
+        kept = torch.rand(batch, self.length + 1, 1, generator=generator) >= share
+        windows["observed"] = windows["observed"] & kept[:, 1:] & kept[:, :-1]  # a pair needs both of its frames
+        return with_start(windows, start_std, generator)
+
+
+def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
+    """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
+    noise = torch.randn(len(windows), 1, 5, generator=generator)
+    windows["start"] = windows["state"] + start_std * noise
+    is_init = torch.zeros(*windows.batch_size, 1, dtype=torch.bool)
+    is_init[:, 0] = True
+    return windows.set("is_init", is_init)

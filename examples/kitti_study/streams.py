@@ -1,0 +1,136 @@
+"""Drives as the study reads them: one stream for each drive, camera and condition, computed once and kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import torch
+from tensordict import TensorDict
+from torchrl.envs.transforms import Transform
+from tqdm import tqdm
+
+from torch_denkf.data import list_kitti_drives, read_kitti_drive, with_motion
+from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+
+SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
+MISSING = 0.3  # share of frames that do not arrive, and of black ones, as in the paper
+
+#: What happens to every image of a drive. "missing" needs no images of its own: it is a mask.
+DISTURBANCES = {
+    "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=["image"], generator=generator),
+    "blur": lambda generator: Blur(in_keys=["image"], generator=generator),
+    "brightness": lambda generator: Brightness(in_keys=["image"], generator=generator),
+    "black": lambda generator: BlackFrames(MISSING, in_keys=["image"], generator=generator),
+    "box": lambda generator: OccludingBox(in_keys=["image"], generator=generator),
+}
+CONDITIONS = ("clean", *DISTURBANCES, "missing")
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One camera's images of one drive under one condition."""
+
+    root: str
+    drive: str
+    camera: str
+    condition: str = "clean"
+    size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
+    pitch: float = 0.0  # rad: the camera is taken to be turned so far up, which makes the sensor find out
+    stride: int = 1  # 2 takes every other frame, at the same frame time: the drive at twice the speed
+
+    @property
+    def name(self) -> str:
+        """Drive and camera."""
+        return f"{self.drive}/{self.camera}"
+
+    def seed(self) -> int:
+        """Random numbers of the condition: its own, the same each time."""
+        what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.stride)
+        return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
+
+    def read(self, cache: Path) -> TensorDict:
+        """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
+        folder = cache / f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
+        if not (folder / "done").exists():
+            self._compute().memmap(folder)
+            (folder / "done").touch()
+        return TensorDict.load_memmap(folder)
+
+    def _compute(self) -> TensorDict:
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        drive = read_kitti_drive(self.root, self.drive, camera=self.camera, size=self.size, colour=False, cache=None)
+        if self.stride > 1:
+            drive = drive[:: self.stride].contiguous()
+            drive["state"] = drive["state"] * torch.tensor([1.0, 1.0, 1.0, self.stride, self.stride])
+        if self.pitch:
+            drive["calibration"][:, 3] += self.pitch * drive["calibration"][:, 1]
+        if self.condition != "clean":
+            disturb: Transform = DISTURBANCES[self.condition](torch.Generator().manual_seed(self.seed()))
+            drive = disturb(drive)
+        drive = with_motion(drive, cache=None)
+        small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
+        return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
+
+
+def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:
+    """Every camera of every drive below ``root`` that has images and poses."""
+    found = drives or list_kitti_drives(root)
+    if not found:
+        raise FileNotFoundError(f"no drive below {root} has both images and poses")
+    streams = []
+    for drive in found:
+        folder = Path(root) / "sequences" / drive
+        cameras = [camera for camera in ("image_2", "image_3") if any((folder / camera).glob("*.png"))]
+        cameras = cameras or [camera for camera in ("image_0", "image_1") if any((folder / camera).glob("*.png"))]
+        streams += [Stream(str(root), drive, camera, size=tuple(size)) for camera in cameras]
+    return streams
+
+
+def _prepare(job: tuple[Stream, Path]) -> None:
+    stream, cache = job
+    stream.read(cache)
+
+
+def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
+    """Computes what is not on disk yet, drives side by side."""
+    cache.mkdir(parents=True, exist_ok=True)
+    jobs = [(stream, cache) for stream in streams]
+    if processes < 2:
+        for job in tqdm(jobs, desc="flow of all drives", disable=None):
+            _prepare(job)
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        list(tqdm(pool.map(_prepare, jobs), total=len(jobs), desc="flow of all drives", disable=None))
+
+
+def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
+    """Rows of a stream as the sensor reads them; a row whose frame or the one before is missing is not observed."""
+    before = (index - 1).clamp_min(0)
+    observed = stream["frame_valid"][index] & stream["frame_valid"][before] & (index > 0).unsqueeze(-1)
+    state = stream["state"][index]
+    frames = TensorDict({"observed": observed, "state": state}, batch_size=index.shape)
+    frames["target_observation"] = state[..., 3:]
+    if sensor == "flow":
+        frames.update({"flow": stream["flow"][index], "road": stream["road"][index]})
+    else:
+        image, previous = (stream["image"][i].float() / 255 for i in (index, before))
+        frames["pixels"] = torch.where(observed[..., None, None], torch.cat([image, image - previous], -3), 0.0)
+    return frames
+
+
+def mirror(frames: TensorDict) -> TensorDict:
+    """What a mirrored world would have shown: sideways motion and turns change sign."""
+    frames = frames.copy()
+    frames["state"] = frames["state"] * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0])
+    frames["target_observation"] = frames["state"][..., 3:]
+    if "pixels" in frames.keys():  # noqa: SIM118
+        frames["pixels"] = frames["pixels"].flip(-1)
+        return frames
+    sign = torch.tensor([-1.0, 1.0, 1.0])[:, None, None].to(frames["flow"].dtype)
+    return frames.set("flow", frames["flow"].flip(-1) * sign)

@@ -1,0 +1,211 @@
+"""Leave one drive out: who plays which part, and the jobs of the table, each of which can be broken off and resumed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from kitti_study.evaluation import evaluate
+from kitti_study.fold import Fold, Part, with_disturbances
+from kitti_study.plots import draw_drive
+from kitti_study.streams import Stream, find_streams, prepare
+from kitti_study.training import Budget, pretrain, train_fold
+from torch_denkf.data import write_drives
+
+RENDERED_FRAMES = 160
+
+
+@dataclass(frozen=True)
+class Study:
+    """All that a job needs to know."""
+
+    root: Path
+    out: Path
+    size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
+    drives: tuple[str, ...] = ()  # all that are found
+    rendered: int = 0  # drives to render for pre-training
+    budget: Budget = Budget()
+
+    @property
+    def cache(self) -> Path:
+        """Streams."""
+        return self.out / "streams"
+
+    def streams(self) -> list[Stream]:
+        """The drives of the study."""
+        return find_streams(self.root, self.size, list(self.drives) or None)
+
+    def rendered_parts(self) -> tuple[list[Part], list[Part]]:
+        """Rendered drives along invented paths, to train the sensor on; and others that it does not see.
+
+        Each is seen by a camera that is turned up or down a little, as another car's would be.
+        """
+        if not self.rendered:
+            return [], []
+        root, names = self.out / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
+        write_drives(root, names, frames=RENDERED_FRAMES, size=self.size, seed=0)
+        pitches = (torch.rand(self.rendered, generator=torch.Generator().manual_seed(0)) * 2 - 1) * 0.03
+        streams = [
+            Stream(str(root), name, "image_2", size=self.size, pitch=round(float(pitch), 4))
+            for name, pitch in zip(names, pitches, strict=True)
+        ]
+        held_out = max(self.rendered // 6, 1)
+        return [Part(stream) for stream in streams[held_out:]], [Part(stream) for stream in streams[:held_out]]
+
+
+def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
+    """The fold that leaves ``test`` out, with rendered drives to train on, or without.
+
+    The drives that follow the test drive, in turn, tune and validate; those of too few rows never do.
+    """
+    drives = list(dict.fromkeys(stream.drive for stream in streams))
+    of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
+    at = drives.index(test)
+    others = [*drives[at + 1 :], *drives[:at]]
+    long = [drive for drive in others if _rows(of[drive][0]) >= 150] or others
+    if held_out:  # few drives: one tunes with its first rows and validates with its last ones
+        tune, validation = long[:1], long[:1]
+        share = 0.6
+    else:
+        validation, tune, share = long[:1], long[1 : 3 if len(long) > 4 else 2], None
+    rest = [drive for drive in others if drive not in (*tune, *validation)]
+    if not rest:
+        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
+
+    def parts(names: Sequence[str], begin: float = 0.0, end: float = 1.0, weight: float = 1.0) -> list[Part]:
+        return [Part(s, begin, end, weight / len(names) / len(of[name])) for name in names for s in of[name]]
+
+    own = parts(rest)
+    fast = [replace(part, stream=replace(part.stream, stride=2), weight=0.5 * part.weight) for part in own]
+    rendered = [replace(part, weight=1.5 / len(train)) for part in train]
+    rendered_tune = [replace(part, weight=0.5 / len(held_out)) for part in held_out]
+    return Fold(
+        test,
+        train=[*with_disturbances(own), *(fast if train else []), *with_disturbances(rendered)],
+        tune=with_disturbances([*parts(tune, end=share or 1.0), *rendered_tune]),
+        validation=with_disturbances(parts(validation, begin=share or 0.0)),
+        test=of[test],
+    )
+
+
+def _rows(stream: Stream) -> int:
+    return sum(1 for _ in (Path(stream.root) / "sequences" / stream.drive / stream.camera).glob("*.png"))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One filter with one sensor on one fold from one seed."""
+
+    study: Study
+    fold: Fold
+    filter: str
+    sensor: str
+    seed: int
+    rendered: tuple[tuple[Part, ...], tuple[Part, ...]] = ((), ())
+
+    @property
+    def out(self) -> Path:
+        """Checkpoints, logs and rows."""
+        return self.study.out / "folds" / f"{self.fold.name}-{self.filter}-{self.sensor}-{self.seed}"
+
+    def run(self) -> list[dict]:
+        """Trains, evaluates and draws; what is done already is read."""
+        file = self.out / "rows.json"
+        if file.exists():
+            return json.loads(file.read_text())
+        torch.set_num_threads(1)
+        study, sensor = self.study, None
+        if self.rendered[0]:
+            sensor = self.pretrain()
+        model, facts = train_fold(
+            self.fold,
+            self.filter,
+            self.sensor,
+            out=self.out,
+            cache=study.cache,
+            seed=self.seed,
+            budget=study.budget,
+            pretrained=sensor,
+            loggers=("csv", "tensorboard"),
+        )
+        rows = []
+        for stream in self.fold.test:
+            names = {"filter_name": self.filter, "kind": self.sensor, "seed": self.seed}
+            own, beliefs = evaluate(model, facts, stream, study.cache, **names)
+            rows += own
+            for condition in ("clean", "missing") if self.seed == 0 else ():
+                shown = [row for row in own if row["condition"] == condition]
+                title = f"{stream.name}, {condition}: {self.filter} with the {self.sensor} sensor, unseen in training"
+                picture = study.out / "plots" / f"{stream.drive}-{stream.camera}-{self.filter}-{self.sensor}-{condition}.png"
+                picture.parent.mkdir(parents=True, exist_ok=True)
+                draw_drive(beliefs[condition], shown, title, facts.dt, picture)
+        beside = file.with_suffix(".part")
+        beside.write_text(json.dumps(rows))
+        beside.replace(file)
+        return rows
+
+    def pretrain(self):
+        """The sensor that all folds of this seed begin with."""
+        return pretrain(
+            self.sensor,
+            with_disturbances(self.rendered[0]),
+            with_disturbances(self.rendered[1]),
+            out=self.study.out / "pretrained" / f"{self.sensor}-{self.seed}",
+            cache=self.study.cache,
+            seed=self.seed,
+            updates=self.study.budget.sensor,
+        )
+
+    def prepare_sensor(self) -> None:
+        """Does :meth:`pretrain` ahead of all folds, so that no two do it at once."""
+        torch.set_num_threads(1)
+        self.pretrain()
+
+
+def make_jobs(study: Study, filters: Sequence[str], sensors: Sequence[str], seeds: int, tests: Sequence[str]) -> list[Job]:
+    """Every combination; seeds last, so that a study that is broken off has whole folds."""
+    streams, rendered = study.streams(), study.rendered_parts()
+    names = list(dict.fromkeys(stream.drive for stream in streams))
+    folds = [make_fold(name, streams, *rendered) for name in (tests or names)]
+    both = (tuple(rendered[0]), tuple(rendered[1]))
+    return [
+        Job(study, fold, name, sensor, seed, both)
+        for seed in range(seeds)
+        for sensor in sensors
+        for name in filters
+        for fold in folds
+    ]
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> list[dict]:
+    """Computes all streams, pre-trains, then runs all folds side by side."""
+    study = jobs[0].study
+    parts = [part for job in jobs for part in (*job.fold.train, *job.fold.tune, *job.fold.validation)]
+    tested = with_disturbances([Part(stream) for job in jobs for stream in job.fold.test])
+    streams = list(dict.fromkeys(part.stream for part in (*parts, *tested)))
+    prepare(streams, study.cache, processes)
+    first = {(job.sensor, job.seed): job for job in jobs if job.rendered[0]}
+    _side_by_side([job.prepare_sensor for job in first.values()], processes, "training on rendered drives")
+    return [row for rows in _side_by_side([job.run for job in jobs], processes, "folds") for row in rows]
+
+
+def _side_by_side(calls: Sequence, processes: int, title: str) -> list:
+    if processes < 2:
+        return [call() for call in tqdm(calls, desc=title, disable=None)]
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(call) for call in calls]
+        for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
+            future.result()  # raises what the job raised
+        return [future.result() for future in futures]
+
+
+def describe(study: Study) -> dict:
+    """The settings, for the record."""
+    return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(study).items()}
