@@ -26,12 +26,12 @@ from torch_denkf.metrics import (
 )
 
 WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
-COLUMNS = (
-    "filter sensor drive condition window seed translation_m_per_m rotation_deg_per_m coverage90 coverage90_v "
-    "coverage90_theta_dot rmse_v_m_per_s mae_v_m_per_s rmse_theta_dot_deg_per_s mae_theta_dot_deg_per_s "
-    "crps_v_m_per_s nll nees spread_skill pathlength_m_per_m pathlength_deg_per_m devkit_t_rel_percent "
-    "devkit_r_rel_deg_per_m blind"
-).split()
+_NAMES = ("filter", "sensor", "drive", "condition", "window", "seed")
+_ERRORS = ("translation_m_per_m", "rotation_deg_per_m", "coverage90", "coverage90_v", "coverage90_theta_dot")
+_VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae_theta_dot_deg_per_s")
+_BELIEF = ("crps_v_m_per_s", "nll", "nees", "spread_skill")
+_OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent", "devkit_r_rel_deg_per_m", "blind")
+COLUMNS = (*_NAMES, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS)
 
 
 def hold_last(reading: TensorDict) -> Tensor:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from kitti_study.filters import VELOCITIES, Statistics
-from kitti_study.streams import DISTURBANCES, Stream, mirror, rows
 from tensordict import TensorDict
 from torch import Tensor
+
+from kitti_study.filters import VELOCITIES, Statistics
+from kitti_study.streams import DISTURBANCES, Stream, mirror, rows
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import shutil
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -56,9 +59,13 @@ class Stream:
     def read(self, cache: Path) -> TensorDict:
         """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
         folder = cache / f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
-        if not (folder / "done").exists():
-            self._compute().memmap(folder)
-            (folder / "done").touch()
+        if not folder.exists():
+            beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
+            self._compute().memmap(beside / "stream")
+            # Renamed when whole: a kill leaves no half stream, and of two processes the first one wins.
+            with contextlib.suppress(OSError):
+                (beside / "stream").rename(folder)
+            shutil.rmtree(beside, ignore_errors=True)
         return TensorDict.load_memmap(folder)
 
     def _compute(self) -> TensorDict:

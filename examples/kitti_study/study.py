@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -31,7 +31,7 @@ class Study:
     size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
     drives: tuple[str, ...] = ()  # all that are found
     rendered: int = 0  # drives to render for pre-training
-    budget: Budget = Budget()
+    budget: Budget = field(default_factory=Budget)
 
     @property
     def cache(self) -> Path:
@@ -115,37 +115,30 @@ class Job:
         """Checkpoints, logs and rows."""
         return self.study.out / "folds" / f"{self.fold.name}-{self.filter}-{self.sensor}-{self.seed}"
 
+    def train(self):
+        """Trains, or goes on where it was broken off; returns the filter and the training drives' statistics."""
+        torch.set_num_threads(1)
+        return train_fold(
+            self.fold,
+            self.filter,
+            self.sensor,
+            out=self.out,
+            cache=self.study.cache,
+            seed=self.seed,
+            budget=self.study.budget,
+            pretrained=self.pretrain() if self.rendered[0] else None,
+            loggers=("csv", "tensorboard"),
+        )
+
     def run(self) -> list[dict]:
         """Trains, evaluates and draws; what is done already is read."""
         file = self.out / "rows.json"
         if file.exists():
             return json.loads(file.read_text())
-        torch.set_num_threads(1)
-        study, sensor = self.study, None
-        if self.rendered[0]:
-            sensor = self.pretrain()
-        model, facts = train_fold(
-            self.fold,
-            self.filter,
-            self.sensor,
-            out=self.out,
-            cache=study.cache,
-            seed=self.seed,
-            budget=study.budget,
-            pretrained=sensor,
-            loggers=("csv", "tensorboard"),
-        )
-        rows = []
-        for stream in self.fold.test:
-            names = {"filter_name": self.filter, "kind": self.sensor, "seed": self.seed}
-            own, beliefs = evaluate(model, facts, stream, study.cache, **names)
-            rows += own
-            for condition in ("clean", "missing") if self.seed == 0 else ():
-                shown = [row for row in own if row["condition"] == condition]
-                title = f"{stream.name}, {condition}: {self.filter} with the {self.sensor} sensor, unseen in training"
-                picture = study.out / "plots" / f"{stream.drive}-{stream.camera}-{self.filter}-{self.sensor}-{condition}.png"
-                picture.parent.mkdir(parents=True, exist_ok=True)
-                draw_drive(beliefs[condition], shown, title, facts.dt, picture)
+        model, facts = self.train()
+        names = {"filter_name": self.filter, "kind": self.sensor, "seed": self.seed}
+        plots = self.study.out / "plots" if self.seed == 0 else None
+        rows = evaluate_and_draw(model, facts, self.fold.test, self.study.cache, plots, **names)
         beside = file.with_suffix(".part")
         beside.write_text(json.dumps(rows))
         beside.replace(file)
@@ -169,7 +162,25 @@ class Job:
         self.pretrain()
 
 
-def make_jobs(study: Study, filters: Sequence[str], sensors: Sequence[str], seeds: int, tests: Sequence[str]) -> list[Job]:
+def evaluate_and_draw(model, facts, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
+    """Rows of some drives, and pictures of each, clean and with missing frames, in a folder if one is given."""
+    rows = []
+    for stream in streams:
+        own, beliefs = evaluate(model, facts, stream, cache, **names)
+        rows += own
+        for condition in ("clean", "missing") if plots else ():
+            shown = [row for row in own if row["condition"] == condition]
+            method = f"{names['filter_name']}-{names['kind']}"
+            title = f"{stream.name}, {condition}: {method}, on a drive that it has not seen"
+            plots.mkdir(parents=True, exist_ok=True)
+            picture = plots / f"{stream.drive}-{stream.camera}-{method}-{condition}.png"
+            draw_drive(beliefs[condition], shown, title, facts.dt, picture)
+    return rows
+
+
+def make_jobs(
+    study: Study, filters: Sequence[str], sensors: Sequence[str], seeds: int, tests: Sequence[str]
+) -> list[Job]:
     """Every combination; seeds last, so that a study that is broken off has whole folds."""
     streams, rendered = study.streams(), study.rendered_parts()
     names = list(dict.fromkeys(stream.drive for stream in streams))
@@ -184,13 +195,17 @@ def make_jobs(study: Study, filters: Sequence[str], sensors: Sequence[str], seed
     ]
 
 
-def run_jobs(jobs: Sequence[Job], processes: int) -> list[dict]:
-    """Computes all streams, pre-trains, then runs all folds side by side."""
-    study = jobs[0].study
+def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
+    """Computes all streams that the jobs read."""
     parts = [part for job in jobs for part in (*job.fold.train, *job.fold.tune, *job.fold.validation)]
     tested = with_disturbances([Part(stream) for job in jobs for stream in job.fold.test])
     streams = list(dict.fromkeys(part.stream for part in (*parts, *tested)))
-    prepare(streams, study.cache, processes)
+    prepare(streams, jobs[0].study.cache, processes)
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> list[dict]:
+    """Computes all streams, pre-trains, then runs all folds side by side."""
+    prepare_jobs(jobs, processes)
     first = {(job.sensor, job.seed): job for job in jobs if job.rendered[0]}
     _side_by_side([job.prepare_sensor for job in first.values()], processes, "training on rendered drives")
     return [row for rows in _side_by_side([job.run for job in jobs], processes, "folds") for row in rows]

@@ -17,7 +17,7 @@ TITLES = {"dead_reckoning": "dead reckoning", "floor": "floor: true v and theta_
 
 def write_csv(rows: Sequence[dict], file: Path) -> None:
     """All rows, one for each filter, sensor, drive, condition, window and seed."""
-    rows = sorted(rows, key=lambda row: tuple(str(row[key]) for key in COLUMNS[:4]) + (row["window"], row["seed"]))
+    rows = sorted(rows, key=lambda row: (*(row[key] for key in COLUMNS[:4]), row["window"], row["seed"]))
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
@@ -132,5 +132,3 @@ def _by_drive(rows: Sequence[dict], methods: Sequence, drives: Sequence[str], wi
 
 def _of(row: dict, drive: str) -> bool:
     return row["drive"].split("/")[0] == drive
-
-

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, without_sensor
-from kitti_study.fold import Fold, FrameSampler, Part, ReadingSampler, statistics
-from kitti_study.streams import MISSING, mirror, rows
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, without_sensor
+from kitti_study.fold import Fold, FrameSampler, Part, ReadingSampler, statistics
+from kitti_study.streams import MISSING, mirror, rows
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import AroundState, SubModel
@@ -216,9 +217,28 @@ def train_fold(
         seed=seed,
     )
     trainer.fit()
+    save_settings(out, filter_name, kind, facts)
     return model, facts
 
 
-def load(model: nn.Module, file: Path) -> None:
-    """Puts a checkpoint's parameters into a model."""
-    model.load_state_dict(read_checkpoint(file)["model"])
+def save_settings(folder: Path, filter_name: str, kind: str, facts: Statistics) -> None:
+    """Leaves beside the checkpoints what :func:`load_filter` needs to build the filter anew."""
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = {key: value.tolist() if isinstance(value, Tensor) else value for key, value in asdict(facts).items()}
+    (folder / "filter.json").write_text(json.dumps({"filter": filter_name, "sensor": kind, "statistics": numbers}))
+
+
+def load_filter(folder: Path) -> tuple[Filter, Statistics, str, str]:
+    """A trained filter, the statistics of its training drives, and the names of filter and sensor.
+
+    Raises:
+        FileNotFoundError: if no training was finished in the folder.
+    """
+    if not (folder / "filter.json").exists() or not (folder / "best_end_to_end.pt").exists():
+        raise FileNotFoundError(f"no finished training in {folder}: it lacks filter.json or best_end_to_end.pt")
+    settings = json.loads((folder / "filter.json").read_text())
+    numbers = settings["statistics"]
+    facts = Statistics(**{k: torch.tensor(v) if isinstance(v, list) else v for k, v in numbers.items()})
+    model = FILTERS[settings["filter"]](SENSORS[settings["sensor"]](facts), facts)
+    model.load_state_dict(read_checkpoint(folder / "best_end_to_end.pt")["model"])
+    return model, facts, settings["filter"], settings["sensor"]
