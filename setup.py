@@ -25,7 +25,7 @@ setup(
         "numpy",
     ],
     extras_require={
-        "examples": ["tqdm", "matplotlib"],
+        "examples": ["tqdm", "matplotlib", "tensorboard"],
         "test": ["evo", "pytest", "pytest-xdist", "ruff", "import-linter", "build", "wheel", "pre-commit"],
     },
 )

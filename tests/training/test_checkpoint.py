@@ -1,0 +1,70 @@
+"""Damage done to real files by hand."""
+
+import pytest
+import torch
+
+from torch_denkf.training import checkpoint as module
+from torch_denkf.training import read_checkpoint, write_checkpoint
+
+
+@pytest.fixture
+def file(tmp_path):
+    write_checkpoint(tmp_path / "last.pt", {"weight": torch.arange(1000.0), "update": 7})
+    return tmp_path / "last.pt"
+
+
+def test_what_was_written_is_read(file):
+    content = read_checkpoint(file)
+    assert content["update"] == 7
+    assert torch.equal(content["weight"], torch.arange(1000.0))
+    assert [f.name for f in file.parent.iterdir()] == ["last.pt"]
+
+
+@pytest.mark.parametrize("size", [0, 10, 2000])
+def test_a_file_cut_short(file, size):
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(ValueError, match=r"last\.pt cannot be read as a checkpoint"):
+        read_checkpoint(file)
+
+
+def test_one_wrong_bit_in_a_weight(file):
+    content = bytearray(file.read_bytes())
+    place = content.index(torch.arange(1000.0).numpy().tobytes())
+    content[place + 400] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"last\.pt is damaged: the checksum"):
+        read_checkpoint(file)
+
+
+def test_a_file_of_others(tmp_path):
+    torch.save({"weight": torch.ones(1)}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"other\.pt is not a checkpoint of torch_denkf"):
+        read_checkpoint(tmp_path / "other.pt")
+
+
+def test_code_in_a_file_is_not_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return exec, (f"open({str(tmp_path / 'ran')!r}, 'w')",)
+
+    torch.save({"format": "torch_denkf.training/1", "trap": Trap()}, tmp_path / "trap.pt")
+    with pytest.raises(ValueError, match=r"trap\.pt cannot be read"):
+        read_checkpoint(tmp_path / "trap.pt")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.pt"):
+        read_checkpoint(tmp_path / "none.pt")
+
+
+def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
+    def half(content, stream):
+        stream.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(module.torch, "save", half)
+    with pytest.raises(OSError, match="disk full"):
+        write_checkpoint(file, {"update": 8})
+    monkeypatch.undo()
+    assert read_checkpoint(file)["update"] == 7

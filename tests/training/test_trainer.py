@@ -1,0 +1,284 @@
+"""Oracles: a training loop written out by hand, the maximum of a closed-form likelihood, scripted validations."""
+
+import sys
+
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+from tensordict import TensorDict
+from torch import nn
+from torchrl.record.loggers import CSVLogger
+from torchrl.trainers import ClearCudaCache, CountFramesLog, EarlyStopping, LogScalar
+
+from tests.training.problem import make_trainer
+from torch_denkf.filters import KalmanFilter
+from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.training import FilterTrainer, Stage, read_checkpoint
+from torch_denkf.training.update import seed_update
+
+
+def rows(out, name):
+    lines = (out / "logs" / "csv" / "scalars" / f"{name}.csv").read_text().split()
+    return [(int(step), float(value)) for step, value in (line.split(",") for line in lines)]
+
+
+def line_stage(net, name="fit", updates=6, spoil=(), **kwargs):
+    """Least squares on random points; the batches of the updates in ``spoil`` hold a NaN."""
+    drawn = iter(range(10**6))
+
+    def sample(generator, length):
+        x = torch.randn(8, 2, generator=generator)
+        if next(drawn) in spoil:
+            x[0, 0] = torch.nan
+        return TensorDict({"x": x, "y": x.sum(-1, keepdim=True) + torch.rand(8, 1)}, [8])
+
+    def loss(batch):
+        error = net(batch["x"]) - batch["y"]
+        return {"loss_square": error.square().mean(), "loss_bias": net.bias.square().sum(), "largest": error.max()}
+
+    return Stage(name, loss, sample, updates, **kwargs)
+
+
+def by_hand(stage, net, seed, number=0, spoil=()):
+    """The loop of examples/quickstart.py; returns the terms of every update."""
+    optimiser = torch.optim.AdamW(net.parameters(), lr=stage.lr, weight_decay=stage.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, stage.lr, total_steps=stage.updates)
+    seen = []
+    for update in range(stage.updates):
+        batch = stage.sample(seed_update(seed, number, update), None)
+        if update in spoil:
+            continue
+        terms = stage.loss(batch)
+        optimiser.zero_grad()
+        (terms["loss_square"] + terms["loss_bias"]).backward()
+        norm = nn.utils.clip_grad_norm_(net.parameters(), stage.clip)
+        seen.append({**{k: v.item() for k, v in terms.items()}, "grad_norm": norm.item()})
+        seen[-1]["lr"] = optimiser.param_groups[0]["lr"]
+        optimiser.step()
+        schedule.step()
+    return seen
+
+
+@pytest.mark.parametrize("spoil", [(), (0,), (2, 3)])
+def test_it_is_the_loop_that_one_would_write(tmp_path, spoil):
+    net, twin = nn.Linear(2, 1), nn.Linear(2, 1)
+    twin.load_state_dict(net.state_dict())
+    options = {"lr": 0.1, "weight_decay": 0.2, "clip": 0.5}
+    trainer = FilterTrainer(
+        net, [line_stage(net, spoil=spoil, **options)], out=tmp_path, seed=3, log_every=3, device="cpu", save_every=4
+    )
+    result = trainer.fit()["fit"]
+    seen = by_hand(line_stage(twin, spoil=spoil, **options), twin, 3, spoil=spoil)
+    for one, other in zip(net.parameters(), twin.parameters(), strict=True):
+        # clip_grad_norm_ and its two halves multiply in the same order
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    assert result == {
+        "value": None, "update": 6, "metrics": {}, "path": tmp_path / "best_fit.pt", "skipped": len(spoil)
+    }  # fmt: skip
+    assert all(step["grad_norm"] > 0.5 for step in seen[:2])  # so that clipping is at work
+    made = [update for update in range(6) if update not in spoil]
+    for name in ("loss_square", "loss_bias", "largest", "grad_norm"):
+        for (step, value), window in zip(rows(tmp_path, f"fit/{name}"), ((0, 1, 2), (3, 4, 5)), strict=True):
+            values = [terms[name] for update, terms in zip(made, seen, strict=True) if update in window]
+            assert step == window[-1] + 1
+            assert value == pytest.approx(sum(values) / len(values), rel=1e-6)  # single precision
+    assert rows(tmp_path, "fit/lr")[-1] == (6, pytest.approx(seen[-1]["lr"], rel=1e-12))
+    assert rows(tmp_path, "fit/skipped") == [(3, sum(u < 3 for u in spoil)), (6, len(spoil))]
+    square, bias, total = (rows(tmp_path, f"fit/{name}") for name in ("loss_square", "loss_bias", "loss"))
+    assert [v for _, v in total] == pytest.approx([a + b for (_, a), (_, b) in zip(square, bias, strict=True)])
+
+
+def test_too_many_that_are_not_finite(tmp_path):
+    net = nn.Linear(2, 1)
+    stage = line_stage(net, "spoilt", updates=20, spoil=range(5, 20))
+    trainer = FilterTrainer(net, [stage], out=tmp_path, device="cpu", save_every=1, max_skipped=3)
+    with pytest.raises(FloatingPointError, match=r"Stage 'spoilt', update 9: .* in 4 updates in a row"):
+        trainer.fit()
+    state = read_checkpoint(tmp_path / "last.pt")
+    assert (state["update"], state["updates"]["in_a_row"]) == (8, 3)
+    twin = nn.Linear(2, 1)
+    twin.load_state_dict(state["model"])
+    assert all(torch.equal(one, other) for one, other in zip(net.parameters(), twin.parameters(), strict=True))
+    assert all(torch.isfinite(p).all() and p.requires_grad for p in net.parameters())
+
+
+def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
+    truth, Q, R, T, rows_ = 0.8, 0.3, 0.2, 12, 64
+    x, readings = torch.randn(rows_), []
+    for _ in range(T):
+        readings.append(x + R**0.5 * torch.randn(rows_))
+        x = truth * x + Q**0.5 * torch.randn(rows_)
+    readings = torch.stack(readings, 1)
+
+    def joint(F):
+        """Mean negative log-likelihood of readings 1 to T - 1, whose covariance is written out."""
+        var = [1.0]
+        for _ in range(T - 1):
+            var.append(F**2 * var[-1] + Q)
+        cov = torch.tensor(
+            [[F ** abs(t - s) * var[min(s, t)] + R * (s == t) for s in range(1, T)] for t in range(1, T)]
+        )
+        density = torch.distributions.MultivariateNormal(torch.zeros(T - 1), cov)
+        return -density.log_prob(readings[:, 1:]).mean().item() / (T - 1)
+
+    best = minimize_scalar(joint, bounds=(0.1, 1.0), method="bounded", options={"xatol": 1e-8})
+    one = torch.eye(1)
+    kalman = KalmanFilter(0.3 * one, Q * one, one, R * one, mean=torch.zeros(1), cov=one)
+    del kalman["transition"].matrix
+    kalman["transition"].matrix = nn.Parameter(0.3 * one)
+    nll = DEnKFLoss(kalman, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
+    batch = TensorDict({"observation": readings.unsqueeze(-1)}, [rows_, T])
+    stage = Stage("fit", nll, lambda generator, length: batch.copy(), 150, lr=0.05)
+    trainer = FilterTrainer(
+        kalman, [stage], out=tmp_path, device="cpu", validate=lambda: nll(batch.copy()), validate_every=20
+    )
+    result = trainer.fit()["fit"]
+    fitted = kalman["transition"].matrix.item()
+    assert result["value"] == pytest.approx(best.fun, abs=1e-7)
+    assert fitted == pytest.approx(best.x, abs=1e-3)
+    assert abs(fitted - truth) < 0.1  # three standard errors of 64 x 11 steps are 0.09
+
+
+def test_stages_freeze_and_hand_on(tmp_path):
+    trainer = make_trainer(tmp_path, updates=3, keep="last")
+    denkf = trainer.model
+    start = {name: value.clone() for name, value in denkf.state_dict().items()}
+    trainer.fit()
+    after = {
+        name: read_checkpoint(tmp_path / f"best_{name}.pt")["model"] for name in ("sensor", "filter", "end_to_end")
+    }
+    own = {id(parameter) for parameter in denkf["sensor"].parameters()}
+    sensor = {name for name, parameter in denkf.named_parameters() if id(parameter) in own}
+    rest = {name for name, _ in denkf.named_parameters()} - sensor
+    assert sensor
+    assert rest
+    moved = lambda a, b: {name for name, _ in denkf.named_parameters() if not torch.equal(a[name], b[name])}  # noqa: E731
+    assert moved(start, after["sensor"]) == sensor
+    assert moved(after["sensor"], after["filter"]) == rest
+    assert moved(after["filter"], after["end_to_end"]) == sensor | rest
+    assert all(p.requires_grad and p.grad is None for p in denkf.parameters())
+    assert rows(tmp_path, "end_to_end/length") == [(2, 2.0), (3, 4.0)]
+
+
+@pytest.mark.parametrize(("keep", "best", "handed_on"), [("best", 4, 4), ("last", 6, 6)])
+def test_the_best_is_kept(tmp_path, keep, best, handed_on):
+    net, weights, errors = nn.Linear(2, 1), [], iter([5.0, 3.0, 1.0, float("nan"), 0.5, 0.7])
+
+    def validate():
+        assert not net.training
+        assert not torch.is_grad_enabled()
+        weights.append(net.weight.clone())
+        return {"error": next(errors), "other": torch.tensor(-7.0)}
+
+    own = {"validate": lambda: {"own": net.weight.sum()}, "monitor": "own"}
+    stages = [line_stage(net, "first"), line_stage(net, "second", updates=2, **own)]
+    trainer = FilterTrainer(
+        net, stages, out=tmp_path, device="cpu", validate=validate, validate_every=2, monitor="error", keep=keep
+    )
+    results = trainer.fit()
+    assert net.training
+    assert len(weights) == 4
+    assert results["first"]["update"] == best
+    assert results["first"]["metrics"]["other"] == -7.0
+    if keep == "best":
+        assert results["first"]["value"] == 1.0
+    assert torch.equal(read_checkpoint(results["first"]["path"])["model"]["weight"], weights[handed_on // 2])
+    assert rows(tmp_path, "second/validation/own")[0] == (0, pytest.approx(weights[handed_on // 2].sum().item()))
+    assert [step for step, _ in rows(tmp_path, "first/validation/error")] == [0, 2, 4, 6]
+    last = read_checkpoint(results["second"]["path"])
+    assert torch.equal(last["model"]["weight"], net.weight)
+    assert results["second"]["value"] == pytest.approx(net.weight.sum().item())
+
+
+def test_validation_leaves_the_training_alone(tmp_path):
+    finals = []
+    for draws in (0, 5):
+        net = nn.Linear(2, 1)
+        nn.init.ones_(net.weight)
+        nn.init.zeros_(net.bias)
+        seen = []
+
+        def validate(draws=draws, seen=seen):
+            seen.append(torch.rand(draws + 1).sum().item())
+            return {"error": 1.0}
+
+        out = tmp_path / str(draws)
+        FilterTrainer(
+            net, [line_stage(net)], out=out, device="cpu", validate=validate, validate_every=1 + draws, keep="last"
+        ).fit()
+        assert len(seen) > 1
+        assert len(set(seen)) == 1  # the same numbers each time
+        finals.append(net.weight.detach())
+    assert torch.equal(*finals)
+
+
+def test_hooks_of_torchrl(tmp_path, capfd):
+    net, calls = nn.Linear(2, 1), []
+    own = CSVLogger("own", log_dir=str(tmp_path))
+    trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", log_every=3, loggers=("csv", own))
+    counter = CountFramesLog(frame_skip=1)
+    counter.register(trainer, "counter")
+    LogScalar("y", "mean_y").register(trainer)
+    ClearCudaCache(interval=2).register(trainer)
+    trainer.register_op("process_optim_batch", lambda batch: batch[:5])
+    trainer.register_op("post_optim", lambda: calls.append(net.weight.grad.norm().item()))
+    with pytest.raises(ValueError, match="no place 'post_steps_log' for a hook; it has 'pre_optim_steps'"):
+        EarlyStopping(monitor="loss").register(trainer)
+    trainer.fit()
+    assert len(calls) == 6
+    assert rows(tmp_path, "fit/n_frames") == [(3, 5.0), (6, 10.0)]
+    stage = line_stage(net)
+    expected = [stage.sample(seed_update(0, 0, update), None)["y"][:5].mean().item() for update in (2, 5)]
+    assert [value for _, value in rows(tmp_path, "fit/mean_y")] == pytest.approx(expected)
+    state = read_checkpoint(trainer.last_checkpoint)["hooks"]
+    assert state["counter"] == counter.state_dict()
+    assert (tmp_path / "own/scalars/fit/loss.csv").read_text() == (
+        tmp_path / "logs/csv/scalars/fit/loss.csv"
+    ).read_text()
+    assert capfd.readouterr() == ("", "")  # no bar where no terminal is
+
+
+def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
+    shown = []
+
+    class Bar:
+        def __init__(self, **kwargs):
+            shown.append(kwargs)
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = update = lambda self, *_: None
+
+        def set_postfix(self, values, refresh):
+            shown.append(sorted(values))
+
+    monkeypatch.setattr(sys.modules["torch_denkf.training.progress"], "tqdm", Bar)
+    net = nn.Linear(2, 1)
+    trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", validate=lambda: {"error": 1.0})
+    trainer.fit()
+    assert shown == [
+        {"total": 6, "initial": 0, "desc": "fit", "disable": None},
+        ["error", "loss", "loss_bias", "loss_square"],
+    ]
+
+
+def test_mistakes(tmp_path):
+    net = nn.Linear(2, 1)
+    options = {"out": tmp_path, "device": "cpu"}
+    with pytest.raises(ValueError, match="name of its own"):
+        FilterTrainer(net, [line_stage(net), line_stage(net)], **options)
+    with pytest.raises(ValueError, match="Unknown logger 'wandb'"):
+        FilterTrainer(net, [line_stage(net)], loggers=["wandb"], **options)
+    with pytest.raises(ValueError, match="keep is"):
+        FilterTrainer(net, [line_stage(net)], keep="first", **options)
+    with pytest.raises(ValueError, match="at least 1"):
+        FilterTrainer(net, [line_stage(net)], log_every=0, **options)
+    with pytest.raises(KeyError, match=r"monitor='mse' is none of \['error'\]"):
+        FilterTrainer(net, [line_stage(net)], validate=lambda: {"error": 0.0}, monitor="mse", **options).fit()
+    for loss, message in (
+        (lambda batch: {"error": net(batch["x"]).mean()}, 'starts with "loss"'),
+        (lambda batch: {"loss": net(batch["x"])}, r"'loss' is \[8, 1\]"),
+        (lambda batch: {"loss": batch["x"].sum()}, "does not depend on the parameters"),
+    ):
+        stage = Stage("fit", loss, line_stage(net).sample, 1)
+        with pytest.raises(ValueError, match=message):
+            FilterTrainer(net, [stage], **options).fit(resume=False)

@@ -1,0 +1,28 @@
+"""What ``torchrun`` starts in test_distributed: trains, and leaves the first gradient and the last parameters."""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from tests.training.problem import make_trainer
+
+if __name__ == "__main__":
+    torch.set_default_dtype(torch.float64)
+    out = Path(sys.argv[1])
+    # End to end is not clipped: the gradient after a step is that before.
+    trainer = make_trainer(out, noise_in_batch=True, stages=("end_to_end",))
+    trainer.model.unused = torch.nn.Parameter(torch.ones(1))
+    rank, gradients = trainer.processes.rank, []
+
+    def keep_first():
+        if not gradients:
+            gradients.append([None if p.grad is None else p.grad.clone() for p in trainer.model.parameters()])
+
+    trainer.register_op("post_optim", keep_first)
+    result = trainer.fit()
+    lonely = torch.nn.Parameter(torch.zeros(2))
+    lonely.grad = torch.tensor([3.0, -1.0]) if rank == 1 else None
+    content = {"mean": trainer.processes.average_([lonely], torch.tensor([float(rank)])), "lonely": lonely.grad}
+    content |= {"gradient": gradients[0], "model": trainer.model.state_dict(), "result": result}
+    torch.save(content, out / f"rank_{rank}.pt")

@@ -1,0 +1,98 @@
+"""Checkpoint files: written whole or not at all, checked before they are used."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+__all__ = ["read_checkpoint", "write_checkpoint"]
+
+_FORMAT = "torch_denkf.training/1"
+
+
+def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
+    """Writes ``content`` beside ``file`` and then puts it in its place: a kill leaves the old file or the new one.
+
+    Args:
+        file: path; its folder exists.
+        content: tensors, state dicts and plain values, nested as you like.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> file = Path(mkdtemp()) / "last.pt"
+        >>> write_checkpoint(file, {"model": {"weight": torch.ones(1)}})
+        >>> read_checkpoint(file)["model"]
+        {'weight': tensor([1.])}
+    """
+    file = Path(file)
+    beside = file.with_name(file.name + ".part")
+    with beside.open("wb") as stream:
+        torch.save({"format": _FORMAT, **content}, stream)
+        stream.flush()
+        os.fsync(stream.fileno())  # else a power failure could put an empty file in the place of a good one
+    os.replace(beside, file)
+
+
+def read_checkpoint(file: Path | str) -> dict[str, Any]:
+    """Reads a checkpoint to the CPU, as data only: nothing in the file is executed.
+
+    Returns:
+        the content that :func:`write_checkpoint` was given.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged or not one of this library's; the message names the file.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"There is no checkpoint {file}.")
+    cure = "move it away to start anew, or restore it from a copy"
+    try:
+        with zipfile.ZipFile(file) as archive:  # torch.load does not look at the checksums
+            damaged = archive.testzip()
+        content = torch.load(file, map_location="cpu", weights_only=True) if damaged is None else None
+    except Exception as error:  # zipfile, torch and pickle have a dozen kinds for a file cut short
+        raise ValueError(f"{file} cannot be read as a checkpoint ({error}); {cure}.") from error
+    if damaged is not None:
+        raise ValueError(f"{file} is damaged: the checksum of its part {damaged!r} is wrong; {cure}.")
+    if not isinstance(content, dict) or content.pop("format", None) != _FORMAT:
+        raise ValueError(f"{file} is not a checkpoint of torch_denkf.training ({_FORMAT}); {cure}.")
+    return content
+
+
+def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[str, Any], stage: int) -> None:
+    """Raises unless a checkpoint is of the training that is to be resumed.
+
+    Stages that had not begun may have been changed, added or left out since.
+
+    Args:
+        file: the checkpoint, for the message.
+        saved: the settings in the checkpoint: ``seed``, ``processes`` and ``stages``, a list of dicts.
+        wanted: those of the training.
+        stage: number of the stage in which the checkpoint was written.
+
+    Raises:
+        ValueError: if settings differ; the message names the file and the settings.
+
+    Example:
+        >>> fit, tune = {"seed": 0, "processes": 1, "stages": [{"lr": 1.0}]}, {"lr": 0.1}
+        >>> check_settings("last.pt", fit, {**fit, "stages": [{"lr": 1.0}, tune]}, stage=1)
+        >>> check_settings("last.pt", fit, {**fit, "stages": [tune]}, stage=0)
+        Traceback (most recent call last):
+        ValueError: last.pt is of another training: stages[0].lr (1.0, now 0.1) differ. Give another out, or ...
+    """
+    pairs = [(name, saved[name], wanted[name]) for name in ("seed", "processes")]
+    for number, old in enumerate(saved["stages"][: stage + 1]):
+        new = wanted["stages"][number] if number < len(wanted["stages"]) else {}
+        pairs += [(f"stages[{number}].{key}", old.get(key), new.get(key)) for key in {**old, **new}]
+    different = [f"{name} ({old}, now {new})" for name, old, new in pairs if old != new]
+    if different:
+        raise ValueError(
+            f"{file} is of another training: {', '.join(different)} differ. Give another out, or start anew with "
+            "fit(resume=False)."
+        )

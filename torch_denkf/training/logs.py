@@ -1,0 +1,86 @@
+"""A run's logs, which a resumed run continues as if it had never been broken off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+from torchrl.record.loggers import CSVLogger, TensorboardLogger
+from torchrl.record.loggers.common import Logger
+
+__all__ = ["RunLogs"]
+
+_KINDS = {
+    "csv": (CSVLogger, "csv/**/*.csv"),
+    "tensorboard": (TensorboardLogger, "tensorboard/**/events.out.tfevents.*"),
+}
+
+
+class RunLogs:
+    """torchrl's loggers, of which those made here can be set back to an earlier :meth:`mark`.
+
+    Both of torchrl's file loggers only ever append, so the sizes of their files are all that a checkpoint needs: on
+    resuming, files are cut to their size and those that did not exist are removed.
+
+    Args:
+        folder: holds ``csv/scalars/*.csv`` (rows ``step,value``) and ``tensorboard/events.out.tfevents.*``.
+        loggers: ``"csv"``, ``"tensorboard"``, or loggers of torchrl, which are written to as they are: what they got
+            after the last checkpoint stays, and comes again.
+
+    Raises:
+        ValueError: on an unknown name.
+        ImportError: if ``tensorboard`` is asked for and not installed.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> logs = RunLogs(mkdtemp())
+        >>> logs.open({})
+        >>> logs.log({"loss": 0.5}, step=10)
+        >>> logs.mark()
+        {'csv/scalars/loss.csv': 7}
+    """
+
+    def __init__(self, folder: Path | str, loggers: Iterable[str | Logger] = ("csv",)):
+        self.folder, self._wanted, self._own = Path(folder), list(loggers), []
+        for logger in self._wanted:
+            if isinstance(logger, str) and logger not in _KINDS:
+                raise ValueError(f"Unknown logger {logger!r}: give one of {sorted(_KINDS)} or a torchrl Logger.")
+        if "tensorboard" in self._wanted and find_spec("tensorboard") is None:
+            raise ImportError(
+                'loggers=("tensorboard",) needs the package tensorboard: pip install "torch_denkf[examples]".'
+            )
+
+    def open(self, mark: Mapping[str, int]) -> None:
+        """Sets the files back to ``mark`` (``{}``: to nothing) and opens the loggers."""
+        for file, name in self._files():
+            if name not in mark:
+                file.unlink()
+            elif file.stat().st_size > mark[name]:
+                with file.open("r+b") as stream:
+                    stream.truncate(mark[name])
+        names = [logger for logger in self._wanted if isinstance(logger, str)]
+        self._own = [_KINDS[name][0](exp_name=name, log_dir=str(self.folder)) for name in names]
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Writes scalars."""
+        for logger in (*self._own, *(logger for logger in self._wanted if not isinstance(logger, str))):
+            logger.log_metrics(dict(values), step=step)
+
+    def mark(self) -> dict[str, int]:
+        """The sizes of all files in bytes, as they are now."""
+        for logger in self._own:
+            logger.flush()
+        return {name: file.stat().st_size for file, name in self._files()}
+
+    def close(self) -> None:
+        """Closes the loggers made here."""
+        for logger in self._own:
+            logger.close()
+        self._own = []
+
+    def _files(self) -> list[tuple[Path, str]]:
+        # Only what these loggers write: the folder may hold files of other people.
+        patterns = [pattern for _, pattern in _KINDS.values()]
+        files = sorted(file for pattern in patterns for file in self.folder.glob(pattern))
+        return [(file, file.relative_to(self.folder).as_posix()) for file in files]

@@ -1,0 +1,155 @@
+"""One stage of a training: what is fitted, on which batches, for how long and at which rate."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, OneCycleLR
+
+__all__ = ["Stage"]
+
+_SCHEDULES = ("one_cycle", "cosine", "constant")
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A part of a training: AdamW on some parameters of a model, all others frozen.
+
+    Args:
+        name: letters, digits, ``_`` and ``-``; it names files and log entries.
+        loss: maps a batch to a mapping (a tensordict, a dict) of scalars. Those whose name starts with ``"loss"`` are
+            summed and minimised; the others are logged only. Any torchrl loss module will do.
+        sample: ``sample(generator, length)`` draws a training batch. All its randomness is to come from the generator
+            (on the CPU), so that a resumed training sees the same batches. ``length`` is that of ``lengths``, or
+            ``None``.
+        updates: number of optimiser steps.
+        parameters: what is trained: parameters, or groups as torch's optimisers take them,
+            ``[{"params": ..., "lr": ...}, ...]``. By default all parameters of ``loss`` (if that is a module, else of
+            the trainer's model) that require gradients.
+        lr: learning rate; the peak for ``"one_cycle"``, the start for ``"cosine"``.
+        weight_decay: of AdamW, per unit of learning rate.
+        schedule: ``"one_cycle"``, ``"cosine"`` (to zero), ``"constant"``, or ``schedule(optimiser, updates)``, which
+            returns one of torch's schedulers; it is stepped after each update.
+        clip: largest norm of the gradient; ``None`` for no limit.
+        lengths: sequence lengths, ``{from_update: length}``, e.g. ``{0: 4, 500: 16}``: short ones first.
+        validate: in the place of the trainer's, e.g. where a sensor is trained alone.
+        monitor: in the place of the trainer's.
+
+    Raises:
+        ValueError: on a bad name, no updates, an unknown schedule, or lengths that say nothing about update 0.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> net = nn.Linear(1, 1)
+        >>> loss = lambda batch: {"loss_fit": (net(batch["x"]) - 2.0).square().mean()}
+        >>> sample = lambda generator, length: TensorDict({"x": torch.rand(8, length, 1, generator=generator)}, [8])
+        >>> stage = Stage("fit", loss, sample, updates=100, lengths={0: 4, 50: 16})
+        >>> [stage.length(update) for update in (0, 49, 50)]
+        [4, 4, 16]
+    """
+
+    name: str
+    loss: Callable[[TensorDictBase], Mapping[str, torch.Tensor]]
+    sample: Callable[[torch.Generator, int | None], TensorDictBase]
+    updates: int
+    parameters: Iterable[nn.Parameter] | Iterable[dict] | None = None
+    lr: float = 2e-3
+    weight_decay: float = 0.0
+    schedule: str | Callable[[torch.optim.Optimizer, int], LRScheduler] = "one_cycle"
+    clip: float | None = 1.0
+    lengths: Mapping[int, int] | None = None
+    validate: Callable[[], Mapping[str, float]] | None = None
+    monitor: str | None = None
+
+    def __post_init__(self):
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ValueError(f"A stage's name names files: letters, digits, _ and - only; got {self.name!r}.")
+        if self.updates < 1:
+            raise ValueError(f"Stage {self.name!r} has updates={self.updates}; give at least one.")
+        if not callable(self.schedule) and self.schedule not in _SCHEDULES:
+            raise ValueError(f"Stage {self.name!r}: schedule is one of {_SCHEDULES} or a function; {self.schedule!r}.")
+        if self.lengths is not None and 0 not in self.lengths:
+            raise ValueError(f"Stage {self.name!r}: lengths {dict(self.lengths)} lack the length from update 0 on.")
+        if self.parameters is not None:  # often generators, which would be empty the second time
+            parameters = [
+                {**entry, "params": list(entry["params"])} if isinstance(entry, dict) else entry
+                for entry in self.parameters
+            ]
+            object.__setattr__(self, "parameters", parameters)
+
+    def length(self, update: int) -> int | None:
+        """The sequence length of an update, counted from zero; ``None`` without ``lengths``."""
+        if self.lengths is None:
+            return None
+        return self.lengths[max(start for start in self.lengths if start <= update)]
+
+    def groups(self, model: nn.Module) -> list[dict]:
+        """The trained parameters as an optimiser's groups.
+
+        Raises:
+            ValueError: if there are none, or ``model`` lacks some: no checkpoint would hold them.
+        """
+        parameters = self.parameters
+        if parameters is None:
+            source = self.loss if isinstance(self.loss, nn.Module) else model
+            parameters = [parameter for parameter in source.parameters() if parameter.requires_grad]
+        groups = parameters if parameters and isinstance(parameters[0], dict) else [{"params": parameters}]
+        groups = [dict(group) for group in groups]  # the optimiser adds its settings to them
+        trained, held = [p for group in groups for p in group["params"]], {id(p) for p in model.parameters()}
+        if not trained:
+            raise ValueError(f"Stage {self.name!r} has no parameters to train; give parameters=...")
+        strange = sum(id(parameter) not in held for parameter in trained)
+        if strange:
+            raise ValueError(
+                f"Stage {self.name!r} trains {strange} parameters that the trainer's model does not hold, so that its "
+                "checkpoints would lose them; give the trainer a model that holds them, e.g. an nn.ModuleList."
+            )
+        return groups
+
+    def optimiser(self, groups: list[dict]) -> tuple[torch.optim.Optimizer, LRScheduler]:
+        """AdamW for :meth:`groups`, and its schedule."""
+        optimiser = torch.optim.AdamW(groups, lr=self.lr, weight_decay=self.weight_decay)
+        if callable(self.schedule):
+            return optimiser, self.schedule(optimiser, self.updates)
+        if self.schedule == "one_cycle":
+            peaks = [group["lr"] for group in optimiser.param_groups]
+            return optimiser, OneCycleLR(optimiser, peaks, total_steps=self.updates)
+        if self.schedule == "cosine":
+            return optimiser, CosineAnnealingLR(optimiser, self.updates)
+        return optimiser, LambdaLR(optimiser, lambda update: 1.0)
+
+    def settings(self, model: nn.Module) -> dict:
+        """What a checkpoint must agree with to be resumed; plain values."""
+        names = {id(parameter): name for name, parameter in model.named_parameters()}
+        schedule = self.schedule if isinstance(self.schedule, str) else getattr(self.schedule, "__qualname__", "custom")
+        return {
+            "name": self.name,
+            "updates": self.updates,
+            "lr": self.lr,
+            "weight_decay": self.weight_decay,
+            "schedule": schedule,
+            "clip": self.clip,
+            "lengths": None if self.lengths is None else dict(sorted(self.lengths.items())),
+            "parameters": [[names[id(p)] for p in group["params"]] for group in self.groups(model)],
+        }
+
+
+@contextmanager
+def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
+    """Freezes all of ``model`` but ``parameters``; afterwards every parameter is as it was."""
+    before = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
+    trained = {id(parameter) for parameter in parameters}
+    try:
+        for parameter, _ in before:
+            parameter.requires_grad_(id(parameter) in trained)
+        yield
+    finally:
+        for parameter, flag in before:
+            parameter.requires_grad_(flag)
+            parameter.grad = None

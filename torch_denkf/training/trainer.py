@@ -1,0 +1,292 @@
+"""Trains any filter, or a part of one, in stages; a training that was killed goes on as if it had not been."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import nn
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.record.loggers.common import Logger
+
+from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
+from torch_denkf.training.distributed import Processes
+from torch_denkf.training.hooks import HookPoints
+from torch_denkf.training.logs import RunLogs
+from torch_denkf.training.progress import progress_bar
+from torch_denkf.training.stage import Stage, only_trainable
+from torch_denkf.training.update import Updates, seed_update
+
+__all__ = ["FilterTrainer"]
+
+_VALIDATION = 2**32 - 1  # the "stage" whose seed every validation starts from
+
+
+class FilterTrainer(HookPoints):
+    """Runs :class:`Stage` after :class:`Stage` on one model, validates, and keeps the best.
+
+    torchrl's ``Trainer`` steps through a collector, has one loss and one optimiser, and does not restore all that an
+    exact resumption needs. This loop is our own, therefore; torchrl's losses, loggers and hooks
+    (:class:`~torch_denkf.training.hooks.HookPoints`) go in as they are.
+
+    A stage is validated before its first update, every ``validate_every`` updates and after its last. The next stage
+    starts from the best parameters of the one before, and those of the last are in the model at the end.
+
+    **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
+    CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
+    its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
+    outside of their ``state_dict``, and a sampler none at all.
+
+    **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
+    another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
+    equally many elements in each. The first process validates, logs and writes; all return the same.
+
+    Args:
+        model: what is trained and checkpointed; holds the parameters of all stages.
+        stages: the stages, in order.
+        out: folder; gets ``last.pt``, ``best_<stage>.pt`` (read them with :func:`read_checkpoint`; ``["model"]`` is
+            the model's state dict) and ``logs/``.
+        validate: returns errors on held-out data, ``{name: value}``. It is called without gradients, with the model in
+            ``eval()`` mode, and from the same seed each time.
+        monitor: the error that decides, lower is better; may be left out where ``validate`` returns but one.
+        validate_every: updates.
+        save_every: updates; at most so many are lost by a kill.
+        log_every: updates; their means are logged as ``<stage>/<term>``, validations as
+            ``<stage>/validation/<name>``, with the number of updates made in the stage as step.
+        loggers: see :class:`RunLogs`.
+        seed: of all random numbers of the training, at least 0. The model's initial parameters are yours to seed.
+        device: by default the GPU if there is one.
+        keep: ``"best"``, or ``"last"``: stages begin and end with the parameters of the last update.
+        max_skipped: so many non-finite updates in a row are left out; one more is an error.
+        progress: whether a terminal shows a bar (needs ``tqdm``).
+
+    Raises:
+        ValueError: on stages without parameters, with the same names, or whose parameters the model does not hold.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> from tensordict import TensorDict
+        >>> net = nn.Linear(1, 1)  # to become 3 x + 1
+        >>> line = lambda x: TensorDict({"x": x, "y": 3 * x + 1}, x.shape[:1])
+        >>> error = lambda batch: (net(batch["x"]) - batch["y"]).square().mean()
+        >>> fit = Stage(
+        ...     "fit",
+        ...     loss=lambda batch: {"loss_fit": error(batch)},
+        ...     sample=lambda generator, length: line(torch.rand(32, 1, generator=generator)),
+        ...     updates=200,
+        ...     lr=0.2,
+        ... )
+        >>> held_out = line(torch.linspace(0, 1, 11).unsqueeze(-1))
+        >>> trainer = FilterTrainer(
+        ...     net, [fit], out=mkdtemp(), validate=lambda: {"mse": float(error(held_out))}, device="cpu"
+        ... )
+        >>> best = trainer.fit()["fit"]
+        >>> best["value"] < 1e-4, best["path"].name
+        (True, 'best_fit.pt')
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        stages: Sequence[Stage],
+        *,
+        out: Path | str,
+        validate: Callable[[], Mapping[str, float]] | None = None,
+        monitor: str | None = None,
+        validate_every: int = 100,
+        save_every: int = 100,
+        log_every: int = 10,
+        loggers: Iterable[str | Logger] = ("csv",),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        keep: Literal["best", "last"] = "best",
+        max_skipped: int = 10,
+        progress: bool = True,
+    ):
+        super().__init__()
+        names = [stage.name for stage in stages]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"A training needs stages, each with a name of its own; got {names}.")
+        if min(validate_every, save_every, log_every) < 1:
+            raise ValueError("validate_every, save_every and log_every are numbers of updates, at least 1.")
+        if keep not in ("best", "last"):
+            raise ValueError(f'keep is "best" or "last"; got {keep!r}.')
+        self.model, self.stages, self.out = model, list(stages), Path(out)
+        self.validate, self.monitor = validate, monitor
+        self.validate_every, self.save_every, self.log_every = validate_every, save_every, log_every
+        self.seed, self.keep, self.max_skipped, self.progress = seed, keep, max_skipped, progress
+        self.processes = Processes(device)
+        for module in (model, *(stage.loss for stage in stages)):  # a loss has buffers of its own
+            if isinstance(module, nn.Module):
+                module.to(self.processes.device)
+        self._settings = {
+            "seed": seed,
+            "processes": self.processes.world_size,
+            "stages": [stage.settings(model) for stage in stages],
+        }
+        self._logs = RunLogs(self.out / "logs", loggers if self.processes.is_main else ())
+        self._results: dict[str, dict[str, Any]] = {}
+        self._best: dict[str, Any] | None = None
+        self._last_metrics: dict[str, float] = {}
+
+    @property
+    def last_checkpoint(self) -> Path:
+        """The file from which a training is resumed."""
+        return self.out / "last.pt"
+
+    def fit(self, *, resume: bool = True) -> dict[str, dict[str, Any]]:
+        """Trains to the end; where a checkpoint is, from there.
+
+        Args:
+            resume: ``False`` removes what an earlier run left in ``out`` and starts anew.
+
+        Returns:
+            for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
+            ``metrics`` there, the ``path`` of that checkpoint, and how many updates were ``skipped``.
+
+        Raises:
+            ValueError: if the checkpoint is damaged, or of another training; the message names the file.
+            FloatingPointError: if too many updates in a row are not finite; names stage and update.
+        """
+        state = self.processes.share(self._open(resume) if self.processes.is_main else None)
+        self._load_model(state["model"], str(self.last_checkpoint))
+        self._results, self._best = state["results"], state["best"]
+        self._last_metrics = state["last_metrics"]
+        self._load_hook_state(state["hooks"])
+        randomness = GlobalRNGState().state_dict()  # what follows a training is not to depend on where it was resumed
+        try:
+            for number in range(state["stage"], len(self.stages)):
+                self._run_stage(number, state["updates"], state["update"])
+                state.update(updates=None, update=0)
+        finally:
+            self._logs.close()
+            GlobalRNGState().load_state_dict(randomness)
+        results = {name: {**result, "path": self.out / result["path"]} for name, result in self._results.items()}
+        return {stage.name: results[stage.name] for stage in self.stages}
+
+    # ------------------------------------------------------------------------------------------------ one stage
+
+    def _run_stage(self, number: int, saved: dict | None, done: int) -> None:
+        stage = self.stages[number]
+        updates = Updates(stage, stage.groups(self.model), self.processes)
+        shown = self.progress and self.processes.is_main
+        bar = progress_bar(stage.name, stage.updates, done, shown)
+        with only_trainable(self.model, updates.parameters), bar:
+            if saved is None:
+                self._best = None
+                self._validate(stage, 0)
+                self._save(number, 0, updates)
+            else:
+                updates.load_state_dict(saved)
+            for update in range(done, stage.updates):
+                self._update(number, updates, update, bar)
+                made = update + 1
+                last = made == stage.updates
+                if made % self.validate_every == 0 or last:
+                    self._validate(stage, made)
+                if made % self.save_every == 0:
+                    self._save(number, made, updates)
+        self._finish(number, updates)
+
+    def _update(self, number: int, updates: Updates, update: int, bar: Any) -> None:
+        stage, length = updates.stage, updates.stage.length(update)
+        generator = seed_update(self.seed, number, update, self.processes.rank)
+        logged = (update + 1) % self.log_every == 0 or update + 1 == stage.updates
+        self._call_hooks("pre_optim_steps")
+        batch = self._hooked_batch(stage.sample(generator, length).to(self.processes.device))
+        values = self._hooked_values("pre_steps_log", batch) if logged else {}
+        updates.step(batch)
+        self._call_hooks("post_optim")
+        if updates.in_a_row > self.max_skipped:
+            raise FloatingPointError(
+                f"Stage {stage.name!r}, update {update + 1}: the loss or its gradient was not finite in "
+                f"{updates.in_a_row} updates in a row. Look for NaN in the batches; lower lr or clip. The last save, "
+                f"{self.last_checkpoint}, is sound."
+            )
+        if logged:
+            values |= updates.summary() | ({} if length is None else {"length": length})
+            values |= self._hooked_values("post_optim_log", batch)
+            self._log(stage, values, update + 1)
+            shown = {k: v for k, v in values.items() if k.startswith("loss")} | self._last_metrics
+            bar.set_postfix({k: f"{v:.3g}" for k, v in shown.items()}, refresh=False)
+        bar.update()
+
+    def _validate(self, stage: Stage, made: int) -> None:
+        validate = stage.validate or self.validate
+        if validate is None or not self.processes.is_main:
+            return
+        training = [module for module in self.model.modules() if module.training]
+        self.model.eval()
+        seed_update(self.seed, _VALIDATION, 0)  # the next update sets a seed of its own
+        try:
+            with torch.no_grad():
+                metrics = {name: float(value) for name, value in validate().items()}
+        finally:
+            for module in training:
+                module.training = True
+        monitor = stage.monitor or self.monitor or (next(iter(metrics)) if len(metrics) == 1 else None)
+        if monitor not in metrics:
+            raise KeyError(f"Stage {stage.name!r}: monitor={monitor!r} is none of {sorted(metrics)}; set monitor=...")
+        self._log(stage, {f"validation/{name}": value for name, value in metrics.items()}, made)
+        self._last_metrics = metrics
+        if self.keep == "last" or metrics[monitor] < (float("inf") if self._best is None else self._best["value"]):
+            self._set_best(stage, made, metrics[monitor], metrics)
+
+    def _set_best(self, stage: Stage, made: int, value: float | None, metrics: dict[str, float]) -> None:
+        self._best = {
+            "stage": stage.name,
+            "update": made,
+            "value": value,
+            "metrics": metrics,
+            "model": self._model_on_cpu(),
+        }
+        write_checkpoint(self.out / f"best_{stage.name}.pt", self._best)
+
+    def _finish(self, number: int, updates: Updates) -> None:
+        stage = updates.stage
+        if self.processes.is_main and self._best is None:  # no validation, or never a finite value
+            self._set_best(stage, stage.updates, None, {})
+        best = self.processes.share(self._best)
+        self._load_model(best["model"], f"best_{stage.name}.pt")
+        result = {key: best[key] for key in ("value", "update", "metrics")}
+        self._results[stage.name] = {**result, "path": f"best_{stage.name}.pt", "skipped": updates.skipped}
+        if number + 1 == len(self.stages):
+            self._save(number + 1, 0, None)
+
+    def _log(self, stage: Stage, values: Mapping[str, float], made: int) -> None:
+        self._logs.log({f"{stage.name}/{name}": value for name, value in values.items()}, made)
+
+    # ---------------------------------------------------------------------------------------------- checkpoints
+
+    def _save(self, number: int, made: int, updates: Updates | None) -> None:
+        if self.processes.is_main:
+            state = {"settings": self._settings, "stage": number, "update": made, "logs": self._logs.mark()}
+            state |= {"model": self.model.state_dict(), "updates": None if updates is None else updates.state_dict()}
+            state |= {"results": self._results, "best": self._best, "last_metrics": self._last_metrics}
+            write_checkpoint(self.last_checkpoint, {**state, "hooks": self._hook_state()})
+
+    def _open(self, resume: bool) -> dict[str, Any]:
+        self.out.mkdir(parents=True, exist_ok=True)
+        if resume and self.last_checkpoint.exists():
+            state = read_checkpoint(self.last_checkpoint)
+            check_settings(self.last_checkpoint, state["settings"], self._settings, state["stage"])
+            if state["best"] is not None:  # the file may be from validations that are about to be repeated
+                write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])
+            self._logs.open(state["logs"])
+            return state
+        for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
+            file.unlink(missing_ok=True)
+        self._logs.open({})
+        state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
+        return {**state, "model": self._model_on_cpu()}
+
+    def _model_on_cpu(self) -> dict[str, torch.Tensor]:
+        return {name: tensor.detach().cpu().clone() for name, tensor in self.model.state_dict().items()}
+
+    def _load_model(self, state: Mapping[str, torch.Tensor], source: str) -> None:
+        try:
+            self.model.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueError(f"{source} does not fit the model to be trained: {error}") from error
