@@ -55,8 +55,7 @@ def test_modules_is_a_relative_link():
     ("packages", "may"),
     [
         (["functional", "metrics"], set()),
-        (["functional", "metrics", "modules", "filters", "transforms", "objectives"], {"mujoco"}),
-        (["data", "envs"], {"mujoco", "cv2"}),
+        (["vision", "modules", "filters", "transforms", "objectives", "training", "data", "envs"], {"mujoco", "cv2"}),
     ],
 )
 def test_importing_costs_no_simulator_and_no_opencv(packages, may):
