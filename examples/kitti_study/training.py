@@ -18,7 +18,7 @@ from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import AroundState, SubModel
 from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint
+from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,9 @@ def pretrain(
     torch.manual_seed(seed)
     facts = statistics(parts, cache)
     sensor = SENSORS[kind](facts)
+    if (out / "sensor.pt").exists():
+        sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
+        return sensor
     model = nn.ModuleDict({"sensor": sensor})
     sampler = FrameSampler(parts, cache, kind)
     stage = Stage(
@@ -139,6 +142,7 @@ def pretrain(
         seed=seed,
     )
     trainer.fit()
+    write_checkpoint(out / "sensor.pt", {"sensor": sensor.state_dict()})
     return sensor
 
 
