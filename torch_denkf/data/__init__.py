@@ -1,6 +1,6 @@
 """Readers and generators of data."""
 
-from torch_denkf.data.drives import random_drive, roadside_scene, write_drives
+from torch_denkf.data.drives import random_drive, render_drives, roadside_scene, write_drives
 from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
 from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
@@ -14,6 +14,7 @@ __all__ = [
     "lorenz96_tendency",
     "random_drive",
     "read_kitti_drive",
+    "render_drives",
     "roadside_scene",
     "sample_windows",
     "with_motion",

@@ -1,4 +1,4 @@
-"""A pinhole camera above a flat road, in KITTI's axes: x right, y down, z forward, in metres."""
+"""A pinhole camera, in KITTI's axes: x right, y down, z forward, in metres."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+
+HEIGHT = 1.65  # m: of KITTI's cameras above the road
+KITTI_FOCAL = 718.856 / 1241  # of the odometry benchmark, as a share of the picture's width
 
 
 @dataclass(frozen=True)
@@ -23,19 +26,27 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    height: float = 1.65
+    height: float = HEIGHT
 
     @classmethod
     def kitti(cls, size: tuple[int, int]) -> Camera:
-        """KITTI's left colour camera (1242 x 375), scaled to ``size``."""
-        height, width = size
-        return cls(
-            size=(height, width),
-            fx=721.5 * width / 1242,
-            fy=721.5 * height / 375,
-            cx=610.1 * width / 1242 - 0.5,
-            cy=173.4 * height / 375 - 0.5,
-        )
+        """KITTI's left colour camera of the raw drives (1242 x 375), scaled to ``size``; for level poses."""
+        return cls._scaled(size, (375, 1242), 721.5, 610.1, 173.4)
+
+    @classmethod
+    def odometry(cls, size: tuple[int, int], focal: float = KITTI_FOCAL) -> Camera:
+        """The left camera of the odometry drives (1241 x 376), scaled to ``size``; its poses look down by about 1°.
+
+        Args:
+            size: (H, W) in pixels.
+            focal: focal length as a share of the width.
+        """
+        return cls._scaled(size, (376, 1241), focal * 1241, 607.1928, 185.2157)
+
+    @classmethod
+    def _scaled(cls, size, native, focal: float, cx: float, cy: float) -> Camera:
+        down, across = size[0] / native[0], size[1] / native[1]
+        return cls(size, focal * across, focal * down, cx * across - 0.5, cy * down - 0.5)
 
     def supersampled(self, down: int, across: int) -> Camera:
         """The same camera with ``down`` x ``across`` pixels for each one."""

@@ -45,15 +45,20 @@ def pyramid(texture: np.ndarray, levels: int) -> list[np.ndarray]:
 
 def ground(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grass, pavement and asphalt, each repeated to a piece from which any PATCH can be cut."""
-    green = 0.8 + 0.4 * rng.random()
+    green, contrast = 0.8 + 0.4 * rng.random(), rng.uniform(0.6, 1.3)
+    paving = np.array([(125, 130, 135), (105, 125, 140), (70, 95, 90)][rng.integers(3)])  # slabs, gravel, mown grass
     kinds = (
         ((45, 95 * green, 75), {1: 0.1, 4: 0.12, 16: 0.18, 64: 0.18}),
-        ((125, 130, 135), {1: 0.05, 4: 0.08, 16: 0.12, 64: 0.06}),
-        ((88, 88, 90), {1: 0.06, 4: 0.1, 16: 0.15, 64: 0.12}),
+        (tuple(paving), {1: 0.05, 4: 0.08, 16: 0.12, 64: 0.06}),
+        (tuple(np.array((88, 88, 90)) * rng.uniform(0.8, 1.35)), {1: 0.06, 4: 0.1, 16: 0.15, 64: 0.12}),
     )
-    tiles = [tinted(1 + noise(rng, (TILE, TILE), cells), colour) for colour, cells in kinds]
-    tiles[1][::16] //= 2  # slabs of 1.6 m
-    tiles[1][:, ::16] //= 2
+    tiles = [
+        tinted(1 + noise(rng, (TILE, TILE), {cell: contrast * size for cell, size in cells.items()}), colour)
+        for colour, cells in kinds
+    ]
+    if paving[0] > 120:
+        tiles[1][::16] //= 2  # slabs of 1.6 m
+        tiles[1][:, ::16] //= 2
     return tuple(np.tile(tile, (4, 4, 1)) for tile in tiles)
 
 
@@ -110,11 +115,20 @@ def _premultiplied(picture: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.dstack([weighted, alpha])
 
 
-def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Side (48 x 128) and rear (48 x 56) of a parked car."""
+def hedge(rng: np.random.Generator) -> np.ndarray:
+    """A hedge or a fence, 24 x 160 at 8 pixels a metre."""
+    if rng.random() < 0.7:
+        colour = np.array([40, 80, 55]) * rng.uniform(0.6, 1.3)
+        return tinted(1 + noise(rng, (24, 160), {2: 0.15, 8: 0.25}), colour)
+    boards = 1 + 0.3 * (np.arange(160) % 4 == 0)[None] * -np.ones((24, 1)) + noise(rng, (24, 160), {4: 0.05})
+    return tinted(boards, np.array([90, 115, 135]) * rng.uniform(0.6, 1.5))
+
+
+def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Side (48 x 128), rear and front (48 x 56) of a car."""
     paint = np.clip(rng.normal(110, 60) + rng.normal(0, 22, 3), 15, 230)
     views = []
-    for columns, margin in ((128, 22), (56, 6)):
+    for columns, margin in ((128, 22), (56, 6), (56, 6)):
         view = np.clip(paint * np.linspace(1.15, 0.75, 48)[:, None, None], 0, 255) * np.ones((1, columns, 1))
         view = view.astype(np.uint8)
         cv2.rectangle(view, (margin, 5), (columns - margin, 19), (50, 45, 40), -1)
@@ -123,9 +137,13 @@ def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     for x in (26, 102):
         cv2.circle(views[0], (x, 38), 11, (15, 15, 15), -1)
         cv2.circle(views[0], (x, 38), 5, (130, 130, 130), -1)
-    for x in (2, 44):
-        cv2.rectangle(views[1], (x, 24), (x + 9, 30), (30, 30, 200), -1)
-    return views[0], views[1]
+    for view, lamp in ((views[1], (30, 30, 200)), (views[2], (225, 235, 235))):
+        for x in (2, 44):
+            cv2.rectangle(view, (x, 24), (x + 9, 30), lamp, -1)
+            cv2.rectangle(view, (x, 40), (x + 9, 48), (12, 12, 12), -1)
+    cv2.rectangle(views[2], (16, 26), (39, 33), (30, 30, 30), -1)
+    cv2.rectangle(views[1], (20, 31), (35, 35), (200, 205, 205), -1)
+    return tuple(views)
 
 
 def panorama(rng: np.random.Generator, haze: np.ndarray, rows: int = 160, columns: int = 1440) -> np.ndarray:

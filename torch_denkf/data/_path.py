@@ -1,0 +1,93 @@
+"""The path of a drive as a line with a point a metre, on which road, roadside and traffic are laid out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BEFORE, AFTER = 20, 120  # m of straight road before the start and after the end
+
+
+@dataclass
+class Path:
+    """A path in (x right, z ahead), in m.
+
+    Attributes:
+        line: a point a metre, ``[M, 2]``.
+        heading: at these points in rad, to the left, unwrapped, ``[M]``.
+        heights: y (down) of the ground at these points, ``[M]``.
+        along: where each frame is on the line, in m from its first point, ``[N]``.
+    """
+
+    line: np.ndarray
+    heading: np.ndarray
+    heights: np.ndarray
+    along: np.ndarray
+
+    @classmethod
+    def of(cls, state: np.ndarray, ground: np.ndarray) -> Path:
+        """The path of a car.
+
+        Args:
+            state: x and y in m and θ in rad in its first three columns, ``[N, 3]`` or more.
+            ground: y (down) of the ground under the car in each row, ``[N]``.
+        """
+        points, theta = np.column_stack([-state[:, 1], state[:, 0]]), np.unwrap(state[:, 2])
+        # A car at rest jitters by millimetres: a frame counts once the car is 0.25 m further.
+        kept = [0]
+        for k in range(1, len(points)):
+            if np.hypot(*(points[k] - points[kept[-1]])) >= 0.25:
+                kept.append(k)
+        travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points[kept], axis=0), axis=-1))])
+        along = np.interp(np.arange(len(points)), kept, travelled)
+        before, after = np.arange(-BEFORE, 0.0), travelled[-1] + np.arange(1.0, AFTER + 1)
+        out = np.stack([-np.sin(theta), np.cos(theta)], -1)
+        columns = np.column_stack([points, theta, ground])[kept]
+        slopes = np.zeros((2, 4))
+        slopes[0, :2], slopes[1, :2] = out[0], out[-1]
+        slopes[:, 3] = _end_slopes(travelled, columns[:, 3])
+        columns = np.concatenate(
+            [
+                columns[0] + slopes[0] * before[:, None],
+                columns,
+                columns[-1] + slopes[1] * (after - travelled[-1])[:, None],
+            ]
+        )
+        where = np.concatenate([before, travelled, after])
+        metres = np.arange(-BEFORE, np.floor(after[-1]) + 1)
+        x, z, heading, heights = (np.interp(metres, where, column) for column in columns.T)
+        return cls(np.column_stack([x, z]), heading, heights, along + BEFORE)
+
+    @property
+    def ahead(self) -> np.ndarray:
+        """Unit vectors along the line, (x, z), ``[M, 2]``."""
+        return np.stack([-np.sin(self.heading), np.cos(self.heading)], -1)
+
+    @property
+    def left(self) -> np.ndarray:
+        """Unit vectors to its left, (x, z), ``[M, 2]``."""
+        return np.stack([-np.cos(self.heading), -np.sin(self.heading)], -1)
+
+    def at(self, along: np.ndarray, aside: np.ndarray | float = 0.0) -> np.ndarray:
+        """Places on or beside the line.
+
+        Args:
+            along: m from the line's first point, ``[T]``.
+            aside: m to the left.
+
+        Returns:
+            x, z and the heading's (x, z), ``[T, 4]``.
+        """
+        metres = np.arange(len(self.line))
+        x, z, heading = (np.interp(along, metres, column) for column in (*self.line.T, self.heading))
+        ahead, up = -np.sin(heading), np.cos(heading)
+        return np.column_stack([x - up * aside, z + ahead * aside, ahead, up])
+
+
+def _end_slopes(travelled: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Slope of the first and of the last 10 m."""
+    if travelled[-1] < 10:
+        return np.zeros(2)
+    near = travelled < 10, travelled > travelled[-1] - 10
+    return np.array([np.polyfit(travelled[part], heights[part], 1)[0] if part.sum() > 1 else 0.0 for part in near])
