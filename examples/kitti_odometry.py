@@ -51,7 +51,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--size", type=int, nargs=2, default=(125, 414), help="rows and columns to compute the flow at")
     parser.add_argument("--processes", type=int, default=1, help="folds side by side")
     for name, value in Budget().__dict__.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=value, help="updates (length: steps)")
+        help = "see Budget in kitti_study/training.py"
+        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value, help=help)
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything, on rendered drives")
     return parser.parse_args()
 
@@ -79,7 +80,10 @@ def table(args: argparse.Namespace, study: Study) -> None:
     begun = time.time()
     jobs = make_jobs(study, args.filters, args.sensors, args.seeds, args.test)
     (args.out / "settings.json").write_text(json.dumps(describe(study), indent=1))
-    write_table(args, run_jobs(jobs, args.processes), begun)
+    run_jobs(jobs, args.processes)
+    # All that --out holds: filters and seeds may come from several calls.
+    rows = [row for file in sorted((args.out / "folds").glob("*/rows.json")) for row in json.loads(file.read_text())]
+    write_table(args, rows, begun)
 
 
 def train(args: argparse.Namespace, study: Study) -> None:

@@ -17,6 +17,7 @@ from torch_denkf.modules import (
     FlowSensor,
     ImageSensor,
     LearnedObservation,
+    Select,
     StochasticMLP,
     SubModel,
     UnicycleMotion,
@@ -97,17 +98,28 @@ def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
     encoding = (
         sensor.encoding_features if isinstance(sensor, FlowSensor) else sensor.module["head"].layers[-1].in_features
     )
+    # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
+    known = Select(VELOCITIES) if isinstance(sensor, FlowSensor) else None
     return DEnKF(
         transition=UnicycleTransition(
-            StochasticMLP(2, 2, output_gain=0.1), dt=statistics.dt, loc=statistics.loc, scale=statistics.scale
+            # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
+            StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
+            dt=statistics.dt,
+            loc=statistics.loc,
+            scale=statistics.scale,
         ),
         sensor=sensor,
-        observation=LearnedObservation(SensorCurve(statistics.loc, statistics.scale)),
+        observation=known or LearnedObservation(SensorCurve(statistics.loc, statistics.scale)),
         noise=DiagonalNoise(2, r=statistics.unit, in_features=encoding, in_key=("sensor", "encoding")),
         # Innovations correct the velocities, and each member's pose moves with them.
         analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(statistics.dt)),
         initial=AroundState(INITIAL_STD, ensemble_size=ENSEMBLE),
     )
+
+
+def analysis_of(model: Filter) -> EnsembleAnalysis:
+    """The module that updates the ensemble."""
+    return next(module for module in model.modules() if isinstance(module, EnsembleAnalysis))
 
 
 def without_sensor(model: Filter, start_std: torch.Tensor | None = None) -> Filter:

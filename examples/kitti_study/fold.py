@@ -31,9 +31,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Fold:
-    """One drive is left out for the test. No drive but it may be missing from the other lists, and it may not be there.
+    """One drive is left out for the test; it may not be in the other lists.
 
-    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones.
+    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones;
+    see ``unseen_readings`` for drives that are in both lists.
     """
 
     name: str
@@ -47,6 +48,16 @@ class Fold:
         leaked = {part.stream.drive for part in (*self.train, *self.tune, *self.validation)} & tested
         if leaked:
             raise ValueError(f"fold {self.name}: {sorted(leaked)} would be trained and tested on")
+
+    @property
+    def trained(self) -> set[str]:
+        """Drives that the sensor sees."""
+        return {part.stream.drive for part in self.train}
+
+    @property
+    def shared(self) -> set[str]:
+        """Drives for both sensor and filter."""
+        return self.trained & {part.stream.drive for part in self.tune}
 
 
 def with_disturbances(parts: Sequence[Part]) -> list[Part]:
@@ -103,23 +114,43 @@ class FrameSampler:
 
 
 class ReadingSampler:
-    """Draws windows of a frozen sensor's readings."""
+    """Draws windows of a frozen sensor's readings.
 
-    def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int):
-        self.readings, self.length, starts, weight = torch.cat(list(readings)), length, [], []
-        offset = 0
+    Args:
+        readings: of each part, ``[n]``.
+        weights: shares of the batches.
+        length: of the windows.
+        gain_error: standard deviation of the logarithm of a factor on all speeds that a window's sensor reads: cameras
+            are mounted a little higher or lower, or look a little further up, and the sensor cannot know.
+    """
+
+    def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int, gain_error: float):
+        self.readings, self.length, self.gain_error = torch.cat(list(readings)), length, gain_error
+        starts, weight, offset = [], [], 0
         for reading, share in zip(readings, weights, strict=True):
             count = len(reading) - length
             if count > 0:  # row 0 has no reading
                 starts.append(offset + 1 + torch.arange(count))
                 weight.append(torch.full((count,), share / count))
             offset += len(reading)
+        if not starts:
+            lengths = [len(reading) for reading in readings]
+            raise ValueError(
+                f"windows of {length} rows do not fit in readings of {lengths} rows; pass a shorter --length"
+            )
         self.starts, self.weight = torch.cat(starts), torch.cat(weight)
 
-    def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 64) -> TensorDict:
-        """Windows ``[batch, length]``, of which up to half of the frames do not arrive."""
+    def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 48) -> TensorDict:
+        """Windows ``[batch, length]``, faster or slower than they were, of which up to half of the frames are lost."""
         start = self.starts[torch.multinomial(self.weight, batch, replacement=True, generator=generator)]
         windows = self.readings[start.unsqueeze(-1) + torch.arange(self.length)]
+        # Few drives have few speeds, and the transition would learn to return to those.
+        low, high = torch.tensor([-1.0, -0.7]), torch.tensor([0.7, 0.7])
+        speed = (low + (high - low) * torch.rand(batch, 1, 2, generator=generator)).exp()
+        gain = (self.gain_error * torch.tensor([1.0, 0.3]) * torch.randn(batch, 1, 2, generator=generator)).exp()
+        state, reading = windows["state"], windows["sensor", "ensemble"]
+        windows["state"] = torch.cat([state[..., :3], state[..., VELOCITIES] * speed], -1)
+        windows["sensor", "ensemble"] = reading * (speed * gain).unsqueeze(-2)
         share = 0.5 * torch.rand(batch, 1, 1, generator=generator)
         kept = torch.rand(batch, self.length + 1, 1, generator=generator) >= share
         windows["observed"] = windows["observed"] & kept[:, 1:] & kept[:, :-1]  # a pair needs both of its frames

@@ -13,10 +13,11 @@ import torch
 from tqdm import tqdm
 
 from kitti_study.evaluation import evaluate
-from kitti_study.fold import Fold, Part, with_disturbances
+from kitti_study.filters import SENSORS
+from kitti_study.fold import Fold, Part, statistics, with_disturbances
 from kitti_study.plots import draw_drive
 from kitti_study.streams import Stream, find_streams, prepare
-from kitti_study.training import Budget, pretrain, train_fold
+from kitti_study.training import Budget, train_fold, train_sensor
 from torch_denkf.data import write_drives
 
 RENDERED_FRAMES = 160
@@ -61,38 +62,35 @@ class Study:
 
 
 def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
-    """The fold that leaves ``test`` out, with rendered drives to train on, or without.
+    """The fold that leaves ``test`` out.
 
-    The drives that follow the test drive, in turn, tune and validate; those of too few rows never do.
+    Without rendered drives the three that follow the test drive, in turn, validate (one) and tune (two). With them all
+    drives train both sensor and filter, and rendered drives validate.
     """
     drives = list(dict.fromkeys(stream.drive for stream in streams))
     of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
     at = drives.index(test)
     others = [*drives[at + 1 :], *drives[:at]]
-    long = [drive for drive in others if _rows(of[drive][0]) >= 150] or others
-    if held_out:  # few drives: one tunes with its first rows and validates with its last ones
-        tune, validation = long[:1], long[:1]
-        share = 0.6
-    else:
-        validation, tune, share = long[:1], long[1 : 3 if len(long) > 4 else 2], None
-    rest = [drive for drive in others if drive not in (*tune, *validation)]
-    if not rest:
-        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
 
-    def parts(names: Sequence[str], begin: float = 0.0, end: float = 1.0, weight: float = 1.0) -> list[Part]:
-        return [Part(s, begin, end, weight / len(names) / len(of[name])) for name in names for s in of[name]]
+    def parts(names: Sequence[str], weight: float = 1.0) -> list[Part]:
+        return [Part(s, weight=weight / len(names) / len(of[name])) for name in names for s in of[name]]
 
-    own = parts(rest)
+    if not held_out:
+        tuning = 2 if len(others) > 4 else 1
+        validation, tune, rest = others[:1], others[1 : 1 + tuning], others[1 + tuning :]
+        if not rest:
+            raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
+        sensor, tuned, checked = parts(rest), parts(tune), parts(validation)
+        return Fold(test, *(with_disturbances(p) for p in (sensor, tuned, checked)), test=of[test])
+    if len(others) < 2:
+        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; two must be left")
+    own = parts(sorted(others, key=lambda name: -_rows(of[name][0])))
     fast = [replace(part, stream=replace(part.stream, stride=2), weight=0.5 * part.weight) for part in own]
     rendered = [replace(part, weight=1.5 / len(train)) for part in train]
-    rendered_tune = [replace(part, weight=0.5 / len(held_out)) for part in held_out]
-    return Fold(
-        test,
-        train=[*with_disturbances(own), *(fast if train else []), *with_disturbances(rendered)],
-        tune=with_disturbances([*parts(tune, end=share or 1.0), *rendered_tune]),
-        validation=with_disturbances(parts(validation, begin=share or 0.0)),
-        test=of[test],
-    )
+    checked = [replace(part, weight=1 / len(held_out)) for part in held_out]
+    sensor = [*with_disturbances(own), *fast, *with_disturbances(rendered)]
+    tune = [*own, *(replace(part, weight=0.3 * part.weight) for part in checked)]
+    return Fold(test, sensor, with_disturbances(tune), with_disturbances(checked), test=of[test])
 
 
 def _rows(stream: Stream) -> int:
@@ -146,14 +144,19 @@ class Job:
 
     def pretrain(self):
         """The sensor that all folds of this seed begin with."""
-        return pretrain(
-            self.sensor,
-            with_disturbances(self.rendered[0]),
+        study, parts = self.study, with_disturbances(self.rendered[0])
+        torch.manual_seed(self.seed)
+        facts = statistics(parts, study.cache)
+        return train_sensor(
+            SENSORS[self.sensor](facts),
+            parts,
             with_disturbances(self.rendered[1]),
-            out=self.study.out / "pretrained" / f"{self.sensor}-{self.seed}",
-            cache=self.study.cache,
+            kind=self.sensor,
+            facts=facts,
+            out=study.out / "pretrained" / f"{self.sensor}-{self.seed}",
+            cache=study.cache,
             seed=self.seed,
-            updates=self.study.budget.sensor,
+            updates=study.budget.sensor,
         )
 
     def prepare_sensor(self) -> None:

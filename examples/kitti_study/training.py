@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,11 +13,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, without_sensor
+from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, analysis_of, without_sensor
 from kitti_study.fold import Fold, FrameSampler, Part, ReadingSampler, statistics
 from kitti_study.streams import MISSING, mirror, rows
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import crps_ensemble
+from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import AroundState, SubModel
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
@@ -23,13 +26,14 @@ from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_ch
 
 @dataclass(frozen=True)
 class Budget:
-    """Updates of each stage; lengths of the windows."""
+    """Updates of each stage; steps of the filter's windows."""
 
     sensor: int = 1500
     fine_tuning: int = 400  # of a sensor that comes trained on rendered drives
     filter: int = 300
-    end_to_end: int = 60
+    end_to_end: int = 40
     length: int = 24
+    gain_error: float = 0.02  # of the sensor's speed on a new drive, as the filter is to expect it
 
 
 class SensorLoss(nn.Module):
@@ -80,31 +84,31 @@ def run_filter(model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
         return without_sensor(model).sequence(batch)
 
 
-class Validation:
-    """Errors of sensor and filter on the validation drives, in units of a good sensor's errors."""
+def velocity_crps(samples: Tensor, frames: TensorDict, unit: Tensor) -> Tensor:
+    """CRPS of (v, theta_dot) ``[*B]``, mean of both in units of a good sensor's errors."""
+    return (crps_ensemble(samples, frames["state"][..., VELOCITIES]) / unit).mean(-1)
 
-    def __init__(self, model: Filter, parts: Sequence[Part], cache: Path, kind: str, unit: Tensor):
-        self.model, self.kind, self.unit = model, kind, unit
-        self.data = [(part.stream.name, part.read(cache)) for part in parts]
 
-    def sensor(self) -> Mapping[str, float]:
-        """CRPS of the sensor where it observes."""
-        scores = [self._score(r["sensor", "ensemble"], r)[r["observed"].squeeze(-1)].mean() for r in self._readings()]
-        return {"crps": float(torch.stack(scores).mean())}
+def sensor_error(sensor: SubModel, parts: Sequence[Part], cache: Path, kind: str, unit: Tensor) -> dict[str, float]:
+    """CRPS of a sensor where it observes."""
+    readings = [read_sensor(sensor, part.read(cache), kind) for part in parts]
+    scores = [velocity_crps(r["sensor", "ensemble"], r, unit)[r["observed"].squeeze(-1)].mean() for r in readings]
+    return {"crps": float(torch.stack(scores).mean())}
 
-    def filter(self) -> Mapping[str, float]:
-        """CRPS of the belief on every validation drive in every condition, and with missing frames."""
-        scores = []
-        for reading in self._readings():
-            out = run_filter(self.model, [reading, lose_frames(reading, seed=len(scores))])
-            scores.append(self._score(out["belief", "ensemble"][..., VELOCITIES], out)[:, 1:].mean())
-        return {"crps": float(torch.stack(scores).mean())}
 
-    def _readings(self) -> list[TensorDict]:
-        return [read_sensor(self.model["sensor"], data, self.kind) for _, data in self.data]
+def run_all(model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
+    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    groups = defaultdict(list)
+    for seed, reading in enumerate(readings):
+        groups[len(reading)] += [reading, lose_frames(reading, seed)]
+    return [run_filter(model, group) for group in groups.values()]
 
-    def _score(self, samples: Tensor, frames: TensorDict) -> Tensor:
-        return crps_ensemble(samples, frames["state"][..., VELOCITIES]) / self.unit
+
+def filter_error(model: Filter, readings: Sequence[TensorDict], unit: Tensor) -> dict[str, float]:
+    """CRPS of the belief on each reading, as it is and with missing frames."""
+    results = run_all(model, readings)
+    scores = [velocity_crps(out["belief", "ensemble"][..., VELOCITIES], out, unit)[:, 1:].mean(-1) for out in results]
+    return {"crps": float(torch.cat(scores).mean())}
 
 
 def start_std_of(facts: Statistics) -> Tensor:
@@ -112,38 +116,77 @@ def start_std_of(facts: Statistics) -> Tensor:
     return torch.cat([torch.zeros(3), 0.2 * facts.scale])
 
 
-def pretrain(
-    kind: str, parts: Sequence[Part], held_out: Sequence[Part], out: Path, cache: Path, seed: int, updates: int
-):
-    """Trains a sensor on rendered drives, for all folds, or reads the one that is there."""
-    torch.manual_seed(seed)
-    facts = statistics(parts, cache)
-    sensor = SENSORS[kind](facts)
+def train_sensor(
+    sensor: SubModel,
+    parts: Sequence[Part],
+    held_out: Sequence[Part],
+    *,
+    kind: str,
+    facts: Statistics,
+    out: Path,
+    cache: Path,
+    seed: int,
+    updates: int,
+    lr: float = 2e-3,
+    keep: str = "best",
+) -> SubModel:
+    """Trains a sensor alone, or reads it where that was done before."""
     if (out / "sensor.pt").exists():
         sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
         return sensor
-    model = nn.ModuleDict({"sensor": sensor})
-    sampler = FrameSampler(parts, cache, kind)
+    model, sampler = nn.ModuleDict({"sensor": sensor}), FrameSampler(parts, cache, kind)
     stage = Stage(
         "sensor",
         SensorLoss(sensor, facts.unit),
         lambda generator, _: sampler.frames(generator),
         updates,
+        lr=lr,
         weight_decay=0.02,
     )
-    validation = Validation(model, held_out, cache, kind, facts.unit)
-    trainer = FilterTrainer(
+    FilterTrainer(
         model,
         [stage],
         out=out,
-        validate=validation.sensor,
-        validate_every=max(updates // 6, 1),
+        validate=lambda: sensor_error(sensor, held_out, cache, kind, facts.unit),
+        validate_every=max(updates // 4, 1),
         save_every=200,
         seed=seed,
-    )
-    trainer.fit()
+        keep=keep,
+    ).fit()
     write_checkpoint(out / "sensor.pt", {"sensor": sensor.state_dict()})
     return sensor
+
+
+def unseen_readings(
+    sensor: SubModel, fold: Fold, *, kind: str, facts: Statistics, out: Path, cache: Path, seed: int, updates: int
+) -> list[tuple[TensorDict, TensorDict, float]]:
+    """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+
+    A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives that
+    are in both lists are read by one of two sensors that stand in: each is trained on one half of those drives, and
+    reads the other.
+
+    Returns:
+        for each part of the tuning drives, and mirrored: readings to tune with, readings to validate with, the weight.
+    """
+    shared = list(dict.fromkeys(p.stream.drive for p in fold.tune if p.stream.drive in fold.trained))
+    readers = {}
+    for half in (shared[0::2], shared[1::2]) if shared else ():
+        stand_in = deepcopy(sensor)
+        parts = [part for part in fold.train if part.stream.drive not in half]
+        folder = out / ("without-" + "-".join(half))
+        held_out = [part for part in fold.tune if part.stream.drive in half]
+        settings = {"kind": kind, "facts": facts, "out": folder, "cache": cache, "seed": seed, "updates": updates}
+        train_sensor(stand_in, parts, held_out, lr=1e-3, keep="last", **settings)
+        readers |= dict.fromkeys(half, stand_in)
+    result = []
+    for part in fold.tune:
+        reader, data = readers.get(part.stream.drive, sensor), part.read(cache)
+        for mirrored in (False, True):
+            reading = read_sensor(reader, data, kind, mirrored)
+            split = int(0.7 * len(reading))
+            result.append((reading[:split], reading[split:], part.weight))
+    return result
 
 
 def train_fold(
@@ -162,74 +205,90 @@ def train_fold(
     torch.manual_seed(seed)
     facts = statistics(fold.train, cache)
     sensor = SENSORS[kind](facts)
-    if pretrained is not None:
+    common = {"kind": kind, "facts": facts, "cache": cache, "seed": seed}
+    if pretrained is None:
+        rates = {"updates": budget.sensor}
+    else:
         sensor.load_state_dict(pretrained.state_dict())
+        rates = {"updates": budget.fine_tuning, "lr": 1e-3, "keep": "last"}
+    read = unseen_readings(sensor, fold, out=out, updates=budget.fine_tuning, **common) if fold.shared else []
+    train_sensor(sensor, fold.train, fold.validation, out=out / "sensor", **common, **rates)
+    read = read or unseen_readings(sensor, fold, out=out, updates=0, **common)
+
     model = FILTERS[filter_name](sensor, facts)
-    start_std = start_std_of(facts)
-    frames = FrameSampler(fold.train, cache, kind)
-    readings: list[ReadingSampler] = []  # made when the sensor has been trained
-
-    def reading_windows(generator: torch.Generator, length: int) -> TensorDict:
-        if not readings:
-            parts = [(part.read(cache), part.weight, mirrored) for part in fold.tune for mirrored in (False, True)]
-            read = [read_sensor(model["sensor"], data, kind, mirrored) for data, _, mirrored in parts]
-            readings.append(ReadingSampler(read, [weight for _, weight, _ in parts], length))
-        return readings[0].windows(generator, start_std)
-
-    # The pose follows from the velocities: it does not count. So does not the belief's first row.
+    start_std, frames = start_std_of(facts), FrameSampler(fold.train, cache, kind)
+    windows = ReadingSampler(
+        [tune for tune, _, _ in read], [weight for *_, weight in read], budget.length, budget.gain_error
+    )
+    validation = [reading for _, reading, _ in read]
+    # The pose follows from the velocities: it does not count.
     scale = torch.cat([torch.full((3,), torch.inf), facts.unit])
     recursion = without_sensor(model, start_std)
     whole = DEnKF(
         **{name: model[name] for name in ("transition", "sensor", "observation", "noise", "analysis")},
         initial=AroundState(start_std, ensemble_size=recursion.initial.ensemble_size, state_key="start"),
     )
-    validation = Validation(model, fold.validation, cache, kind, facts.unit)
+    third = max(budget.end_to_end // 3, 1)
     stages = [
-        Stage(
-            "sensor",
-            SensorLoss(sensor, facts.unit),
-            lambda generator, _: frames.frames(generator),
-            budget.sensor if pretrained is None else budget.fine_tuning,
-            lr=2e-3 if pretrained is None else 1e-3,
-            weight_decay=0.02,
-            validate=validation.sensor,
-        ),
         Stage(
             "filter",
             DEnKFLoss(recursion, sensor=0.0, state_scale=scale),
-            reading_windows,
+            lambda generator, _: windows.windows(generator, start_std),
             budget.filter,
-            lengths={0: budget.length},
+            lr=5e-3,
+            validate=lambda: filter_error(model, validation, facts.unit),
         ),
         Stage(
             "end_to_end",
             DEnKFLoss(whole, sensor=1.0, state_scale=scale, observation_scale=facts.unit),
             lambda generator, length: frames.windows(generator, length, start_std),
             budget.end_to_end,
+            # The noise model knows by now how wrong the sensor is on new drives; on those it has seen it would forget.
+            parameters=[*sensor.parameters(), *model["transition"].parameters()],
             lr=1e-4,
-            lengths={0: 4, budget.end_to_end // 3 + 1: 8, 2 * budget.end_to_end // 3 + 2: 16},
+            lengths={0: 4, third: 8, 2 * third: 16},
+            validate=lambda: filter_error(
+                model, [read_sensor(sensor, part.read(cache), kind) for part in fold.validation], facts.unit
+            ),
         ),
     ]
-    trainer = FilterTrainer(
+    FilterTrainer(
         model,
         stages,
         out=out,
-        validate=validation.filter,
         validate_every=max(budget.filter // 3, 1),
         save_every=200,
         loggers=loggers,
         seed=seed,
-    )
-    trainer.fit()
-    save_settings(out, filter_name, kind, facts)
+    ).fit()
+    calibrate(model, validation)
+    save_settings(out, filter_name, kind, facts, analysis_of(model).inflation)
     return model, facts
 
 
-def save_settings(folder: Path, filter_name: str, kind: str, facts: Statistics) -> None:
+def calibrate(model: Filter, readings: Sequence[TensorDict], level: float = 0.9) -> None:
+    """Sets the inflation of the analysis with which the filter's intervals hold their share of the truth."""
+    analysis, distance = analysis_of(model), {}
+    for inflation in (1.0, 1.03, 1.06, 1.1, 1.15, 1.2):
+        analysis.inflation = inflation
+        covered = torch.stack([_coverage(out, level) for out in run_all(model, readings)]).mean(0)
+        distance[inflation] = float((covered - level).abs().sum())
+    analysis.inflation = min(distance, key=distance.get)
+
+
+def _coverage(out: TensorDict, level: float) -> Tensor:
+    mean, variance, truth = out["belief", "mean"], out["belief", "var"], out["state"]
+    pairs = [value[:, 1:, VELOCITIES].flatten(0, 1) for value in (mean, variance, truth)]
+    return interval_coverage(*pairs, level=level)
+
+
+def save_settings(folder: Path, filter_name: str, kind: str, facts: Statistics, inflation: float) -> None:
     """Leaves beside the checkpoints what :func:`load_filter` needs to build the filter anew."""
     folder.mkdir(parents=True, exist_ok=True)
     numbers = {key: value.tolist() if isinstance(value, Tensor) else value for key, value in asdict(facts).items()}
-    (folder / "filter.json").write_text(json.dumps({"filter": filter_name, "sensor": kind, "statistics": numbers}))
+    (folder / "filter.json").write_text(
+        json.dumps({"filter": filter_name, "sensor": kind, "inflation": inflation, "statistics": numbers})
+    )
 
 
 def load_filter(folder: Path) -> tuple[Filter, Statistics, str, str]:
@@ -245,4 +304,5 @@ def load_filter(folder: Path) -> tuple[Filter, Statistics, str, str]:
     facts = Statistics(**{k: torch.tensor(v) if isinstance(v, list) else v for k, v in numbers.items()})
     model = FILTERS[settings["filter"]](SENSORS[settings["sensor"]](facts), facts)
     model.load_state_dict(read_checkpoint(folder / "best_end_to_end.pt")["model"])
+    analysis_of(model).inflation = settings["inflation"]
     return model, facts, settings["filter"], settings["sensor"]
