@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from torch_denkf.data import _drive_writer as writer
+from torch_denkf.data import _raster as raster
 from torch_denkf.data import list_kitti_drives, random_drive, read_kitti_drive, render_drives, roadside_scene
 from torch_denkf.data._camera import HEIGHT, Camera
 from torch_denkf.data._kitti_files import DEFAULT_DT, poses_to_state, write_poses
@@ -156,6 +157,25 @@ def test_a_moving_car_moves_by_itself_and_stands_on_the_hill():
         else:  # as fast as the camera: a car that stood would come 5.6 m nearer
             assert 0.9 < sizes[2] / sizes[0] < 1.15
         assert (renderer.render(poses[40])[..., 2].astype(int) - renderer.render(poses[40])[..., 1] < 90).all()
+
+
+def test_leaving_out_what_is_hidden_changes_no_picture(monkeypatch):
+    poses, _ = hill()
+    state = poses_to_state(poses, DEFAULT_DT)
+    scene = roadside_scene(state, np.random.default_rng(3), ground=poses[:, 1, 3] + HEIGHT, traffic_on=True)
+    renderer = Renderer(scene, Camera.odometry((50, 150)))
+    numbers = range(0, 190, 6)
+    quick = [renderer.render(poses[number], number) for number in numbers]
+    hidden, left_out = raster.hidden, []
+
+    def nothing(pixels, *others):
+        left_out.append(hidden(pixels, *others).sum() - hidden(pixels, others[0], 0 * others[1], others[2]).sum())
+        return np.zeros(len(pixels), bool)
+
+    monkeypatch.setattr(raster, "hidden", nothing)
+    for number, picture in zip(numbers, quick, strict=True):
+        np.testing.assert_array_equal(renderer.render(poses[number], number), picture)
+    assert np.mean(left_out) > 3  # behind walls, besides what is outside the picture
 
 
 def test_traffic_has_its_own_speed():

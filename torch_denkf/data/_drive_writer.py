@@ -22,7 +22,7 @@ from torch_denkf.data._kitti_files import DEFAULT_DT, poses_to_state, write_pose
 from torch_denkf.data._renderer import Renderer
 from torch_denkf.data._roadside import roadside_scene
 
-FORMAT = 2  # raise it when drives of the same options come out differently
+FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"
 STRETCH = 500  # frames that a process draws at a time
 GRAIN = 1.5  # grey values: standard deviation of the images' noise

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BEFORE, AFTER = 20, 120  # m of straight road before the start and after the end
+BEFORE, AFTER = 20, 140  # m of straight road before the start and after the end
 
 
 @dataclass

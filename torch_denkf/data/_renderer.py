@@ -11,13 +11,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from torch_denkf.data import _raster as raster
 from torch_denkf.data import _textures as textures
 from torch_denkf.data._camera import Camera
-from torch_denkf.data._scene import PATCH, RESOLUTION, Box, Card, Scene
+from torch_denkf.data._scene import PATCH, RESOLUTION, Scene
+from torch_denkf.data._things import FAR, HAZE, Things
 
 GRID = 16  # m: new ground is drawn when the camera has moved that far
-HAZE = 140.0  # m: distance at which haze hides 63 %
-NEAR, FAR = 1.0, 90.0  # m
 DEPTHS = np.concatenate([np.geomspace(1.2, 200, 48), [400, 1500, 10000]])  # m: where the ground is looked up
 STEP = 16  # pixels: columns between those where it is
 LEVELS = 6  # of the ground's pyramid
@@ -40,11 +40,10 @@ class Renderer:
         self._b = ((np.arange(height) - fine.cy) / fine.fy).astype(np.float32)
         self._coarse_a = (np.arange(0, width + STEP, STEP) - fine.cx) / fine.fx
         self._coarse_b = (np.arange(0, height + STEP, STEP) - fine.cy) / fine.fy
-        self._across, self._down = _hats(width), _hats(height)
-        self._stretch, self._relief, self._feet = None, None, []
+        self._across, self._down = raster.hats(width, STEP), raster.hats(height, STEP)
+        self._things = Things(scene, fine)
+        self._stretch, self._relief = None, None
         self._origin, self._pyramid = None, []
-        sun = scene.sun / max(np.linalg.norm(scene.sun), 1e-9)
-        self._sun = sun * (1 - scene.shade)
 
     def render(self, pose: np.ndarray, frame: int | None = None) -> np.ndarray:
         """Draw one picture.
@@ -64,21 +63,8 @@ class Renderer:
         self._sky(picture, pose, int(np.ceil(top.max())) + 1)
         self._ground(picture, pose, inverse, top)
         self._inverse, self._top = inverse, top
-        boxes = [] if frame is None else [box for mover in scene.traffic if (box := mover.at(frame)) is not None]
-        middles = np.array([box.corners.mean(0) for box in boxes]).reshape(-1, 2)
-        for box in boxes:
-            self._car_shadow(picture, box, pose)
-        relative = np.concatenate([scene.places, middles]) - pose[[0, 2], 3]
-        depth, aside = relative @ pose[[0, 2], 2], relative @ pose[[0, 2], 0]
-        seen = (depth > -10) & (depth < FAR) & (np.abs(aside) < 15 + depth * self.fine.size[1] / (2 * self.fine.fx))
-        for k in sorted(np.flatnonzero(seen), key=lambda k: -depth[k]):
-            if k >= len(scene.objects):
-                box = boxes[k - len(scene.objects)]
-                self._box(picture, box, self._relief.at(*box.corners.T), pose)
-            elif isinstance(scene.objects[k], Card):
-                self._card(picture, scene.objects[k], self._feet[k], depth[k], pose)
-            else:
-                self._box(picture, scene.objects[k], self._feet[k], pose)
+        cars = [] if frame is None else [box for mover in scene.traffic if (box := mover.at(frame)) is not None]
+        self._things.draw(picture, pose, cars, self._shown)
         picture = cv2.resize(picture, self.camera.size[::-1], interpolation=cv2.INTER_AREA)
         gain = 1.0 if scene.exposure is None or frame is None else scene.exposure[frame]
         grey = 255 * (np.arange(256) / 255) ** scene.gamma * gain
@@ -95,12 +81,7 @@ class Renderer:
         stretch = min(round(metre / GRID) * GRID, len(terrain.line) - 1)
         if stretch != self._stretch:
             self._stretch, self._relief = stretch, terrain.around(stretch)
-            near = 2 * GRID + FAR * np.hypot(1, self.fine.size[1] / (2 * self.fine.fx))
-            reach = np.linalg.norm(self.scene.places - terrain.line[stretch], axis=-1) < near
-            self._feet = [None] * len(reach)
-            for k in np.flatnonzero(reach):
-                item = self.scene.objects[k]
-                self._feet[k] = self._relief.at(*(item.corners if isinstance(item, Box) else item.foot).T)
+            self._things.settle(self._relief, terrain.line[stretch])
 
     def _ground_depth(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One over the ground's depth at each pixel, and the row of its upper end in each column.
@@ -179,13 +160,6 @@ class Renderer:
         above = np.arange(start, end)[:, None] < top
         picture[start:end][above] = sky[above]
 
-    def _pixels(self, points: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels and depths of points of the world, ``[..., 3]``."""
-        local = (points - pose[:, 3]) @ pose[:, :3]
-        depth = local[..., 2]
-        scaled = local[..., :2] / np.maximum(depth, 0.05)[..., None]
-        return scaled * [self.fine.fx, self.fine.fy] + [self.fine.cx, self.fine.cy], depth
-
     def _shown(self, region: tuple[int, int, int, int], depth: float) -> np.ndarray | None:
         """Where no crest of the road hides what is at a depth, uint8; None for everywhere."""
         if not self._hides:
@@ -194,124 +168,3 @@ class Renderer:
         nearer = self._inverse[y0:y1, x0:x1] > 1 / depth * 1.1
         ground = np.arange(y0, y1)[:, None] >= self._top[x0:x1]
         return (~(nearer & ground)).astype(np.uint8)
-
-    def _box(self, picture: np.ndarray, box: Box, feet: np.ndarray, pose: np.ndarray) -> None:
-        corners = np.column_stack([box.corners[:, 0], feet, box.corners[:, 1]])
-        roof = feet.mean() - box.height
-        heads = corners.copy()
-        heads[:, 1] = roof
-        view = box.corners - pose[[0, 2], 3]
-        depths = np.minimum(*(((points - pose[:, 3]) @ pose[:, 2]) for points in (corners, heads)))
-        sides = []
-        for k in range(4):
-            n = (k + 1) % 4
-            hidden = view[k, 0] * view[n, 1] - view[k, 1] * view[n, 0] >= 0  # seen from behind
-            if not hidden and max(depths[k], depths[n]) > NEAR:
-                sides.append((k, n))
-        for k, n in sorted(sides, key=lambda side: -depths[list(side)].sum()):
-            span = depths[n] - depths[k]
-            start = (NEAR - depths[k]) / span if depths[k] < NEAR else 0.0
-            end = (NEAR - depths[k]) / span if depths[n] < NEAR else 1.0
-            part = np.array([start, end, end, start])[:, None]
-            points = np.concatenate(
-                [
-                    heads[k] + part[:2] * (heads[n] - heads[k]),
-                    corners[k] + part[2:] * (corners[n] - corners[k]),
-                ]
-            )
-            quad, depth = self._pixels(points, pose)
-            face = box.faces[k]
-            rows, columns = face[0].shape[:2]
-            across = box.corners[n] - box.corners[k]
-            length = np.linalg.norm(across)
-            if box.pixels_per_metre is not None:
-                columns = min(columns, length * box.pixels_per_metre)
-                rows = min(rows, box.height * box.pixels_per_metre)
-            tall = (points[:, 1] - roof) * rows / box.height  # the foot follows the slope
-            source = np.column_stack([part * columns, tall]) - 0.5
-            light = 1 + float(self._sun @ (across[1], -across[0])) / length
-            self._warp_quad(picture, face, source, quad, float(depth.min()), light)
-
-    def _warp_quad(self, picture, face, source, quad, depth: float, light: float) -> None:
-        """Lay a texture over a quadrilateral of the picture."""
-        region = _region(*quad.min(0), *quad.max(0), picture.shape)
-        if region is None:
-            return
-        x0, y0, x1, y1 = region
-        area = max(cv2.contourArea(quad.astype(np.float32)), 1e-3)
-        level = _level(np.sqrt(cv2.contourArea(source.astype(np.float32)) / area), len(face))
-        shifted = (quad - [x0, y0]).astype(np.float32)
-        homography = cv2.getPerspectiveTransform((source / 2.0**level).astype(np.float32), shifted)
-        size = (x1 - x0, y1 - y0)
-        piece = cv2.warpPerspective(
-            face[level], homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        clear = np.float32(np.exp(-depth / HAZE))
-        mist = np.float32(self.scene.haze) * (1 - clear)
-        piece = np.minimum(piece * (clear * np.float32(light)) + mist, 255).astype(np.uint8)
-        mask = np.zeros(size[::-1], np.uint8)
-        corners = np.round(np.clip(shifted, -8000, 8000) * 16).astype(np.int32)
-        cv2.fillConvexPoly(mask, corners, 255, cv2.LINE_8, 4)
-        shown = self._shown(region, depth)
-        cv2.copyTo(piece, mask if shown is None else mask * shown, picture[y0:y1, x0:x1])
-
-    def _card(self, picture: np.ndarray, card: Card, foot: float, depth: float, pose: np.ndarray) -> None:
-        if depth < 2 * NEAR:
-            return
-        base = np.array([card.foot[0], foot, card.foot[1]])
-        right = pose[:, 0] * [1, 0, 1]
-        half = right / np.linalg.norm(right) * card.width / 2
-        points = np.stack([base - half, base + half, base - half - [0, card.height, 0]])
-        (left, far, head), _ = self._pixels(points, pose)
-        quad = np.stack([left, far, head, head + far - left])
-        region = _region(*quad.min(0), *quad.max(0), picture.shape)
-        if region is None:
-            return
-        x0, y0, x1, y1 = region
-        rows, columns = card.sprite[0].shape[:2]
-        matrix = np.column_stack([(far - left) / columns, (left - head) / rows, head - [x0, y0]])
-        level = _level(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), len(card.sprite))
-        matrix[:, :2] *= 2.0**level
-        piece = cv2.warpAffine(card.sprite[level], matrix, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR)
-        shown = self._shown(region, depth)
-        if shown is not None:
-            piece = piece * shown[..., None]
-        alpha = piece[..., 3:] * np.float32(1 / 255)
-        clear = np.float32(np.exp(-depth / HAZE))
-        colour = piece[..., :3] * clear + np.float32(self.scene.haze) * ((1 - clear) * alpha)
-        view = picture[y0:y1, x0:x1]
-        view[:] = view * (1 - alpha) + colour
-
-    def _car_shadow(self, picture: np.ndarray, box: Box, pose: np.ndarray) -> None:
-        """Darken the ground under a moving car."""
-        middle = box.corners.mean(0)
-        corners = middle + (box.corners - middle) * [1.08, 1.08]
-        points = np.column_stack([corners[:, 0], self._relief.at(*corners.T), corners[:, 1]])
-        quad, depth = self._pixels(points, pose)
-        if depth.min() < NEAR or depth.max() > FAR:
-            return
-        region = _region(*quad.min(0), *quad.max(0), picture.shape)
-        if region is None:
-            return
-        x0, y0, x1, y1 = region
-        mask = np.zeros((y1 - y0, x1 - x0), np.uint8)
-        cv2.fillConvexPoly(mask, np.round((quad - [x0, y0]) * 16).astype(np.int32), 255, cv2.LINE_8, 4)
-        shown = self._shown(region, float(depth.min()))
-        view = picture[y0:y1, x0:x1]
-        cv2.copyTo(cv2.convertScaleAbs(view, alpha=0.45), mask if shown is None else mask * shown, view)
-
-
-def _hats(pixels: int) -> np.ndarray:
-    """Weights that interpolate linearly between pixels 0, STEP, 2 STEP ...: ``[nodes, pixels]``."""
-    nodes = np.arange(0, pixels + STEP, STEP)
-    return np.maximum(1 - np.abs(np.arange(pixels) - nodes[:, None]) / STEP, 0).astype(np.float32)
-
-
-def _region(left, top, right, bottom, shape) -> tuple[int, int, int, int] | None:
-    x0, y0 = max(int(np.floor(left)), 0), max(int(np.floor(top)), 0)
-    x1, y1 = min(int(np.ceil(right)) + 1, shape[1]), min(int(np.ceil(bottom)) + 1, shape[0])
-    return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
-
-
-def _level(minification: float, levels: int) -> int:
-    return int(np.clip(np.round(np.log2(max(minification, 1e-6))), 0, levels - 1))

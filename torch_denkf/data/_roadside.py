@@ -44,7 +44,7 @@ def roadside_scene(
         >>> straight = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
         >>> scene = roadside_scene(straight, np.random.default_rng(0))
         >>> scene.road[0].tolist(), scene.road[-1].tolist()  # (x to the right, z ahead), in m
-        ([-1.75, -20.0], [-1.75, 219.0])
+        ([-1.75, -20.0], [-1.75, 239.0])
         >>> bool((abs(scene.places[:, 0] + 1.75) > scene.road_width / 2).all())
         True
     """
@@ -70,7 +70,7 @@ def roadside_scene(
         ground=textures.ground(rng),
         panorama=textures.panorama(rng, haze),
         haze=haze,
-        light=rng.uniform(0.8, 1.15) * (1 + 0.08 * np.array([-1, 0, 1]) * rng.standard_normal()),
+        light=rng.uniform(0.85, 1.3) * (1 + 0.08 * np.array([-1, 0, 1]) * rng.standard_normal()),
         terrain=Terrain(way.line, way.heights),
         metres=np.round(way.along).astype(int),
         road_width=width,
@@ -78,7 +78,7 @@ def roadside_scene(
         traffic=traffic(way, cars, rng) if traffic_on else [],
         sun=sun,
         shade=rng.uniform(0.5, 0.8) if sunny else 1.0,
-        gamma=rng.uniform(0.85, 1.2),
+        gamma=rng.uniform(0.85, 1.5),
         exposure=_exposure(len(path), rng) if traffic_on else None,
     )
 
@@ -156,6 +156,11 @@ class _Roadside:
                 if item is not None:
                     objects.append(item)
                 at += length + rng.uniform(*gaps[kind])
+            for k in range(0, len(way.line), 1 + round(12 * dense)):  # what is further back
+                kind = TREE if fast or rng.random() < 0.7 else HOUSE
+                item = make[kind](way.line[k], side * sideways[k], ahead[k], edge + rng.uniform(6, 26), lengths[kind]())
+                if item is not None:
+                    objects.append(item)
         return objects
 
     def _makers(self, cars) -> tuple[Callable, ...]:

@@ -11,7 +11,7 @@ from torch_denkf.data._kitti_files import DEFAULT_DT
 from torch_denkf.data._path import Path
 from torch_denkf.data._scene import Mover
 
-SIGHT = 105.0  # m ahead at which cars enter and leave, beyond what is drawn
+SIGHT = 125.0  # m ahead at which cars enter and leave, beyond what is drawn
 BACK = 12.0  # m behind the camera
 FAST = 17.0  # m/s: of a motorway, whose other lane goes the same way
 
