@@ -1,0 +1,171 @@
+"""The parts of examples/kitti_odometry.py that a wrong table could come from."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+
+from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
+from kitti_study.fold import Fold, Part, ReadingSampler, with_disturbances
+from kitti_study.streams import DISTURBANCES, Stream, mirror
+from kitti_study.study import make_fold
+from kitti_study.tables import by_drive, markdown, read_csv, write_csv
+from kitti_study.training import lose_frames
+
+from torch_denkf.metrics import dead_reckoning
+
+
+def streams(*drives, cameras=("image_0",)):
+    return [Stream("root", drive, camera) for drive in drives for camera in cameras]
+
+
+@pytest.fixture(autouse=True)
+def rows_of_drives(monkeypatch):
+    monkeypatch.setattr("kitti_study.study._rows", lambda stream: 100)
+
+
+@pytest.mark.parametrize("rendered", [0, 4])
+@pytest.mark.parametrize("test", ["a", "c", "f"])
+def test_no_fold_trains_on_its_test_drive_in_any_condition_or_camera(test, rendered):
+    found = streams(*"abcdef", cameras=("image_0", "image_1"))
+    parts = [Part(stream) for stream in streams(*[f"r{i}" for i in range(rendered)])]
+    fold = make_fold(test, found, parts[1:], parts[:1])
+    others = [*fold.train, *fold.tune, *fold.validation]
+    assert {stream.drive for stream in fold.test} == {test}
+    assert len(fold.test) == 2  # both cameras
+    assert test not in {part.stream.drive for part in others}
+    assert {part.stream.condition for part in fold.train} == {"clean", *DISTURBANCES}
+    if not rendered:  # the filter is tuned and the checkpoint chosen on drives that the sensor has not seen
+        roles = [{part.stream.drive for part in role} for role in (fold.train, fold.tune, fold.validation)]
+        assert not roles[0] & roles[1]
+        assert not roles[0] & roles[2]
+        assert not roles[1] & roles[2]
+        assert set.union(*roles) == set("abcdef") - {test}
+
+
+def test_a_fold_that_leaks_is_refused():
+    part = Part(Stream("root", "a", "image_0", condition="blur"))
+    with pytest.raises(ValueError, match=r"\['a'\] would be trained and tested on"):
+        Fold("a", [part], [], [], test=streams("a"))
+
+
+def test_too_few_drives_are_refused():
+    with pytest.raises(ValueError, match="too few"):
+        make_fold("a", streams("a", "b"), [], [])
+
+
+def test_disturbances_together_weigh_half_as_much_as_the_clean_stream():
+    parts = with_disturbances([Part(*streams("a"), weight=2.0)])
+    assert sum(part.weight for part in parts if part.stream.condition == "clean") == 2.0
+    assert sum(part.weight for part in parts if part.stream.condition != "clean") == pytest.approx(1.0)
+
+
+def reading(values, observed):
+    values = torch.tensor(values)
+    samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]  # two members
+    entries = {
+        "observed": torch.tensor(observed).unsqueeze(-1),
+        "state": torch.tensor([[0.0, 0.0, 0.0, 7.0, 0.7]]).repeat(len(values), 1),
+        "sensor": {"ensemble": samples},
+    }
+    return TensorDict(entries, [len(values)])
+
+
+def test_dead_reckoning_holds_the_last_reading_and_before_the_first_the_true_start():
+    read = reading([[9.0, 9.0], [1.0, 0.1], [9.0, 9.0], [2.0, 0.2], [9.0, 9.0]], [False, True, False, True, False])
+    expected = torch.tensor([[7.0, 0.7], [1.0, 0.1], [1.0, 0.1], [2.0, 0.2], [2.0, 0.2]])
+    torch.testing.assert_close(hold_last(read), expected)
+
+
+def test_a_lost_frame_blinds_its_own_pair_and_the_next_one():
+    read = reading([[0.0, 0.0]] * 4000, [True] * 4000)
+    observed = lose_frames(read, seed=3)["observed"].squeeze(-1)
+    share = float(observed.float().mean())
+    assert share == pytest.approx(0.7**2, abs=0.03)  # standard error of the mean of neighbours that agree: 0.011
+    assert bool(read["observed"].all())  # the original is left as it was
+    lengths = torch.diff(torch.nonzero(torch.diff(observed.float())).flatten())
+    blind = lengths[0::2] if observed[0] else lengths[1::2]
+    assert int(blind.min()) >= 2
+
+
+def test_errors_of_a_path_that_is_a_tenth_too_fast():
+    truth = torch.zeros(121, 5, dtype=torch.float64)
+    truth[:, 3] = 10.0
+    truth[:, 0] = torch.arange(121) * 1.0
+    states = integrate(truth[:, 3:] * 1.1, truth, 0.1)
+    table = errors(states, truth)
+    assert [row["window"] for row in table] == [50, 100]
+    for row in table:
+        assert row["translation_m_per_m"] == pytest.approx(0.1)
+        assert row["pathlength_m_per_m"] == pytest.approx(0.1)
+        assert row["rotation_deg_per_m"] == pytest.approx(0.0)
+        assert row["rmse_v_m_per_s"] == pytest.approx(1.0)
+        assert row["devkit_t_rel_percent"] == pytest.approx(10.1, abs=0.15)  # a segment ends behind 100 m, by a frame
+
+
+def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
+    data = TensorDict(
+        {
+            "observed": torch.ones(60, 1, dtype=torch.bool),
+            "state": torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1]).repeat(60, 1),
+            "sensor": {"ensemble": torch.tensor([8.0, 0.1]).repeat(60, 4, 1)},
+        },
+        [60],
+    )
+    windows = ReadingSampler([data], [1.0], 8, gain_error=0.0).windows(
+        torch.Generator().manual_seed(0), torch.zeros(5), batch=200
+    )
+    velocity = windows["state"][..., 3:]
+    torch.testing.assert_close(windows["sensor", "ensemble"].mean(2), velocity)
+    torch.testing.assert_close(windows["start"], windows["state"])  # no wrong start was asked for
+    speed = velocity[:, 0, 0] / 8
+    assert 0.36 < float(speed.min()) < 0.45  # exp(-1) and exp(0.7), and 200 draws come near
+    assert 1.85 < float(speed.max()) < 2.02
+    assert not windows["observed"].all()
+    assert windows["is_init"].sum() == 200
+
+
+def test_windows_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match=r"windows of 50 rows do not fit in readings of \[5\] rows"):
+        ReadingSampler([reading([[0.0, 0.0]] * 5, [True] * 5)], [1.0], 50, 0.0)
+
+
+def test_a_mirrored_drive_goes_the_mirrored_way():
+    rng = torch.Generator().manual_seed(0)
+    velocity = torch.rand(30, 2, generator=rng, dtype=torch.float64) + torch.tensor([5.0, -0.5])
+    path = dead_reckoning(velocity, torch.zeros(3, dtype=torch.float64), 0.1)
+    flow, road = torch.randn(30, 3, 25, 79, generator=rng), torch.rand(30, 13, 69, generator=rng)
+    frames = TensorDict({"state": torch.cat([path, velocity], -1), "flow": flow, "road": road}, [30])
+    other = mirror(frames)
+    again = dead_reckoning(other["state"][:, 3:], torch.zeros(3, dtype=torch.float64), 0.1)
+    torch.testing.assert_close(again, other["state"][:, :3])
+    torch.testing.assert_close(other["flow"][:, 0], -flow[:, 0].flip(-1))
+    torch.testing.assert_close(other["flow"][:, 1:], flow[:, 1:].flip(-1))
+    torch.testing.assert_close(mirror(other)["state"], frames["state"])
+
+
+def row(drive, seed, value, **entries):
+    row = {"filter": "denkf", "sensor": "flow", "condition": "clean", "window": 100, "coverage90": 0.9}
+    return {**row, "drive": drive, "seed": seed, "translation_m_per_m": value, "rotation_deg_per_m": 0.1, **entries}
+
+
+def test_a_drive_counts_once_by_the_median_of_its_seeds_and_the_mean_of_its_cameras():
+    rows = [row("a/image_0", 0, 1.0), row("a/image_1", 0, 3.0), row("a/image_0", 1, 5.0), row("a/image_1", 1, 5.0)]
+    rows += [row("a/image_0", 2, 90.0), row("a/image_1", 2, 90.0), row("b/image_2", 0, 7.0)]
+    assert by_drive(rows, "translation_m_per_m") == {"a": 5.0, "b": 7.0}
+
+
+def test_the_table_survives_its_file(tmp_path):
+    rows = [row("a/image_0", 0, 0.25), row("b/image_0", 0, 0.75, coverage90=float("nan"))]
+    rows += [row("a/image_0", 0, 0.125, filter="floor"), row("b/image_0", 0, 0.125, filter="floor")]
+    write_csv(rows, tmp_path / "table.csv")
+    again = read_csv(tmp_path / "table.csv")
+    assert list(again[0]) == list(COLUMNS)
+    assert by_drive([r for r in again if r["filter"] == "denkf"], "translation_m_per_m") == {"a": 0.25, "b": 0.75}
+    text = markdown(again, "header")
+    assert "| clean | denkf | flow | 0.500 ± 0.250 |" in text
+    assert "| clean | floor: true v and theta_dot | truth | 0.125 ± 0.000 |" in text
