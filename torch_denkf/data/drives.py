@@ -170,7 +170,7 @@ def write_drives(
 
     Written in the layout that :func:`torch_denkf.data.read_kitti_drive` reads. A drive follows from its name, the seed
     and the options alone, so one that is already there with the same options is kept. Writing 300 frames of 50 x 150
-    takes about a second. Images are noisy by about 1.5 grey values. :func:`render_drives` makes harder ones.
+    takes about two seconds. Images are noisy by about 1.5 grey values. :func:`render_drives` makes harder ones.
 
     Args:
         root: folder to write ``sequences/NAME/image_2``, ``calib.txt``, ``times.txt`` and ``poses/NAME.txt`` to.
