@@ -116,7 +116,7 @@ def main() -> None:
         raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
     args.out.mkdir(parents=True, exist_ok=True)
     budget = Budget(**{name: getattr(args, name) for name in Budget().__dict__})
-    study = Study(args.root, args.out, tuple(args.size), tuple(args.drives), args.rendered, budget)
+    study = Study(args.root, args.out, tuple(args.size), tuple(args.drives), args.rendered, budget, args.processes)
     {"table": table, "train": train, "evaluate": evaluate}[args.command](args, study)
     if args.smoke:
         args.checkpoint = next((args.out / "folds").iterdir())

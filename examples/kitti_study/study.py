@@ -18,7 +18,7 @@ from kitti_study.fold import Fold, Part, statistics, with_disturbances
 from kitti_study.plots import draw_drive
 from kitti_study.streams import Stream, find_streams, prepare
 from kitti_study.training import Budget, train_fold, train_sensor
-from torch_denkf.data import write_drives
+from torch_denkf.data import render_drives
 
 RENDERED_FRAMES = 160
 
@@ -33,6 +33,7 @@ class Study:
     drives: tuple[str, ...] = ()  # all that are found
     rendered: int = 0  # drives to render for pre-training
     budget: Budget = field(default_factory=Budget)
+    processes: int = 1
 
     @property
     def cache(self) -> Path:
@@ -44,14 +45,14 @@ class Study:
         return find_streams(self.root, self.size, list(self.drives) or None)
 
     def rendered_parts(self) -> tuple[list[Part], list[Part]]:
-        """Rendered drives along invented paths, to train the sensor on; and others that it does not see.
+        """Rendered drives along invented paths, with traffic, to train the sensor on; and others that it does not see.
 
         Each is seen by a camera that is turned up or down a little, as another car's would be.
         """
         if not self.rendered:
             return [], []
         root, names = self.out / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
-        write_drives(root, names, frames=RENDERED_FRAMES, size=self.size, seed=0)
+        render_drives(root, names=names, frames=RENDERED_FRAMES, size=self.size, processes=self.processes)
         pitches = (torch.rand(self.rendered, generator=torch.Generator().manual_seed(0)) * 2 - 1) * 0.03
         streams = [
             Stream(str(root), name, "image_2", size=self.size, pitch=round(float(pitch), 4))
