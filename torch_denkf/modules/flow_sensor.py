@@ -30,6 +30,7 @@ class _MotionTrunk(nn.Module):
         super().__init__()
         channels, height, width = FLOW_SHAPE
         pitches, shifts = ROAD_SHAPE
+        dtype = torch.get_default_dtype()
         self.flow = nn.Sequential(
             nn.Conv2d(channels + 2, 16, 3, 2, 1),
             nn.ReLU(),
@@ -47,8 +48,8 @@ class _MotionTrunk(nn.Module):
         )
         self.pitch = nn.Linear(features, pitches)
         self.log_sharpness = nn.Parameter(torch.tensor(3.0))
-        self.register_buffer("distances", torch.as_tensor(ROAD_SHIFTS, dtype=torch.float32))
-        self.register_buffer("pitches", torch.as_tensor(ROAD_PITCHES / ROAD_PITCHES.max(), dtype=torch.float32))
+        self.register_buffer("distances", torch.as_tensor(ROAD_SHIFTS, dtype=dtype))
+        self.register_buffer("pitches", torch.as_tensor(ROAD_PITCHES / ROAD_PITCHES.max(), dtype=dtype))
         self.register_buffer("flow_grid", _grid(height, width))
         self.register_buffer("road_grid", _grid(pitches, shifts))
         self.out_features = features + 4

@@ -27,6 +27,7 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
     """
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
+    previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV refuses cut-outs
     # Searched from the current image, so that the vectors stand on its grid.
     return -dis.calc(current, previous, None) / camera.focal
 
