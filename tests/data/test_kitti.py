@@ -186,10 +186,29 @@ def test_grey_and_colour(tmp_path):
 
 
 def test_images_of_any_size_are_scaled(tmp_path):
-    make(tmp_path)
-    make(tmp_path, images=[3], size=(37, 122))
+    make(tmp_path, size=(37, 122))
     drive = read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None)
     assert drive["image"][3, :, 5, 5].tolist() == [103, 53, 3]
+
+
+def test_a_drive_has_one_size(tmp_path):
+    """An image of another size would have another calibration; a damaged one has no size."""
+    make(tmp_path)
+    make(tmp_path, images=[4], size=(37, 122))
+    (tmp_path / "sequences/00/image_2/000000.png").write_bytes(b"nothing")
+    message = r"000004.png is 122 pixels wide and 37 high, but .*000001.png is 30 pixels wide and 10 high; .* one size"
+    with pytest.warns(UserWarning, match="000000.png is not a complete PNG"), pytest.raises(ValueError, match=message):
+        read_kitti_drive(tmp_path, "00", size=(10, 30), cache=tmp_path / "cache")
+    assert not list(tmp_path.glob("cache/*"))
+
+
+def test_progress_counts_the_images_that_are_decoded(tmp_path):
+    make(tmp_path, images=[0, 1, 3, 5])
+    seen = []
+    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
+    assert sum(seen) == 4
+    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
+    assert sum(seen) == 4
 
 
 def test_times_are_nominal_without_a_file(tmp_path):

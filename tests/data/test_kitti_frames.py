@@ -78,11 +78,34 @@ def test_windows_of_a_drive_and_of_its_frames_are_the_same():
     assert (windows["state"][1] == drive["state"][4:7]).all()
 
 
+def test_motion_comes_along():
+    """Flow and road as float32, zero where the row is not observed; without images there are no pixels."""
+    drive = make_drive(missing=[3])
+    drive["flow"] = torch.randn(8, 3, 2, 4).half()
+    drive["road"] = torch.randn(8, 5, 6).half()
+    observed = [1, 2, 5, 6, 7]
+    for given in (drive, drive.exclude("image")):
+        frames = drive_frames(given)
+        assert ("pixels" in frames.keys()) == ("image" in given.keys())  # noqa: SIM118
+        for key in ("flow", "road"):
+            assert frames[key].dtype == torch.float32
+            assert (frames[key][observed] == drive[key][observed].float()).all()
+            assert not frames[key][[0, 3, 4]].any()
+        windows = sample_windows(given, 2, [1, 5])
+        assert (windows == sample_windows(frames, 2, [1, 5])).all()
+        assert windows["flow"].shape == (2, 2, 3, 2, 4)
+        assert (windows["road"][0, 1] == drive["road"][2].float()).all()
+
+
 def test_errors_say_what_to_do():
     drive = make_drive()
     with pytest.raises(ValueError, match=r"windows of 3 rows from \[0, 6\] do not fit in 8 rows; .* 0 to 5"):
         sample_windows(drive, 3, [0, 6])
     with pytest.raises(ValueError, match="do not fit"):
         sample_windows(drive, 3, [-1])
+    with pytest.raises(ValueError, match=r"windows of 9 rows from \[0\] do not fit in 8 rows; pass a length in 1 to 8"):
+        sample_windows(drive, 9, [0])
+    with pytest.raises(KeyError, match=r"lacks \['image'\]"):
+        drive_frames(drive.exclude("image"))
     with pytest.raises(KeyError, match=r"lacks \['frame_valid', 'time'\]; pass what .*read_kitti_drive returns"):
         drive_frames(drive.exclude("frame_valid", "time"))

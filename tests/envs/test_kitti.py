@@ -66,6 +66,20 @@ def test_a_rollout_is_the_drives_frames(root, tmp_path, colour):
     assert env.dt == pytest.approx(0.103)
 
 
+@pytest.mark.parametrize("images", [True, False])
+def test_flow_and_road_are_emitted_where_the_drive_has_them(drive, images):
+    drive = drive.copy() if images else drive.exclude("image")
+    drive["flow"], drive["road"] = torch.randn(ROWS, 3, 2, 5).half(), torch.randn(ROWS, 4, 6).half()
+    env = KITTIReplayEnv(drive, batch_size=[2], start=[0, 6], length=5)
+    check_env_specs(env)
+    keys = {"pixels", "flow", "road", "state"} if images else {"flow", "road", "state"}
+    assert keys - set(env.observation_spec.keys()) == set()
+    assert ("pixels" in env.observation_spec.keys()) == images  # noqa: SIM118
+    rollout, frames = env.rollout(10), drive_frames(drive)
+    same(rollout, frames, torch.tensor([[0, 1, 2, 3], [6, 7, 8, 9]]), keys)
+    assert (rollout["flow"][0, 2] == drive["flow"][2].float()).all()
+
+
 def test_rows_replay_their_own_stretch(drive):
     env = KITTIReplayEnv(drive, batch_size=[3], start=[0, 4, 12], length=8)
     rollout, frames = env.rollout(1000), drive_frames(drive)

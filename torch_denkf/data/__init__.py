@@ -3,15 +3,19 @@
 from torch_denkf.data.drives import random_drive, render_drives, roadside_scene, write_drives
 from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
 from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
+from torch_denkf.data.kitti_replay import KITTIOdometryExperienceReplay
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
+from torch_denkf.data.mirror import mirror_drive
 from torch_denkf.data.motion import with_motion
 
 __all__ = [
+    "KITTIOdometryExperienceReplay",
     "drive_frames",
     "frames_at",
     "list_kitti_drives",
     "lorenz96_step",
     "lorenz96_tendency",
+    "mirror_drive",
     "random_drive",
     "read_kitti_drive",
     "render_drives",

@@ -13,6 +13,8 @@ from torch import Tensor
 
 __all__ = ["drive_frames", "frames_at", "sample_windows"]
 
+MOTION_KEYS = ("flow", "road")  # what with_motion adds
+
 
 def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     """Frames of a drive by row number.
@@ -20,17 +22,21 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     ============ ============ ====================================================================================
     key          shape        content
     ============ ============ ====================================================================================
-    ``pixels``   [*B,2C,H,W]  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1]
+    ``pixels``   [*B,2C,H,W]  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1];
+                              where the drive has ``image``
+    ``flow``     [*B,3,h,w]   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
+    ``road``     [*B,p,s]     float32, likewise
     ``state``    [*B,5]       float32, see :func:`torch_denkf.data.read_kitti_drive`
     ``observed`` [*B,1]       bool: both frames are there, so that the difference means something
     ``time``     [*B,1]       float64, s
     ============ ============ ====================================================================================
 
-    What is missing is zero: both parts where frame t is, the difference where frame t-1 is. The first row of a drive
-    has no frame before it and is not observed.
+    What is missing is zero: both parts of the pixels where frame t is, the difference, the flow and the road where
+    frame t-1 is. The first row of a drive has no frame before it and is not observed.
 
     Args:
-        drive: as :func:`torch_denkf.data.read_kitti_drive` gives it, batch size ``[N]``.
+        drive: as :func:`torch_denkf.data.read_kitti_drive` or :func:`torch_denkf.data.with_motion` gives it, batch
+            size ``[N]``. One that has flow need not have images.
         index: rows, int64 ``[*B]``, in [0, N).
 
     Returns:
@@ -39,18 +45,30 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     Raises:
         KeyError: if ``drive`` lacks a key, with what to pass.
     """
-    missing = {"image", "frame_valid", "state", "time"} - set(drive.keys())
+    missing = {"frame_valid", "state", "time"} - set(drive.keys())
+    if not {"image", "flow"} & set(drive.keys()):
+        missing.add("image")
     if missing:
         raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")
-    before = (index - 1).clamp_min(0)
-    valid = drive["frame_valid"][index]
-    observed = valid & drive["frame_valid"][before] & (index > 0).unsqueeze(-1)
-    frame = drive["image"][index].to(torch.float32)
-    difference = frame - drive["image"][before]
-    difference = torch.where(observed[..., None, None], difference, 0.0)
-    pixels = torch.cat([torch.where(valid[..., None, None], frame, 0.0), difference], -3).div_(255)
-    entries = {"pixels": pixels, "state": drive["state"][index], "observed": observed, "time": drive["time"][index]}
+    valid, observed = drive["frame_valid"][index], observed_at(drive, index)
+    entries = {"state": drive["state"][index], "observed": observed, "time": drive["time"][index]}
+    if "image" in drive:
+        frame = drive["image"][index].to(torch.float32)
+        difference = frame - drive["image"][(index - 1).clamp_min(0)]
+        difference = torch.where(observed[..., None, None], difference, 0.0)
+        entries["pixels"] = torch.cat([torch.where(valid[..., None, None], frame, 0.0), difference], -3).div_(255)
+    for key in MOTION_KEYS:
+        if key in drive:
+            motion = drive[key][index].to(torch.float32)
+            mask = observed.reshape(*observed.shape[:-1], *[1] * (motion.ndim - index.ndim))
+            entries[key] = torch.where(mask, motion, 0.0)
     return TensorDict(entries, batch_size=index.shape, device=drive["state"].device)
+
+
+def observed_at(drive: TensorDictBase, index: Tensor) -> Tensor:
+    """Whether both the frame and the one before it are there: ``"observed"`` of :func:`frames_at`, ``[*B, 1]``."""
+    before = drive["frame_valid"][(index - 1).clamp_min(0)]
+    return drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)
 
 
 def drive_frames(drive: TensorDictBase) -> TensorDict:
@@ -100,10 +118,14 @@ def sample_windows(frames: TensorDictBase, length: int, starts: Sequence[int] | 
     if length < 1 or starts.ndim != 1 or bool(((starts < 0) | (starts + length > rows)).any()):
         raise ValueError(
             f"windows of {length} rows from {starts.tolist()} do not fit in {rows} rows; "
-            f"pass [n] starts in 0 to {rows - length}"
+            + (
+                f"pass [n] starts in 0 to {rows - length}"
+                if 1 <= length <= rows
+                else f"pass a length in 1 to {rows}, or a longer drive"
+            )
         )
     index = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
-    windows = frames_at(frames, index) if "image" in frames.keys() else frames[index]  # noqa: SIM118
+    windows = frames_at(frames, index) if "frame_valid" in frames else frames[index]
     return _mark_start(windows)
 
 

@@ -16,9 +16,8 @@ import hashlib
 import json
 import os
 import re
-import shutil
-import tempfile
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -27,6 +26,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torch_denkf.data._cache import _cache_directory, _cached
 from torch_denkf.data._kitti_files import (
     poses_to_state,
     read_calibration,
@@ -38,7 +38,7 @@ from torch_denkf.data._kitti_files import (
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
-_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 _END_OF_PNG = b"IEND\xaeB`\x82"
 
 
@@ -73,6 +73,7 @@ def read_kitti_drive(
     size: tuple[int, int] = (50, 150),
     colour: bool | None = True,
     cache: str | Path | bool | None = True,
+    progress: Callable[[int], object] | None = None,
 ) -> TensorDict:
     """Read one drive: images of one size, and the planar state in Kloss et al.'s convention.
 
@@ -108,14 +109,16 @@ def read_kitti_drive(
             one grey channel; None leaves them as the files are.
         cache: folder of the cache; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``; None or False
             for none: the drive is then in memory.
+        progress: called with the number of images that were decoded since the last call; never, where the cache has
+            the drive.
 
     Returns:
         The drive, batch size ``[N]``.
 
     Raises:
         FileNotFoundError: without the sequence's folder, images, poses or calibration.
-        ValueError: for malformed rows, images without any pose, drives none of whose images can be read, and sizes
-            that are not positive.
+        ValueError: for malformed rows, images without any pose, drives none of whose images can be read, drives whose
+            images differ in size, and sizes that are not positive.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -135,7 +138,7 @@ def read_kitti_drive(
         raise FileNotFoundError(f"no images FFFFFF.png in {folder / camera}; pass another camera, or download them")
 
     def read() -> TensorDict:
-        return _read(folder, poses, camera, files, (height, width), colour)
+        return _read(folder, poses, camera, files, (height, width), colour, progress)
 
     if cache is None or cache is False:
         return read()
@@ -147,45 +150,12 @@ def read_kitti_drive(
     return _cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
 
 
-def _cache_directory() -> Path:
-    return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
-
-
 def _stamp(path: Path) -> tuple[int, int]:
     try:
         status = path.stat()
     except FileNotFoundError:
         return (-1, -1)
     return (status.st_mtime_ns, status.st_size)
-
-
-def _cached(entry: Path, read) -> TensorDict:
-    """Load a cache entry, or make it: written beside and renamed, so that an entry that exists is complete."""
-    if entry.is_dir():
-        try:
-            return TensorDict.load_memmap(entry)
-        except (OSError, RuntimeError, KeyError, ValueError):  # damaged from outside: make it anew
-            shutil.rmtree(entry, ignore_errors=True)
-    drive = read()
-    try:
-        entry.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=entry.parent))
-    except OSError as error:
-        raise OSError(
-            f"cannot write the cache at {entry.parent} ({error}); pass cache=FOLDER or cache=None, or set "
-            "TORCH_DENKF_CACHE"
-        ) from error
-    try:
-        drive.memmap(beside / "drive")
-        if not entry.is_dir():
-            try:
-                (beside / "drive").rename(entry)
-            except OSError:
-                if not entry.is_dir():  # otherwise another process was faster, with the same content
-                    raise
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return TensorDict.load_memmap(entry)
 
 
 def _choose_camera(folder: Path, camera: str | None) -> str:
@@ -217,7 +187,13 @@ def _frame_files(folder: Path) -> dict[int, Path]:
 
 
 def _read(
-    folder: Path, poses_file: Path, camera: str, files: dict[int, Path], size: tuple[int, int], colour: bool | None
+    folder: Path,
+    poses_file: Path,
+    camera: str,
+    files: dict[int, Path],
+    size: tuple[int, int],
+    colour: bool | None,
+    progress: Callable[[int], object] | None,
 ) -> TensorDict:
     poses = read_poses(poses_file)
     numbers = [number for number in files if number < len(poses)]
@@ -234,18 +210,30 @@ def _read(
         colour = _is_colour(files[number] for number in numbers)
     image = np.zeros((rows, 3 if colour else 1, *size), dtype=np.uint8)
     valid = np.zeros((rows, 1), dtype=bool)
-    native = None
+    native, first_file = None, None
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:  # OpenCV decodes without the GIL
         frames = pool.map(lambda number: _read_image(files[number], size, colour), numbers)
-        for number, (pixels, shape) in zip(numbers, frames, strict=True):
-            if pixels is None:
-                warnings.warn(
-                    f"{files[number]} is not a complete PNG image; its frame counts as missing (frame_valid False)",
-                    stacklevel=4,
-                )
-                continue
-            image[number - first], valid[number - first] = pixels, True
-            native = native or shape
+        try:
+            for number, (pixels, shape) in zip(numbers, frames, strict=True):
+                if progress is not None:
+                    progress(1)
+                if pixels is None:
+                    warnings.warn(
+                        f"{files[number]} is not a complete PNG image; its frame counts as missing (frame_valid False)",
+                        stacklevel=4,
+                    )
+                    continue
+                if native is None:
+                    native, first_file = shape, files[number]
+                elif shape != native:
+                    raise ValueError(
+                        f"{files[number]} is {_text(shape)}, but {first_file} is {_text(native)}; the images of a "
+                        "drive have one size, that of its calibration: scale this one or take it away"
+                    )
+                image[number - first], valid[number - first] = pixels, True
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # without it, thousands of images would still be decoded
+            raise
     if native is None:
         raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them anew")
     calibration = scale_calibration(read_calibration(folder / "calib.txt", camera), native, size)
@@ -261,6 +249,10 @@ def _read(
         },
         batch_size=[rows],
     )
+
+
+def _text(size: tuple[int, int]) -> str:
+    return f"{size[1]} pixels wide and {size[0]} high"
 
 
 def _decode(file: Path, flags: int) -> np.ndarray | None:

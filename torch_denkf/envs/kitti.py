@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_denkf.data.frames import frames_at
+from torch_denkf.data.frames import MOTION_KEYS, frames_at
 from torch_denkf.data.kitti import read_kitti_drive
 
 __all__ = ["KITTIReplayEnv"]
@@ -26,7 +26,10 @@ class KITTIReplayEnv(EnvBase):
     ============ ============ ====================================================================================
     key          shape        content
     ============ ============ ====================================================================================
-    ``pixels``   [*B,2C,H,W]  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour
+    ``pixels``   [*B,2C,H,W]  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour;
+                              where the drive has images
+    ``flow``     [*B,3,h,w]   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
+    ``road``     [*B,p,s]     float32, likewise
     ``observed`` [*B,1]       bool: frames t and t-1 are both there; what is missing is zero in the pixels
     ``state``    [*B,5]       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
     ``is_init``  [*B,1]       bool: an episode starts here
@@ -44,7 +47,7 @@ class KITTIReplayEnv(EnvBase):
 
     Args:
         drive: the folder that holds ``sequences`` and ``poses``, or a drive as
-            :func:`torch_denkf.data.read_kitti_drive` gives it.
+            :func:`torch_denkf.data.read_kitti_drive` or :func:`torch_denkf.data.with_motion` gives it.
         sequence: name of the sequence, if ``drive`` is a folder.
         batch_size: ``*B``.
         start: row of the drive at which episodes start: one, one for each element of the batch (any shape that expands
@@ -124,10 +127,13 @@ class KITTIReplayEnv(EnvBase):
         self._starts, self._lengths, self._rows = begin, frames, rows
 
     def _set_specs(self) -> None:
-        shape, channels, size = self.batch_size, 2 * self.drive["image"].shape[1], self.drive["image"].shape[2:]
+        shape, emitted = self.batch_size, frames_at(self.drive, self._starts)
         flag = Binary(shape=(*shape, 1), dtype=torch.bool)
+        seen = {key: Unbounded(emitted[key].shape, dtype=torch.float32) for key in MOTION_KEYS if key in emitted}
+        if "pixels" in emitted:
+            seen["pixels"] = Bounded(low=-1.0, high=1.0, shape=emitted["pixels"].shape, dtype=torch.float32)
         self.observation_spec = Composite(
-            pixels=Bounded(low=-1.0, high=1.0, shape=(*shape, channels, *size), dtype=torch.float32),
+            **seen,
             observed=flag.clone(),
             state=Unbounded((*shape, 5), dtype=torch.float32),
             is_init=flag.clone(),

@@ -1,0 +1,44 @@
+"""Memory-mapped TensorDicts that were costly to make, kept on disk from one run to the next."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from tensordict import TensorDict
+
+
+def _cache_directory() -> Path:
+    return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
+
+
+def _cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
+    """Load a cache entry, or make it: written beside and renamed, so that an entry that exists is complete."""
+    if entry.is_dir():
+        try:
+            return TensorDict.load_memmap(entry)
+        except (OSError, RuntimeError, KeyError, ValueError):  # damaged from outside: make it anew
+            shutil.rmtree(entry, ignore_errors=True)
+    drive = read()
+    try:
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=entry.parent))
+    except OSError as error:
+        raise OSError(
+            f"cannot write the cache at {entry.parent} ({error}); pass cache=FOLDER or cache=None, or set "
+            "TORCH_DENKF_CACHE"
+        ) from error
+    try:
+        drive.memmap(beside / "drive")
+        if not entry.is_dir():
+            try:
+                (beside / "drive").rename(entry)
+            except OSError:
+                if not entry.is_dir():  # otherwise another process was faster, with the same content
+                    raise
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return TensorDict.load_memmap(entry)
