@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tests.vision.drives_for_tests import rendered_motion
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import FlowSensor, deterministic
-from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, median_turn
+from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
 
 cv2.setNumThreads(1)
 DT = 0.1
@@ -80,14 +80,14 @@ def test_turn_is_the_median_flow_ahead():
     silence(sensor.module["head"])
     turned = sensor(motion.select("flow", "road"))["sensor", "ensemble"][:, 0, 1].detach().numpy() * DT
     flow = motion["flow"].float().numpy()
-    # Rows from 33 to 50 % of the height and columns from 37.5 to 62.5 % of the width; an even number of them, of
-    # which torch's median is the lower one of the two in the middle and NumPy's their mean.
-    ahead = np.sort(flow[:, 0, 8:12, 29:49].reshape(len(flow), -1))
-    low, high = ahead[:, 39], ahead[:, 40]
-    assert (turned >= low - 1e-7).all()
-    assert (turned <= high + 1e-7).all()
-    expected = [median_turn(each.transpose(1, 2, 0))[0] for each in flow]
-    np.testing.assert_allclose((low + high) / 2, expected, rtol=0, atol=1e-7)
+    # Rows from 33 to 50 % of the height and as many columns to both sides of the middle one.
+    expected = np.median(flow[:, 0, 8:12, 29:50].reshape(len(flow), -1), axis=1)
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-7)
+    mirrored = motion.select("flow", "road").clone()
+    mirrored["flow"] = mirrored["flow"].flip(-1)
+    mirrored["flow"][:, 0] *= -1
+    again = sensor(mirrored)["sensor", "ensemble"][:, 0, 1].detach().numpy() * DT
+    np.testing.assert_allclose(again, -turned, rtol=0, atol=1e-7)
     assert np.abs(turned).max() > 0.03
 
 

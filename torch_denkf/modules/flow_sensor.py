@@ -190,5 +190,8 @@ def _grid(height: int, width: int) -> torch.Tensor:
 def _median_turn(flow: torch.Tensor) -> torch.Tensor:
     """Like :func:`torch_denkf.vision.median_turn`, to the left, on a batch of coarse flows."""
     height, width = flow.shape[-2:]
-    ahead = flow[:, 0, int(0.33 * height) : int(0.5 * height), int(0.375 * width) : int(0.625 * width)]
-    return ahead.flatten(1).median(1).values
+    side = int(0.375 * width)  # as much on both sides: where things come nearer, their flows cancel
+    ahead = flow[:, 0, int(0.33 * height) : int(0.5 * height), side : width - side].flatten(1)
+    middle = ahead.shape[1] // 2
+    ordered = ahead.sort(1).values  # torch's median would take the lower of two middle values
+    return (ordered[:, (ahead.shape[1] - 1) // 2] + ordered[:, middle]) / 2
