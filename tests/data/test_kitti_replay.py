@@ -1,7 +1,5 @@
 """The data set's rows are the drives' frames, in whatever order torchrl asks for them."""
 
-import shutil
-import warnings
 from functools import partial
 
 import cv2
@@ -15,7 +13,6 @@ from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.data._kitti_episodes as episodes_module
 import torch_denkf.data.kitti as kitti_module
-from tests.data.test_kitti import KITTI, make
 from torch_denkf.data import (
     KITTIOdometryExperienceReplay,
     drive_frames,
@@ -214,6 +211,10 @@ def test_flow(root, tmp_path):
     assert light[:]["flow"].equal(rows["flow"])
     assert light[:]["calibration"].equal(rows["calibration"])
     assert set(light.statistics.keys()) == {"velocity"}
+    short = open_dataset(root, ["lane", "town"], mirrored=True, flow=True, cache=tmp_path / "cache")
+    assert (short[:] == rows).all()
+    assert len(list(tmp_path.glob("cache/motion-*"))) == 2
+    assert "flow" not in open_dataset(root, "lane", flow=False)[:]
     for bad in (lambda drive: drive, lambda drive: flow(drive)[1:]):
         with pytest.raises(ValueError, match=r"flow must return the drive with 'flow', 9 rows of it; for lane/image_2"):
             open_dataset(root, "lane", flow=bad)
@@ -263,115 +264,6 @@ def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
     open_dataset(root, "lane")
 
 
-def test_cameras(tmp_path):
-    make(tmp_path, camera="image_0", grey=True, sequence="00")
-    make(tmp_path, camera="image_3", sequence="00")
-    make(tmp_path, camera="image_0", grey=True, sequence="01")
-    make(tmp_path, camera="image_1", grey=True, sequence="01")
-
-    def chosen(**options):
-        return [(e.drive, e.camera) for e in open_dataset(tmp_path, **options).episodes]
-
-    assert chosen() == [("00", "image_0"), ("01", "image_0")]
-    # Both cameras of one kind, colour before grey.
-    assert chosen(cameras="both") == [("00", "image_3"), ("01", "image_0"), ("01", "image_1")]
-    assert chosen(cameras=["image_1", "image_0"], drives=1) == [("01", "image_1"), ("01", "image_0")]
-    data = open_dataset(tmp_path, cameras="both", colour=False)
-    assert data[:]["pixels"].shape == (18, 2, *SIZE)
-    assert (data[0]["calibration"] != data[6]["calibration"]).any()  # each camera has its own
-    with pytest.raises(ValueError, match=r"01/image_0 has frames of {'image': \(1, .*00/image_3 has .*\(3, .*colour"):
-        open_dataset(tmp_path, cameras="both", colour=None)
-    for wrong in ("all", "image_2", [], ["image_0", "image_0"]):
-        with pytest.raises(ValueError, match="cameras is 'first', 'both' or a sequence of folder names"):
-            open_dataset(tmp_path, cameras=wrong)
-    with pytest.raises(FileNotFoundError, match=r"no folder .*sequences/01/image_2"):
-        open_dataset(tmp_path, cameras=["image_2"], drives="01")
-
-
-def test_drives_of_other_sizes_are_scaled_with_their_calibration(tmp_path):
-    make(tmp_path, sequence="00", size=(12, 36))
-    make(tmp_path, sequence="01", size=(24, 72))
-    rows = open_dataset(tmp_path)[:]
-    torch.testing.assert_close(rows["calibration"][0], torch.tensor([30.0, 18.0, 14.5, 4.5]))
-    torch.testing.assert_close(rows["calibration"][6], torch.tensor([15.0, 9.0, 7.0, 2.0]))
-
-
-# Bad input -----------------------------------------------------------------------------------------------------------
-
-
-def fails(error, match, root, **options):
-    with pytest.raises(error, match=match):
-        open_dataset(root, **options)
-
-
-def test_folders_that_lack_something(tmp_path):
-    fails(FileNotFoundError, r"no folder .*sequences; pass the folder that holds 'sequences' and 'poses'", tmp_path)
-    (tmp_path / "sequences").mkdir()
-    fails(FileNotFoundError, r"no drive below .* has both images and poses: it is empty; download KITTI", tmp_path)
-    make(tmp_path, sequence="05", images=[])
-    make(tmp_path, sequence="07")
-    (tmp_path / "poses/07.txt").unlink()
-    message = r"no poses/NAME.txt for \['07'\]; no images sequences/NAME/image_\*/FFFFFF.png for \['05'\]"
-    fails(FileNotFoundError, message, tmp_path)
-    make(tmp_path, sequence="02")
-    assert [e.drive for e in open_dataset(tmp_path).episodes] == ["02"]
-    # Asked for by name, they are errors.
-    fails(FileNotFoundError, r"no images in .*sequences/05; expected FFFFFF.png", tmp_path, drives=["02", "05"])
-    fails(FileNotFoundError, r"no images in .*sequences/05", tmp_path, drives=["05"], cameras="both")
-    fails(FileNotFoundError, r"no poses at .*poses/07.txt; download", tmp_path, drives=["07"])
-    fails(FileNotFoundError, r"no folder .*sequences/03; .* has \['02', '05', '07'\]", tmp_path, drives=[3])
-    for wrong in ([], ["02", 2]):
-        fails(ValueError, r"drives are names, each once, or None for all", tmp_path, drives=wrong)
-
-
-def test_damaged_files(tmp_path):
-    make(tmp_path, sequence="00")
-    make(tmp_path, sequence="01", size=(40, 60))
-    folder = tmp_path / "sequences/01/image_2"
-    noisy = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
-    cv2.imwrite(str(folder / "000004.png"), noisy)
-    data = (folder / "000004.png").read_bytes()
-    (folder / "000004.png").write_bytes(data[: len(data) // 2])  # truncated
-    (folder / "000002.png").write_bytes(data[:30] + b"?" * 200 + data[230:])  # corrupt, though its end is there
-    with pytest.warns(UserWarning, match="is not a complete PNG image") as caught:
-        rows = open_dataset(tmp_path, ["00", "01"])[:]
-    named = {str(folder / name) for name in ("000002.png", "000004.png")}
-    assert {str(warning.message).split(" is ")[0] for warning in caught} == named
-    assert rows["observed"][6:].flatten().tolist() == [False, True, False, False, False, False]
-    assert not rows["pixels"][[8, 10]].any()
-    for name in folder.iterdir():
-        name.write_bytes(b"nothing")
-    with pytest.warns(UserWarning, match="PNG"):
-        fails(ValueError, r"none of the 6 images in .*sequences/01/image_2 can be read", tmp_path)
-
-
-def test_files_that_contradict_each_other(tmp_path):
-    make(tmp_path)
-    make(tmp_path, images=[3], size=(37, 122))
-    fails(ValueError, r"000003.png is 122 pixels wide and 37 high, but .*000000.png is 30 pixels wide", tmp_path)
-    make(tmp_path)
-    lines = (tmp_path / "poses/00.txt").read_text().splitlines()
-    (tmp_path / "poses/00.txt").write_text("\n".join([*lines[:2], lines[2] + " 7", *lines[3:]]))
-    fails(ValueError, r"poses/00.txt:3: expected 12 finite numbers", tmp_path)
-    fails(ValueError, r"size is \(height, width\)", tmp_path, size=(0, 5))
-
-
-def test_drives_shorter_than_a_slice(root):
-    message = r"slices have 15 rows, but these drives are shorter: {'hill/image_2': 14, 'lane/image_2': 9}; leave them"
-    fails(ValueError, message, root, batch_size=30, num_slices=2)
-    fails(ValueError, message, root, batch_size=30, slice_len=15)
-    fails(ValueError, message, root, batch_size=30, sampler=SliceSampler(num_slices=2))
-    data = open_dataset(root, batch_size=30, num_slices=2, strict_length=False)
-    for _ in range(20):  # the short ones come whole
-        sample = data.sample()
-        ends = sample["next", "truncated"].flatten().nonzero().flatten() + 1
-        lengths = ends.diff(prepend=torch.zeros(1, dtype=torch.int64))
-        assert lengths.tolist() == [min(15, data.episodes[k].length) for k in sample["episode"][ends - 1]]
-    assert len(open_dataset(root, "town", batch_size=30, num_slices=2).sample()) == 30
-    for wrong in ({"num_slices": 2, "slice_len": 3}, {"num_slices": 2, "sampler": SliceSampler(num_slices=2)}):
-        fails(ValueError, "pass one of num_slices, slice_len and sampler", root, **wrong)
-
-
 # The rest of torchrl's interface -------------------------------------------------------------------------------------
 
 
@@ -395,42 +287,3 @@ def test_preprocess_sees_pixels(root, tmp_path):
     rows = data[:]
     torch.testing.assert_close(storage[:]["dark"], 1 - rows["pixels"][:, :3].mean((1, 2, 3)))
     assert storage[:]["state"].equal(rows["state"])
-
-
-# Real frames ---------------------------------------------------------------------------------------------------------
-
-
-def test_real_frames(tmp_path):
-    drive = "2011_09_26_drive_0039"
-    if not (KITTI / "sequences" / drive / "image_1").is_dir():
-        pytest.skip(f"no KITTI frames at {KITTI}")
-    for camera in ("image_0", "image_1"):
-        folder = tmp_path / "sequences" / drive / camera
-        folder.mkdir(parents=True)
-        for k in range(40):
-            file = KITTI / "sequences" / drive / camera / f"{k:06d}.png"
-            if file.is_file():
-                (folder / file.name).symlink_to(file)
-    (tmp_path / "poses").mkdir()
-    shutil.copy(KITTI / "poses" / f"{drive}.txt", tmp_path / "poses")
-    for name in ("calib.txt", "times.txt"):
-        shutil.copy(KITTI / "sequences" / drive / name, tmp_path / "sequences" / drive)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        data = KITTIOdometryExperienceReplay(
-            tmp_path, cameras="both", mirrored=True, colour=False, batch_size=40, num_slices=4, cache=tmp_path / "cache"
-        )
-    assert [(e.camera, e.mirrored, e.length) for e in data.episodes] == [
-        (camera, mirrored, 40) for camera in ("image_0", "image_1") for mirrored in (False, True)
-    ]
-    batch = data.sample().reshape(4, 10)
-    for row in batch:
-        episode = data.episodes[row["episode"][0]]
-        drive_rows = read_kitti_drive(tmp_path, drive, camera=episode.camera, colour=False, cache=None)
-        frames = drive_frames(mirror_drive(drive_rows) if episode.mirrored else drive_rows)
-        for key in KEYS:
-            assert row[key].equal(frames[key][row["frame"].flatten()]), key
-    # Side by side, the cameras see the same turns; the pictures differ by their parallax.
-    pixels = data[:]["pixels"].reshape(4, 40, 2, 50, 150)
-    assert 0.005 < (pixels[0, :, 0] - pixels[2, :, 0]).abs().mean() < 0.2
-    assert (data[:]["state"][:40] == data[:]["state"][80:120]).all()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 
 from torch_denkf.data.kitti import _frame_files, list_kitti_drives, read_kitti_drive
+from torch_denkf.data.motion import with_motion
 
 try:  # of the extra "examples"
     from tqdm import tqdm
@@ -131,25 +133,26 @@ def read_drives(
     size: tuple[int, int],
     colour: bool | None,
     cache: str | Path | bool | None,
-    flow: Callable[[TensorDictBase], TensorDictBase] | None,
+    flow: bool | Callable[[TensorDictBase], TensorDictBase],
     progress: bool,
 ) -> list[TensorDict]:
-    """Read drives one after another, with flow where ``flow`` is given.
+    """Read drives one after another, with flow if asked for: ``flow`` True is :func:`with_motion`, with the same cache.
 
     Raises:
         ValueError: if ``flow`` returns something else than the drive with ``"flow"``, or if drives differ in what a
             frame holds.
     """
     counts = [len(_frame_files(root / "sequences" / drive / camera)) for drive, camera in sources]
-    steps = 1 if flow is None else 2
+    add_flow = partial(with_motion, cache=cache) if flow is True else flow
+    steps = 2 if add_flow else 1
     drives, ends = [], 0
     with Bar(steps * sum(counts), progress) as bar:
         for (name, camera), count in zip(sources, counts, strict=True):
             drive = read_kitti_drive(root, name, camera=camera, size=size, colour=colour, cache=cache, progress=bar)
             bar.skip_to(ends + count)
-            if flow is not None:
+            if add_flow:
                 rows = drive.batch_size
-                drive = flow(drive)
+                drive = add_flow(drive)
                 if "flow" not in drive or drive.batch_size != rows:
                     raise ValueError(
                         f"flow must return the drive with 'flow', {rows[0]} rows of it; for {name}/{camera} it "

@@ -61,8 +61,9 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
         mirrored: True adds each episode's mirror image, see :func:`torch_denkf.data.mirror_drive`.
         colour: True for three channels, False for a grey one, None for what the files have.
         size: (H, W) to scale the images to.
-        flow: what adds ``"flow"`` to a drive, such as :func:`torch_denkf.data.with_motion`; called once for each drive
-            and camera. If it takes ``"image"`` away, samples have no pixels.
+        flow: True adds ``"flow"`` and ``"road"`` by :func:`torch_denkf.data.with_motion`, kept in the same cache. Or
+            what else adds ``"flow"`` to a drive, called once for each drive and camera, such as
+            ``partial(with_motion, keep_images=False)``: samples then have no pixels.
         batch_size: rows of a sample.
         num_slices: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence; reshape the sample to
             ``[num_slices, -1]``. Exclusive with ``slice_len`` and ``sampler``.
@@ -109,7 +110,7 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
         mirrored: bool = False,
         colour: bool | None = True,
         size: tuple[int, int] = (50, 150),
-        flow: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        flow: bool | Callable[[TensorDictBase], TensorDictBase] = False,
         batch_size: int | None = None,
         num_slices: int | None = None,
         slice_len: int | None = None,
