@@ -107,6 +107,7 @@ def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
             dt=statistics.dt,
             loc=statistics.loc,
             scale=statistics.scale,
+            drift=False,
         ),
         sensor=sensor,
         observation=known or LearnedObservation(SensorCurve(statistics.loc, statistics.scale)),

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torchrl.envs.transforms import Transform
 from tqdm import tqdm
 
-from torch_denkf.data import list_kitti_drives, read_kitti_drive, with_motion
+from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_kitti_drive, with_motion
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
@@ -118,26 +118,11 @@ def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
 
 def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
     """Rows of a stream as the sensor reads them; a row whose frame or the one before is missing is not observed."""
-    before = (index - 1).clamp_min(0)
-    observed = stream["frame_valid"][index] & stream["frame_valid"][before] & (index > 0).unsqueeze(-1)
-    state = stream["state"][index]
-    frames = TensorDict({"observed": observed, "state": state}, batch_size=index.shape)
-    frames["target_observation"] = state[..., 3:]
-    if sensor == "flow":
-        frames.update({"flow": stream["flow"][index], "road": stream["road"][index]})
-    else:
-        image, previous = (stream["image"][i].float() / 255 for i in (index, before))
-        frames["pixels"] = torch.where(observed[..., None, None], torch.cat([image, image - previous], -3), 0.0)
-    return frames
+    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road"), index)
+    return frames.set("target_observation", frames["state"][..., 3:])
 
 
 def mirror(frames: TensorDict) -> TensorDict:
     """What a mirrored world would have shown: sideways motion and turns change sign."""
-    frames = frames.copy()
-    frames["state"] = frames["state"] * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0])
-    frames["target_observation"] = frames["state"][..., 3:]
-    if "pixels" in frames.keys():  # noqa: SIM118
-        frames["pixels"] = frames["pixels"].flip(-1)
-        return frames
-    sign = torch.tensor([-1.0, 1.0, 1.0])[:, None, None].to(frames["flow"].dtype)
-    return frames.set("flow", frames["flow"].flip(-1) * sign)
+    frames = mirror_drive(frames)
+    return frames.set("target_observation", frames["state"][..., 3:])

@@ -269,7 +269,7 @@ def train_fold(
 def calibrate(model: Filter, readings: Sequence[TensorDict], level: float = 0.9) -> None:
     """Sets the inflation of the analysis with which the filter's intervals hold their share of the truth."""
     analysis, distance = analysis_of(model), {}
-    for inflation in (1.0, 1.03, 1.06, 1.1, 1.15, 1.2):
+    for inflation in (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4):
         analysis.inflation = inflation
         covered = torch.stack([_coverage(out, level) for out in run_all(model, readings)]).mean(0)
         distance[inflation] = float((covered - level).abs().sum())

@@ -135,3 +135,18 @@ def test_motion_of_an_unchanged_forecast_is_the_forecast(float64):
     moved = forecast(UnicycleTransition(still, 0.1), state)
     td = TensorDict({"belief": {"ensemble": state}, "analysis": {"ensemble": moved}})
     torch.testing.assert_close(UnicycleMotion(0.1)(td)["belief", "ensemble"], moved, rtol=0, atol=1e-15)
+
+
+def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean():
+    torch.manual_seed(0)
+    network = StochasticMLP(2, 2)  # untrained: its mean change is anything
+    state = torch.randn(3, 16, 5) + torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1])
+    outs = {}
+    for drift in (True, False):
+        torch.manual_seed(1)
+        transition = UnicycleTransition(network, dt=0.1, scale=[2.0, 0.1], drift=drift)
+        td = TensorDict({("belief", "ensemble"): state}, [3])
+        outs[drift] = transition(td)["forecast", "ensemble"][..., 3:] - state[..., 3:]
+    torch.testing.assert_close(outs[False].mean(1), torch.zeros(3, 2), rtol=0, atol=1e-6)
+    torch.testing.assert_close(outs[False], outs[True] - outs[True].mean(1, keepdim=True), rtol=1e-5, atol=1e-6)
+    assert outs[False].std(1).min() > 0.001

@@ -125,6 +125,8 @@ class UnicycleTransition(_StochasticTransition):
         dt: time step in seconds.
         loc: mean of (v, theta_dot), in m/s and rad/s.
         scale: standard deviation of (v, theta_dot), in m/s and rad/s.
+        drift: False takes the ensemble's mean change away: the velocities walk at random, with learned steps, and a
+            network trained on few drives cannot make them return to those drives' usual ones where nothing is observed.
         ensemble_size: see :class:`LearnedTransition`.
         in_key: ensemble ``[*B, E, 5]`` of [x m, y m, theta rad, v m/s, theta_dot rad/s].
         out_key: forecast ensemble ``[*B, E, 5]``.
@@ -148,13 +150,14 @@ class UnicycleTransition(_StochasticTransition):
         *,
         loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
         scale: Sequence[float] | torch.Tensor = (1.0, 1.0),
+        drift: bool = True,
         ensemble_size: int | None = None,
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
         noise_key: NestedKey = ("noise", "transition"),
     ):
         super().__init__(velocity, [in_key], [out_key], ensemble_size, noise_key)
-        self.dt = dt
+        self.dt, self.drift = dt, drift
         self.register_buffer("loc", torch.as_tensor(loc, dtype=torch.get_default_dtype()))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.get_default_dtype()))
 
@@ -167,7 +170,10 @@ class UnicycleTransition(_StochasticTransition):
                 f"{state.shape[-1]} state dimensions."
             )
         pose, velocity = state.split([3, 2], -1)
-        velocity = velocity + self.scale * self._run((velocity - self.loc) / self.scale, tensordict)
+        change = self._run((velocity - self.loc) / self.scale, tensordict)
+        if not self.drift:
+            change = change - change.mean(-2, keepdim=True)
+        velocity = velocity + self.scale * change
         tensordict.set(self.out_keys[0], _move(pose, velocity, self.dt))
         return tensordict
 
