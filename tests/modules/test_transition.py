@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.modules import LearnedTransition, UnicycleMotion, UnicycleTransition
+from torch_denkf.modules import LearnedTransition, StochasticMLP, UnicycleMotion, UnicycleTransition
 
 BATCHES = [(), (3,), (2, 3)]
 
