@@ -58,6 +58,13 @@ class CanonicalCamera:
             ``[height, width]``, uint8.
         """
         fx, fy, cx, cy = (float(value) for value in calibration)
+        if fx > 1.5 * self.focal:  # linear interpolation alone would skip pixels
+            height, width = image.shape
+            size = round(width * self.focal / fx), round(height * self.focal / fx)
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            across, down = size[0] / width, size[1] / height
+            fx, cx = fx * across, (cx + 0.5) * across - 0.5  # pixel centres are at whole numbers
+            fy, cy = fy * down, (cy + 0.5) * down - 0.5
         x, y = fx / self.focal, fy / self.focal
         to_real = np.array([[x, 0, cx - x * (self.width - 1) / 2], [0, y, cy - y * (self.height - 1) / 2]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
