@@ -104,3 +104,19 @@ def test_errors():
         EnsembleAnalysis("enkf")
     with pytest.raises(ValueError, match="rotate"):
         EnsembleAnalysis("sakov", rotate=True)
+
+
+def test_inflation_leaves_an_ensemble_without_observation_as_it_is():
+    torch.manual_seed(0)
+    td = TensorDict(
+        {
+            "forecast": {"ensemble": torch.randn(2, 8, 3), "observation": torch.randn(2, 8, 2)},
+            "sensor": {"ensemble": torch.randn(2, 8, 2), "noise": torch.ones(2, 2)},
+            "observed": torch.tensor([[True], [False]]),
+        },
+        [2],
+    )
+    plain = EnsembleAnalysis("sensor")(td.clone())["belief", "ensemble"]
+    inflated = EnsembleAnalysis("sensor", inflation=1.5)(td.clone())["belief", "ensemble"]
+    torch.testing.assert_close(inflated[0] - inflated[0].mean(0), 1.5 * (plain[0] - plain[0].mean(0)))
+    torch.testing.assert_close(inflated[1], td["forecast", "ensemble"][1])

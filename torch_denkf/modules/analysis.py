@@ -27,7 +27,7 @@ class EnsembleAnalysis(SubModel):
     Args:
         scheme: ``"sensor"`` (the paper: innovations from the sensor's samples), ``"perturbed"`` (the sensor's mean
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
-        inflation: factor on the analysis anomalies; 1 for none.
+        inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
         ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
@@ -107,20 +107,24 @@ class EnsembleAnalysis(SubModel):
             noise = random_rotation(
                 forecast.shape[-2], forecast.shape[:-2], device=forecast.device, dtype=forecast.dtype
             )
+        observed = tensordict.get(self.optional_keys[0], None)
         ensemble, innovation, nis, log_likelihood = analyse(
             forecast,
             predicted,
             observation,
             variance,
             scheme=self.scheme,
-            observed=tensordict.get(self.optional_keys[0], None),
+            observed=observed,
             perturbation=noise if self.scheme == "perturbed" else None,
             rotation=noise if self.rotate else None,
         )
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
-            ensemble = inflate(ensemble, self.inflation)
+            inflated = inflate(ensemble, self.inflation)
+            if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
+                inflated = torch.where(observed.any(-1)[..., None, None], inflated, ensemble)
+            ensemble = inflated
         values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), innovation, nis, log_likelihood)
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
