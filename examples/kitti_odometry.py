@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # the parts of this example, whe
 
 from kitti_study.filters import FILTERS, SENSORS
 from kitti_study.fold import Part, with_disturbances
-from kitti_study.streams import find_streams, prepare
+from kitti_study.streams import find_streams, prepare, spans
 from kitti_study.study import Study, describe, evaluate_and_draw, make_jobs, prepare_jobs, run_jobs
 from kitti_study.tables import markdown, write_csv
 from kitti_study.training import Budget, load_filter
@@ -102,7 +102,8 @@ def evaluate(args: argparse.Namespace, study: Study) -> None:
         raise SystemExit("evaluate needs --checkpoint: a folder that train or table left in --out/folds")
     model, facts, name, sensor = load_filter(args.checkpoint)
     streams = find_streams(args.root, tuple(args.size), list(args.test) or None)
-    prepare([part.stream for part in with_disturbances([Part(s) for s in streams])], study.cache, args.processes)
+    parts = with_disturbances([Part(stream) for stream in streams])
+    prepare([each for part in parts for each in spans(part.stream, sensor)], study.cache, args.processes)
     names = {"filter_name": name, "kind": sensor, "seed": 0}
     write_table(args, evaluate_and_draw(model, facts, streams, study.cache, args.out / "plots", **names), begun)
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from kitti_study.filters import VELOCITIES, Statistics
+from kitti_study.filters import REACH, VELOCITIES, Statistics
+from kitti_study.fold import Part
 from kitti_study.streams import CONDITIONS, DISTURBANCES, Stream
-from kitti_study.training import lose_frames, read_sensor, run_filter
+from kitti_study.training import all_frames, lose_frames, read_spans, run_filter
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.metrics import (
@@ -34,11 +36,18 @@ _OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent",
 COLUMNS = (*_NAMES, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS)
 
 
-def hold_last(reading: TensorDict) -> Tensor:
-    """The sensor's mean velocities ``[N, 2]``; where it is blind the last one, at the start the true one."""
-    mean, observed = reading["sensor", "ensemble"].mean(1), reading["observed"].squeeze(-1)
-    index = torch.where(observed, torch.arange(len(mean)), -1).cummax(0).values
-    return torch.where(index.unsqueeze(-1) < 0, reading["state"][0, VELOCITIES], mean[index.clamp_min(0)])
+def hold_last(reading: TensorDict, dt: float) -> Tensor:
+    """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
+
+    A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
+    """
+    mean, steps = reading["sensor", "ensemble"].mean(1), reading["steps"].squeeze(-1).tolist()
+    held, path = reading["state"][0, VELOCITIES], []
+    for row, seen in enumerate(reading["observed"].squeeze(-1).tolist()):
+        if seen and abs(float(held[0])) * steps[row] * dt <= REACH:
+            held = mean[row] / steps[row]
+        path.append(held)
+    return torch.stack(path)
 
 
 def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
@@ -50,11 +59,11 @@ def evaluate(
     model: Filter, facts: Statistics, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
-    clean = read_sensor(model["sensor"], stream.read(cache), kind)
-    readings = {"clean": clean, "missing": lose_frames(clean, seed=stream.seed())}
+    clean = read_spans(model["sensor"], Part(stream), cache, kind)
+    readings = {"clean": all_frames(clean), "missing": lose_frames(clean, seed=stream.seed())}
     for condition in DISTURBANCES:
-        data = Stream(**{**stream.__dict__, "condition": condition}).read(cache)
-        readings[condition] = read_sensor(model["sensor"], data, kind)
+        part = Part(replace(stream, condition=condition))
+        readings[condition] = all_frames(read_spans(model["sensor"], part, cache, kind))
     conditions = [condition for condition in CONDITIONS if condition in readings]
     out = run_filter(model, [readings[condition] for condition in conditions])
     table = []
@@ -63,7 +72,7 @@ def evaluate(
         common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
         common["blind"] = 1 - float(reading["observed"][1:].float().mean())
         estimates = {filter_name: belief["belief", "mean"].double()}
-        estimates["dead_reckoning"] = integrate(hold_last(reading), truth, facts.dt)
+        estimates["dead_reckoning"] = integrate(hold_last(reading, facts.dt), truth, facts.dt)
         if condition == "clean":
             estimates["floor"] = integrate(truth[:, VELOCITIES], truth, facts.dt)
         for name, states in estimates.items():

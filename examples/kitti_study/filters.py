@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
+from kitti_study.streams import LONGEST
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.modules import (
     AroundState,
@@ -17,15 +18,17 @@ from torch_denkf.modules import (
     FlowSensor,
     ImageSensor,
     LearnedObservation,
-    Select,
+    PairObservation,
     StochasticMLP,
     SubModel,
     UnicycleMotion,
     UnicycleTransition,
+    WithHistory,
     convolutional_trunk,
 )
 
 ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
 # Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
 UNITS = (0.1, 0.03)
@@ -95,11 +98,18 @@ class SensorCurve(nn.Module):
 @register
 def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
     """The differentiable ensemble Kalman filter with known motion of the pose."""
-    encoding = (
-        sensor.encoding_features if isinstance(sensor, FlowSensor) else sensor.module["head"].layers[-1].in_features
-    )
-    # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
-    known = Select(VELOCITIES) if isinstance(sensor, FlowSensor) else None
+    pairs = isinstance(sensor, FlowSensor)
+    encoding = sensor.encoding_features if pairs else sensor.module["head"].layers[-1].in_features
+    # The flow sensor reads metres, from pairs of frames with a gap between them, too. One that was trained on grey
+    # values hedges, and h is the curve by which it does.
+    if pairs:
+        observation = PairObservation([REACH / statistics.dt, torch.inf])
+        keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
+    else:
+        observation, keys = LearnedObservation(SensorCurve(statistics.loc, statistics.scale)), {}
+    # Innovations correct the velocities, and each member's pose moves with them.
+    motion = UnicycleMotion(statistics.dt, history_key=("belief", "history") if pairs else None)
+    initial = AroundState(INITIAL_STD, ensemble_size=ENSEMBLE)
     return DEnKF(
         transition=UnicycleTransition(
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
@@ -110,11 +120,10 @@ def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
             drift=False,
         ),
         sensor=sensor,
-        observation=known or LearnedObservation(SensorCurve(statistics.loc, statistics.scale)),
+        observation=observation,
         noise=DiagonalNoise(2, r=statistics.unit, in_features=encoding, in_key=("sensor", "encoding")),
-        # Innovations correct the velocities, and each member's pose moves with them.
-        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(statistics.dt)),
-        initial=AroundState(INITIAL_STD, ensemble_size=ENSEMBLE),
+        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
+        initial=WithHistory(initial, LONGEST - 1) if pairs else initial,
     )
 
 
@@ -123,10 +132,12 @@ def analysis_of(model: Filter) -> EnsembleAnalysis:
     return next(module for module in model.modules() if isinstance(module, EnsembleAnalysis))
 
 
-def without_sensor(model: Filter, start_std: torch.Tensor | None = None) -> Filter:
-    """The same filter on readings of its sensor, sharing all parameters; windows may start from a wrong velocity."""
+def parts_of(model: Filter, *, sensor: bool, start_std: torch.Tensor | None = None) -> Filter:
+    """The same filter, sharing all parameters, with or without its sensor; windows may start from a wrong velocity."""
     parts = {name: model[name] for name in ("transition", "observation", "noise", "analysis")}
     initial = model.initial
     if start_std is not None:
         initial = AroundState(start_std, ensemble_size=ENSEMBLE, state_key="start")
-    return DEnKF(sensor=None, **parts, initial=initial)
+        if isinstance(model.initial, WithHistory):
+            initial = WithHistory(initial, model.initial.lags)
+    return DEnKF(sensor=model["sensor"] if sensor else None, **parts, initial=initial)

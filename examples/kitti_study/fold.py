@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from kitti_study.filters import VELOCITIES, Statistics
-from kitti_study.streams import DISTURBANCES, Stream, mirror, rows
+from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
+from torch_denkf.data import steps_between
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,25 @@ def with_disturbances(parts: Sequence[Part]) -> list[Part]:
     for part in parts:
         disturbed.append(part)
         for condition in DISTURBANCES:
-            stream = Stream(**{**part.stream.__dict__, "condition": condition})
-            disturbed.append(Part(stream, part.begin, part.end, 0.5 * part.weight / len(DISTURBANCES)))
+            stream = replace(part.stream, condition=condition)
+            disturbed.append(replace(part, stream=stream, weight=0.5 * part.weight / len(DISTURBANCES)))
     return disturbed
+
+
+def with_spans(parts: Sequence[Part]) -> list[Part]:
+    """Each clean part, and with less weight in pairs of two and of three steps."""
+    longer = [
+        replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
+        for part in parts
+        for steps, weight in ((2, 0.5), (3, 0.25))
+        if part.stream.condition == "clean"
+    ]
+    return [*parts, *longer]
 
 
 def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
     """Means and standard deviations over clean training drives, each counted mirrored, too."""
-    data = [part.read(cache) for part in parts if part.stream.condition == "clean"]
+    data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
     velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
     loc, scale = velocity.mean(0), velocity.std(0)
     loc[1], scale[1] = 0.0, velocity[:, 1].square().mean().sqrt()
@@ -89,7 +101,9 @@ class FrameSampler:
     """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
 
     def __init__(self, parts: Sequence[Part], cache: Path, sensor: str, streams_per_batch: int = 8):
+        parts = [part for part in parts if part.stream.steps == 1 or sensor == "flow"]
         self.data, self.sensor, self.count = [part.read(cache) for part in parts], sensor, streams_per_batch
+        self.steps = torch.tensor([part.stream.steps for part in parts])
         self.weight = torch.tensor([part.weight for part in parts])
 
     def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
@@ -104,8 +118,8 @@ class FrameSampler:
 
     def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
         """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
-        chosen = []
-        for number in torch.multinomial(self.weight, self.count, replacement=True, generator=generator).tolist():
+        chosen, weight = [], self.weight * (self.steps == 1)
+        for number in torch.multinomial(weight, self.count, replacement=True, generator=generator).tolist():
             data = self.data[number]
             first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
             frames = rows(data, torch.arange(first, first + length), self.sensor)
@@ -113,11 +127,31 @@ class FrameSampler:
         return with_start(torch.stack(chosen), start_std, generator)
 
 
+def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
+    """Of readings of pairs of 1, 2, ... steps ``[*B, K]``, those of ``steps`` ``[*B]``; none where that is 0.
+
+    A copy, with ``"observed"`` and ``"steps"`` ``[*B, 1]``.
+    """
+    spans = readings["spans"]
+    index = (steps - 1).clamp(0, spans.shape[-1] - 1).unsqueeze(-1)
+    taken = {}
+    for key in ("observed", "ensemble", "encoding"):
+        value = spans[key]
+        where = index.reshape(*index.shape, *[1] * (value.ndim - index.ndim))
+        taken[key] = value.gather(steps.ndim, where.expand(*index.shape, *value.shape[steps.ndim + 1 :])).squeeze(
+            steps.ndim
+        )
+    steps = torch.where(steps > spans.shape[-1], 0, steps).unsqueeze(-1)
+    seen = taken.pop("observed") & (steps > 0)
+    sensor = TensorDict(taken, batch_size=readings.batch_size)
+    return readings.select("state").clone().update({"observed": seen, "steps": steps, "sensor": sensor})
+
+
 class ReadingSampler:
     """Draws windows of a frozen sensor's readings.
 
     Args:
-        readings: of each part, ``[n]``.
+        readings: of each part, ``[n]``, with those of all ``LONGEST`` spans.
         weights: shares of the batches.
         length: of the windows.
         gain_error: standard deviation of the logarithm of a factor on all speeds that a window's sensor reads: cameras
@@ -148,12 +182,11 @@ class ReadingSampler:
         low, high = torch.tensor([-1.0, -0.7]), torch.tensor([0.7, 0.7])
         speed = (low + (high - low) * torch.rand(batch, 1, 2, generator=generator)).exp()
         gain = (self.gain_error * torch.tensor([1.0, 0.3]) * torch.randn(batch, 1, 2, generator=generator)).exp()
-        state, reading = windows["state"], windows["sensor", "ensemble"]
-        windows["state"] = torch.cat([state[..., :3], state[..., VELOCITIES] * speed], -1)
-        windows["sensor", "ensemble"] = reading * (speed * gain).unsqueeze(-2)
-        share = 0.5 * torch.rand(batch, 1, 1, generator=generator)
-        kept = torch.rand(batch, self.length + 1, 1, generator=generator) >= share
-        windows["observed"] = windows["observed"] & kept[:, 1:] & kept[:, :-1]  # a pair needs both of its frames
+        share = 0.5 * torch.rand(batch, 1, generator=generator)
+        kept = torch.rand(batch, self.length + 1, generator=generator) >= share
+        windows = take_spans(windows, steps_between(kept, LONGEST)[:, 1:])
+        windows["state"][..., VELOCITIES] *= speed
+        windows["sensor", "ensemble"] *= (speed * gain).unsqueeze(-2)
         return with_start(windows, start_std, generator)
 
 

@@ -40,7 +40,7 @@ def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, 
     seconds, seen = torch.arange(len(truth)) * dt, belief["observed"].squeeze(-1)
     for name, dim, unit, factor in (("v", 3, "v, m/s", 1.0), ("w", 4, "theta_dot, deg/s", 57.2958)):
         axis, band = axes[name], 1.645 * deviation[:, dim] * factor
-        reading = belief["sensor", "ensemble"][..., dim - 3].mean(1) * factor
+        reading = belief["sensor", "ensemble"][..., dim - 3].mean(1) / belief["steps"].clamp_min(1).squeeze(-1) * factor
         axis.plot(seconds[seen], reading[seen], ".", color="tab:red", markersize=2, label="sensor readings")
         low, high = mean[:, dim] * factor - band, mean[:, dim] * factor + band
         axis.fill_between(seconds, low, high, color="tab:blue", alpha=0.3, label="90 % of the belief")

@@ -7,7 +7,7 @@ import hashlib
 import shutil
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_ki
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
+LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing
 MISSING = 0.3  # share of frames that do not arrive, and of black ones, as in the paper
 
 #: What happens to every image of a drive. "missing" needs no images of its own: it is a mask.
@@ -44,7 +45,7 @@ class Stream:
     condition: str = "clean"
     size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
     pitch: float = 0.0  # rad: the camera is taken to be turned so far up, which makes the sensor find out
-    stride: int = 1  # 2 takes every other frame, at the same frame time: the drive at twice the speed
+    steps: int = 1  # between the two frames of a pair
 
     @property
     def name(self) -> str:
@@ -53,7 +54,7 @@ class Stream:
 
     def seed(self) -> int:
         """Random numbers of the condition: its own, the same each time."""
-        what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.stride)
+        what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.steps)
         return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
 
     def read(self, cache: Path) -> TensorDict:
@@ -72,15 +73,14 @@ class Stream:
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
         drive = read_kitti_drive(self.root, self.drive, camera=self.camera, size=self.size, colour=False, cache=None)
-        if self.stride > 1:
-            drive = drive[:: self.stride].contiguous()
-            drive["state"] = drive["state"] * torch.tensor([1.0, 1.0, 1.0, self.stride, self.stride])
         if self.pitch:
             drive["calibration"][:, 3] += self.pitch * drive["calibration"][:, 1]
         if self.condition != "clean":
             disturb: Transform = DISTURBANCES[self.condition](torch.Generator().manual_seed(self.seed()))
             drive = disturb(drive)
-        drive = with_motion(drive, cache=None)
+        valid = drive["frame_valid"]
+        paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
+        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None)
         small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
         return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
 
@@ -116,13 +116,21 @@ def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
         list(tqdm(pool.map(_prepare, jobs), total=len(jobs), desc="flow of all drives", disable=None))
 
 
+def spans(stream: Stream, sensor: str) -> list[Stream]:
+    """The same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
+    longest = LONGEST if sensor == "flow" and stream.condition == "clean" else 1
+    return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
+
+
 def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
-    """Rows of a stream as the sensor reads them; a row whose frame or the one before is missing is not observed."""
+    """Rows of a stream as the sensor reads them, and what it should read: the velocities of all steps of the pair."""
     frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road"), index)
-    return frames.set("target_observation", frames["state"][..., 3:])
+    lags = torch.arange(LONGEST)
+    velocity = stream["state"][(index.unsqueeze(-1) - lags).clamp_min(0)][..., 3:]
+    return frames.set("target_observation", (velocity * (lags < frames["steps"]).unsqueeze(-1)).sum(-2))
 
 
 def mirror(frames: TensorDict) -> TensorDict:
     """What a mirrored world would have shown: sideways motion and turns change sign."""
-    frames = mirror_drive(frames)
-    return frames.set("target_observation", frames["state"][..., 3:])
+    mirrored = mirror_drive(frames)
+    return mirrored.set("target_observation", frames["target_observation"] * torch.tensor([1.0, -1.0]))

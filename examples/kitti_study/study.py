@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from kitti_study.evaluation import evaluate
 from kitti_study.filters import SENSORS
-from kitti_study.fold import Fold, Part, statistics, with_disturbances
+from kitti_study.fold import Fold, Part, statistics, with_disturbances, with_spans
 from kitti_study.plots import draw_drive
-from kitti_study.streams import Stream, find_streams, prepare
+from kitti_study.streams import Stream, find_streams, prepare, spans
 from kitti_study.training import Budget, train_fold, train_sensor
 from torch_denkf.data import render_drives
 
@@ -82,14 +82,15 @@ def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_
         if not rest:
             raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
         sensor, tuned, checked = parts(rest), parts(tune), parts(validation)
-        return Fold(test, *(with_disturbances(p) for p in (sensor, tuned, checked)), test=of[test])
+        return Fold(
+            test, with_spans(with_disturbances(sensor)), *map(with_disturbances, (tuned, checked)), test=of[test]
+        )
     if len(others) < 2:
         raise ValueError(f"{len(drives)} drives are too few to leave {test} out; two must be left")
     own = parts(sorted(others, key=lambda name: -_rows(of[name][0])))
-    fast = [replace(part, stream=replace(part.stream, stride=2), weight=0.5 * part.weight) for part in own]
     rendered = [replace(part, weight=1.5 / len(train)) for part in train]
     checked = [replace(part, weight=1 / len(held_out)) for part in held_out]
-    sensor = [*with_disturbances(own), *fast, *with_disturbances(rendered)]
+    sensor = with_spans([*with_disturbances(own), *with_disturbances(rendered)])
     tune = [*own, *(replace(part, weight=0.3 * part.weight) for part in checked)]
     return Fold(test, sensor, with_disturbances(tune), with_disturbances(checked), test=of[test])
 
@@ -145,7 +146,7 @@ class Job:
 
     def pretrain(self):
         """The sensor that all folds of this seed begin with."""
-        study, parts = self.study, with_disturbances(self.rendered[0])
+        study, parts = self.study, with_spans(with_disturbances(self.rendered[0]))
         torch.manual_seed(self.seed)
         facts = statistics(parts, study.cache)
         return train_sensor(
@@ -201,10 +202,12 @@ def make_jobs(
 
 def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
     """Computes all streams that the jobs read."""
-    parts = [part for job in jobs for part in (*job.fold.train, *job.fold.tune, *job.fold.validation)]
-    tested = with_disturbances([Part(stream) for job in jobs for stream in job.fold.test])
-    streams = list(dict.fromkeys(part.stream for part in (*parts, *tested)))
-    prepare(streams, jobs[0].study.cache, processes)
+    streams = []
+    for job in jobs:
+        streams += [part.stream for part in job.fold.train if part.stream.steps == 1 or job.sensor == "flow"]
+        read = [*job.fold.tune, *job.fold.validation, *with_disturbances([Part(stream) for stream in job.fold.test])]
+        streams += [stream for part in read for stream in spans(part.stream, job.sensor)]
+    prepare(list(dict.fromkeys(streams)), jobs[0].study.cache, processes)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[dict]:

@@ -6,20 +6,21 @@ import json
 from collections import defaultdict
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, analysis_of, without_sensor
-from kitti_study.fold import Fold, FrameSampler, Part, ReadingSampler, statistics
-from kitti_study.streams import MISSING, mirror, rows
-from torch_denkf.filters import DEnKF, Filter
+from kitti_study.filters import FILTERS, SENSORS, VELOCITIES, Statistics, analysis_of, parts_of
+from kitti_study.fold import Fold, FrameSampler, Part, ReadingSampler, statistics, take_spans
+from kitti_study.streams import LONGEST, MISSING, mirror, rows, spans
+from torch_denkf.data import steps_between
+from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.metrics import interval_coverage
-from torch_denkf.modules import AroundState, SubModel
+from torch_denkf.modules import SubModel
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
 
@@ -47,7 +48,7 @@ class SensorLoss(nn.Module):
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
         """Scores frames ``[N]``; the terms are losses of v and of theta_dot."""
         samples = self.sensor(frames)["sensor", "ensemble"]
-        score = crps_ensemble(samples, frames["state"][..., VELOCITIES]) / self.unit
+        score = crps_ensemble(samples, frames["target_observation"]) / self.unit
         v, theta_dot = score[frames["observed"].squeeze(-1)].mean(0)
         return {"loss_v": v, "loss_theta_dot": theta_dot}
 
@@ -67,10 +68,35 @@ def read_sensor(sensor: SubModel, data: TensorDict, kind: str, mirrored: bool = 
     return torch.cat(readings)
 
 
-def lose_frames(reading: TensorDict, seed: int) -> TensorDict:
-    """The same readings where some frames did not arrive; a reading needs its frame and the one before."""
-    kept = torch.rand(len(reading) + 1, 1, generator=torch.Generator().manual_seed(seed)) >= MISSING
-    return reading.copy().set("observed", reading["observed"] & kept[1:] & kept[:-1])
+def read_spans(sensor: SubModel, part: Part, cache: Path, kind: str, mirrored: bool = False) -> TensorDict:
+    """A sensor's readings of a part ``[N]``, of pairs of 1, 2, ... steps: ``("spans", ...)`` ``[N, LONGEST]``.
+
+    Those that were not computed are not observed.
+    """
+    parts = [replace(part, stream=stream) for stream in spans(part.stream, kind)]
+    read = [read_sensor(sensor, each.read(cache), kind, mirrored) for each in parts]
+    entries = {
+        "observed": [each["observed"] for each in read],
+        "ensemble": [each["sensor", "ensemble"] for each in read],
+        "encoding": [each["sensor", "encoding"] for each in read],
+    }
+    blank = LONGEST - len(read)
+    stacked = {
+        key: torch.stack([*values, *[torch.zeros_like(values[0])] * blank], 1) for key, values in entries.items()
+    }
+    size = (len(read[0]), LONGEST)
+    return TensorDict({"state": read[0]["state"], "spans": TensorDict(stacked, batch_size=size)}, batch_size=size[:1])
+
+
+def lose_frames(readings: TensorDict, seed: int, share: float = MISSING) -> TensorDict:
+    """What the sensor reads where some frames did not arrive: pairs of those that did."""
+    kept = torch.rand(len(readings), generator=torch.Generator().manual_seed(seed)) >= share
+    return take_spans(readings, steps_between(kept, LONGEST))
+
+
+def all_frames(readings: TensorDict) -> TensorDict:
+    """What the sensor reads of neighbours."""
+    return take_spans(readings, torch.ones(len(readings), dtype=torch.int64))
 
 
 @torch.no_grad()
@@ -81,7 +107,7 @@ def run_filter(model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
     batch["is_init"][:, 0] = True
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return without_sensor(model).sequence(batch)
+        return parts_of(model, sensor=False).sequence(batch)
 
 
 def velocity_crps(samples: Tensor, frames: TensorDict, unit: Tensor) -> Tensor:
@@ -100,7 +126,7 @@ def run_all(model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
     """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
     groups = defaultdict(list)
     for seed, reading in enumerate(readings):
-        groups[len(reading)] += [reading, lose_frames(reading, seed)]
+        groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
     return [run_filter(model, group) for group in groups.values()]
 
 
@@ -181,9 +207,9 @@ def unseen_readings(
         readers |= dict.fromkeys(half, stand_in)
     result = []
     for part in fold.tune:
-        reader, data = readers.get(part.stream.drive, sensor), part.read(cache)
+        reader = readers.get(part.stream.drive, sensor)
         for mirrored in (False, True):
-            reading = read_sensor(reader, data, kind, mirrored)
+            reading = read_spans(reader, part, cache, kind, mirrored)
             split = int(0.7 * len(reading))
             result.append((reading[:split], reading[split:], part.weight))
     return result
@@ -223,11 +249,7 @@ def train_fold(
     validation = [reading for _, reading, _ in read[::2]]  # not the mirrored ones: they say the same
     # The pose follows from the velocities: it does not count.
     scale = torch.cat([torch.full((3,), torch.inf), facts.unit])
-    recursion = without_sensor(model, start_std)
-    whole = DEnKF(
-        **{name: model[name] for name in ("transition", "sensor", "observation", "noise", "analysis")},
-        initial=AroundState(start_std, ensemble_size=recursion.initial.ensemble_size, state_key="start"),
-    )
+    recursion, whole = (parts_of(model, sensor=sensor, start_std=start_std) for sensor in (False, True))
     third = max(budget.end_to_end // 3, 1)
     stages = [
         Stage(
@@ -248,7 +270,7 @@ def train_fold(
             lr=1e-4,
             lengths={0: 4, third: 8, 2 * third: 16},
             validate=lambda: filter_error(
-                model, [read_sensor(sensor, part.read(cache), kind) for part in fold.validation], facts.unit
+                model, [read_spans(sensor, part, cache, kind) for part in fold.validation], facts.unit
             ),
         ),
     ]

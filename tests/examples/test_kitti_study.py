@@ -10,11 +10,11 @@ from tensordict import TensorDict
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
-from kitti_study.fold import Fold, Part, ReadingSampler, with_disturbances
-from kitti_study.streams import DISTURBANCES, Stream, mirror
+from kitti_study.fold import Fold, Part, ReadingSampler, take_spans, with_disturbances
+from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from kitti_study.study import make_fold
 from kitti_study.tables import by_drive, markdown, read_csv, write_csv
-from kitti_study.training import lose_frames
+from kitti_study.training import all_frames, lose_frames
 
 from torch_denkf.metrics import dead_reckoning
 
@@ -64,32 +64,49 @@ def test_disturbances_together_weigh_half_as_much_as_the_clean_stream():
     assert sum(part.weight for part in parts if part.stream.condition != "clean") == pytest.approx(1.0)
 
 
-def reading(values, observed):
-    values = torch.tensor(values)
-    samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]  # two members
-    entries = {
-        "observed": torch.tensor(observed).unsqueeze(-1),
-        "state": torch.tensor([[0.0, 0.0, 0.0, 7.0, 0.7]]).repeat(len(values), 1),
-        "sensor": {"ensemble": samples},
-    }
-    return TensorDict(entries, [len(values)])
+def readings(values, observed=True, longest=1):
+    """Of two members, half a unit beside the values; of pairs of n steps n times as much, as at a constant speed."""
+    values = torch.as_tensor(values)
+    samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]
+    spans = torch.stack([n * samples for n in range(1, LONGEST + 1)], 1)
+    there = torch.as_tensor(observed).expand(len(values))[:, None, None] & (torch.arange(LONGEST) < longest)[:, None]
+    entries = {"observed": there, "ensemble": spans, "encoding": torch.zeros(len(values), LONGEST, 1)}
+    state = torch.tensor([[0.0, 0.0, 0.0, 7.0, 0.7]]).repeat(len(values), 1)
+    spans = TensorDict(entries, batch_size=[len(values), LONGEST])
+    return TensorDict({"state": state, "spans": spans}, [len(values)])
 
 
 def test_dead_reckoning_holds_the_last_reading_and_before_the_first_the_true_start():
-    read = reading([[9.0, 9.0], [1.0, 0.1], [9.0, 9.0], [2.0, 0.2], [9.0, 9.0]], [False, True, False, True, False])
+    values = [[9.0, 9.0], [1.0, 0.1], [9.0, 9.0], [2.0, 0.2], [9.0, 9.0]]
+    read = all_frames(readings(values, [False, True, False, True, False]))
     expected = torch.tensor([[7.0, 0.7], [1.0, 0.1], [1.0, 0.1], [2.0, 0.2], [2.0, 0.2]])
-    torch.testing.assert_close(hold_last(read), expected)
+    torch.testing.assert_close(hold_last(read, 0.1), expected)
 
 
-def test_a_lost_frame_blinds_its_own_pair_and_the_next_one():
-    read = reading([[0.0, 0.0]] * 4000, [True] * 4000)
-    observed = lose_frames(read, seed=3)["observed"].squeeze(-1)
-    share = float(observed.float().mean())
-    assert share == pytest.approx(0.7**2, abs=0.03)  # standard error of the mean of neighbours that agree: 0.011
-    assert bool(read["observed"].all())  # the original is left as it was
-    lengths = torch.diff(torch.nonzero(torch.diff(observed.float())).flatten())
-    blind = lengths[0::2] if observed[0] else lengths[1::2]
-    assert int(blind.min()) >= 2
+def test_dead_reckoning_takes_the_mean_over_a_gap_unless_it_is_too_wide():
+    read = readings([[7.0, 0.7], [6.0, 0.1], [9.0, 9.0], [8.0, 0.2], [9.0, 9.0], [30.0, 0.3]], longest=3)
+    out = take_spans(read, torch.tensor([0, 1, 0, 2, 0, 2]))
+    torch.testing.assert_close(out["sensor", "ensemble"].mean(1)[3], torch.tensor([16.0, 0.4]))
+    path = hold_last(out, 0.1)
+    torch.testing.assert_close(path[3:5], torch.tensor([[8.0, 0.2]] * 2))  # 2 x 0.6 m are within reach
+    torch.testing.assert_close(path[5], torch.tensor([30.0, 0.3]))  # held 8 m/s over 0.2 s: within reach, as it knows
+    torch.testing.assert_close(hold_last(out, 0.3)[3:], torch.tensor([[6.0, 0.1]] * 3))  # 2 x 1.8 m are not
+
+
+@pytest.mark.parametrize("longest", [1, LONGEST])
+def test_a_lost_frame_blinds_its_own_pair_and_those_that_cannot_bridge_it(longest):
+    read = readings([[0.0, 0.0]] * 4000, longest=longest)
+    lost = lose_frames(read, seed=3)
+    kept = torch.rand(4000, generator=torch.Generator().manual_seed(3)) >= 0.3
+    seen = lost["observed"].squeeze(-1)
+    for row in range(1, 4000):
+        back = next((n for n in range(1, longest + 1) if row >= n and kept[row - n]), 0)
+        assert bool(seen[row]) == bool(kept[row] and back)
+        if seen[row]:
+            assert int(lost["steps"][row]) == back
+    # 0.7 x 0.7 of neighbours; over gaps of up to two 0.7 x (1 - 0.3^3); standard error 0.01
+    assert float(seen.float().mean()) == pytest.approx(0.7**2 if longest == 1 else 0.7 * (1 - 0.3**3), abs=0.03)
+    assert bool(read["spans", "observed"][:, 0].all())  # the original is left as it was
 
 
 def test_errors_of_a_path_that_is_a_tenth_too_fast():
@@ -108,19 +125,16 @@ def test_errors_of_a_path_that_is_a_tenth_too_fast():
 
 
 def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
-    data = TensorDict(
-        {
-            "observed": torch.ones(60, 1, dtype=torch.bool),
-            "state": torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1]).repeat(60, 1),
-            "sensor": {"ensemble": torch.tensor([8.0, 0.1]).repeat(60, 4, 1)},
-        },
-        [60],
-    )
+    data = readings(torch.tensor([[8.0, 0.1]]).repeat(60, 1), longest=LONGEST)
+    data["state"] = torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1]).repeat(60, 1)
     windows = ReadingSampler([data], [1.0], 8, gain_error=0.0).windows(
         torch.Generator().manual_seed(0), torch.zeros(5), batch=200
     )
-    velocity = windows["state"][..., 3:]
-    torch.testing.assert_close(windows["sensor", "ensemble"].mean(2), velocity)
+    velocity, steps, seen = windows["state"][..., 3:], windows["steps"], windows["observed"].squeeze(-1)
+    assert steps.unique().tolist() == [0, 1, 2, 3]
+    mean = windows["sensor", "ensemble"].mean(2)
+    torch.testing.assert_close(mean[seen], (velocity * steps)[seen])
+    assert data["state"].eq(torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1])).all()  # windows are copies
     torch.testing.assert_close(windows["start"], windows["state"])  # no wrong start was asked for
     speed = velocity[:, 0, 0] / 8
     assert 0.36 < float(speed.min()) < 0.45  # exp(-1) and exp(0.7), and 200 draws come near
@@ -131,7 +145,7 @@ def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
 
 def test_windows_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"windows of 50 rows do not fit in readings of \[5\] rows"):
-        ReadingSampler([reading([[0.0, 0.0]] * 5, [True] * 5)], [1.0], 50, 0.0)
+        ReadingSampler([readings([[0.0, 0.0]] * 5)], [1.0], 50, 0.0)
 
 
 def test_a_mirrored_drive_goes_the_mirrored_way():
@@ -140,12 +154,25 @@ def test_a_mirrored_drive_goes_the_mirrored_way():
     path = dead_reckoning(velocity, torch.zeros(3, dtype=torch.float64), 0.1)
     flow, road = torch.randn(30, 3, 25, 79, generator=rng), torch.rand(30, 13, 69, generator=rng)
     frames = TensorDict({"state": torch.cat([path, velocity], -1), "flow": flow, "road": road}, [30])
+    frames["target_observation"] = 2 * velocity
     other = mirror(frames)
     again = dead_reckoning(other["state"][:, 3:], torch.zeros(3, dtype=torch.float64), 0.1)
     torch.testing.assert_close(again, other["state"][:, :3])
     torch.testing.assert_close(other["flow"][:, 0], -flow[:, 0].flip(-1))
     torch.testing.assert_close(other["flow"][:, 1:], flow[:, 1:].flip(-1))
+    torch.testing.assert_close(other["target_observation"], 2 * other["state"][:, 3:])
     torch.testing.assert_close(mirror(other)["state"], frames["state"])
+
+
+def test_a_pair_should_read_the_velocities_of_all_its_steps():
+    state = torch.randn(10, 5, generator=torch.Generator().manual_seed(0))
+    entries = {"state": state, "flow": torch.zeros(10, 3, 25, 79), "road": torch.zeros(10, 13, 69)}
+    entries |= {"frame_valid": torch.ones(10, 1, dtype=torch.bool), "time": torch.zeros(10, 1)}
+    for steps in (1, 2, 3):
+        stream = TensorDict({**entries, "steps": torch.full((10, 1), steps)}, [10])
+        target = rows(stream, torch.tensor([9, 5]), "flow")["target_observation"]
+        expected = [state[row - steps + 1 : row + 1, 3:].sum(0) for row in (9, 5)]
+        torch.testing.assert_close(target, torch.stack(expected))
 
 
 def row(drive, seed, value, **entries):

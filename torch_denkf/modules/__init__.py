@@ -12,7 +12,8 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
-from torch_denkf.modules.transition import LearnedTransition, UnicycleMotion, UnicycleTransition
+from torch_denkf.modules.transition import LearnedTransition
+from torch_denkf.modules.unicycle import PairObservation, UnicycleMotion, UnicycleTransition, WithHistory
 
 __all__ = [
     "SubModel",
@@ -22,6 +23,8 @@ __all__ = [
     "LearnedTransition",
     "UnicycleTransition",
     "UnicycleMotion",
+    "PairObservation",
+    "WithHistory",
     "LearnedObservation",
     "LinearObservation",
     "Select",

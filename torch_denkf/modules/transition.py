@@ -8,14 +8,13 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import nn
 
-from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.stochastic import StochasticMLP
 
-__all__ = ["LearnedTransition", "UnicycleMotion", "UnicycleTransition"]
+__all__ = ["LearnedTransition"]
 
 
-class _StochasticTransition(SubModel):
+class StochasticTransition(SubModel):
     """A transition of an ensemble whose noise is that of a stochastic network."""
 
     def __init__(self, network: nn.Module, in_keys, out_keys, ensemble_size: int | None, noise_key: NestedKey):
@@ -39,7 +38,7 @@ class _StochasticTransition(SubModel):
         return self.module(features, noise)
 
 
-class LearnedTransition(_StochasticTransition):
+class LearnedTransition(StochasticTransition):
     r"""A learned transition, residual by default: :math:`x_t = x_{t-1} + s \circ f_\theta((x_{t-1} - m) / s, a)`.
 
     Args:
@@ -106,128 +105,3 @@ class LearnedTransition(_StochasticTransition):
             change = change + self.loc
         tensordict.set(self.out_keys[0], change)
         return tensordict
-
-
-class UnicycleTransition(_StochasticTransition):
-    r"""Known motion of a vehicle, learned change of its velocities (the paper's section IV-A).
-
-    .. math::
-        (v, \dot\theta)_t &= (v, \dot\theta)_{t-1} + s \circ f_\theta(((v, \dot\theta)_{t-1} - m) / s) \\
-        x_t &= x_{t-1} + v_t \Delta t \cos(\theta_{t-1} + \dot\theta_t \Delta t / 2) \\
-        y_t &= y_{t-1} + v_t \Delta t \sin(\theta_{t-1} + \dot\theta_t \Delta t / 2) \\
-        \theta_t &= \theta_{t-1} + \dot\theta_t \Delta t
-
-    The pose moves with the *new* velocities, because those are what the image pair (t-1, t) measures: their
-    innovation then corrects the pose through the ensemble's covariance.
-
-    Args:
-        velocity: maps standardised ``[*, 2]`` velocities to the standardised change ``[*, 2]``.
-        dt: time step in seconds.
-        loc: mean of (v, theta_dot), in m/s and rad/s.
-        scale: standard deviation of (v, theta_dot), in m/s and rad/s.
-        drift: False takes the ensemble's mean change away: the velocities walk at random, with learned steps, and a
-            network trained on few drives cannot make them return to those drives' usual ones where nothing is observed.
-        ensemble_size: see :class:`LearnedTransition`.
-        in_key: ensemble ``[*B, E, 5]`` of [x m, y m, theta rad, v m/s, theta_dot rad/s].
-        out_key: forecast ensemble ``[*B, E, 5]``.
-        noise_key: optional noise (see :class:`StochasticMLP`).
-
-    Raises:
-        ValueError: if the state does not have five dimensions.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> straight = UnicycleTransition(lambda v: torch.zeros_like(v), dt=0.1)
-        >>> td = TensorDict({("belief", "ensemble"): torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.0]])})
-        >>> straight(td)["forecast", "ensemble"].tolist()
-        [[1.0, 0.0, 0.0, 10.0, 0.0]]
-    """
-
-    def __init__(
-        self,
-        velocity: nn.Module,
-        dt: float,
-        *,
-        loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
-        scale: Sequence[float] | torch.Tensor = (1.0, 1.0),
-        drift: bool = True,
-        ensemble_size: int | None = None,
-        in_key: NestedKey = ("belief", "ensemble"),
-        out_key: NestedKey = ("forecast", "ensemble"),
-        noise_key: NestedKey = ("noise", "transition"),
-    ):
-        super().__init__(velocity, [in_key], [out_key], ensemble_size, noise_key)
-        self.dt, self.drift = dt, drift
-        self.register_buffer("loc", torch.as_tensor(loc, dtype=torch.get_default_dtype()))
-        self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.get_default_dtype()))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast ensemble."""
-        state = self.read(tensordict, self.in_keys[0])
-        if state.shape[-1] != 5:
-            raise ValueError(
-                f"UnicycleTransition moves [x, y, theta, v, theta_dot]; {self.in_keys[0]!r} has "
-                f"{state.shape[-1]} state dimensions."
-            )
-        pose, velocity = state.split([3, 2], -1)
-        change = self._run((velocity - self.loc) / self.scale, tensordict)
-        if not self.drift:
-            change = change - change.mean(-2, keepdim=True)
-        velocity = velocity + self.scale * change
-        tensordict.set(self.out_keys[0], _move(pose, velocity, self.dt))
-        return tensordict
-
-
-class UnicycleMotion(SubModel):
-    r"""Moves the pose of the last belief with the velocities of the analysis, put *after* an :class:`EnsembleAnalysis`.
-
-    The analysis of an ensemble corrects the pose through sample correlations. Over a long drive the members' poses
-    spread over many metres, and a spurious correlation of :math:`1/\sqrt{E}` between them and the velocity's
-    innovation makes the mean pose jump. This module takes from the analysis the velocities alone and lets the known
-    motion carry each member's pose, which is localisation in the state: an innovation of the velocities at t acts on
-    the step from t-1 to t.
-
-    Use with ``EnsembleAnalysis(..., belief_key="analysis")``, and not with ``update_at_reset``.
-
-    Args:
-        dt: time step in seconds.
-        before_key: ensemble of the belief at t-1, ``[*B, E, 5]``, see :class:`UnicycleTransition`.
-        analysis_key: ensemble of the analysis at t, ``[*B, E, 5]``.
-        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> before, analysis = torch.zeros(2, 5), torch.tensor([[9.0, 9.0, 9.0, 10.0, 0.0]] * 2)
-        >>> td = TensorDict({"belief": {"ensemble": before}, "analysis": {"ensemble": analysis}})
-        >>> UnicycleMotion(0.1)(td)["belief", "mean"].tolist()
-        [1.0, 0.0, 0.0, 10.0, 0.0]
-    """
-
-    def __init__(
-        self,
-        dt: float,
-        *,
-        before_key: NestedKey = ("belief", "ensemble"),
-        analysis_key: NestedKey = ("analysis", "ensemble"),
-        belief_key: str = "belief",
-    ):
-        out_keys = [(belief_key, name) for name in ("ensemble", "mean", "var")]
-        super().__init__(nn.Identity(), [before_key, analysis_key], out_keys)
-        self.dt = dt
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        before, analysis = (self.read(tensordict, key) for key in self.in_keys)
-        ensemble = _move(before[..., :3], analysis[..., 3:], self.dt)
-        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
-
-
-def _move(pose: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:
-    """The state [x, y, theta, v, theta_dot] after ``dt`` at constant ``velocity``, with the heading at mid-step."""
-    step = velocity * dt
-    heading = pose[..., 2] + 0.5 * step[..., 1]
-    moved = torch.stack([step[..., 0] * heading.cos(), step[..., 0] * heading.sin(), step[..., 1]], -1)
-    return torch.cat([pose + moved, velocity], -1)

@@ -1,0 +1,189 @@
+"""Readings that span a gap. Oracles: the filter without gaps, a Kalman filter on the cloned state, plane geometry."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+
+from torch_denkf.filters import DEnKF
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    PairObservation,
+    Select,
+    SubModel,
+    UnicycleMotion,
+    UnicycleTransition,
+    WithHistory,
+)
+
+DT, Q, R, START = 0.5, (0.3, 0.05), (0.2, 0.02), (0.0, 0.0, 0.0, 0.6, 0.1)
+
+
+class Walk(torch.nn.Module):
+    """Changes of the velocities: N(0, Q)."""
+
+    def forward(self, velocity):
+        return torch.randn_like(velocity) * velocity.new_tensor(Q).sqrt()
+
+
+def pair_filter(size, scheme="perturbed", reach=None, change=None):
+    keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed"), "sensor_key": "y"}
+    return DEnKF(
+        UnicycleTransition(change or Walk(), DT),
+        None,
+        PairObservation(reach),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        TensorDictSequential(
+            EnsembleAnalysis(scheme, belief_key="analysis", **keys), UnicycleMotion(DT, history_key=("belief", "history"))
+        ),
+        initial=WithHistory(AroundState(START, ensemble_size=size), lags=2),
+    )
+
+
+def frames_of(y, steps):
+    is_init = torch.zeros(len(y), 1, dtype=torch.bool)
+    is_init[0] = True
+    steps = torch.tensor(steps).unsqueeze(-1)
+    state = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.1]).expand(len(y), 5)
+    return TensorDict({"y": y, "steps": steps, "observed": steps > 0, "is_init": is_init, "state": state}, [len(y)])
+
+
+def test_neighbours_are_filtered_as_without_a_history(float64):
+    plain = DEnKF(
+        UnicycleTransition(Walk(), DT),
+        None,
+        Select([3, 4]),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        TensorDictSequential(EnsembleAnalysis("perturbed", sensor_key="y", belief_key="analysis"), UnicycleMotion(DT)),
+        initial=AroundState(START, ensemble_size=16),
+    )
+    frames = frames_of(torch.randn(9, 2) + torch.tensor([4.0, 0.1]), [0, 1, 1, 0, 1, 1, 0, 0, 1])
+    results = []
+    for filter in (plain, pair_filter(16)):
+        torch.manual_seed(2)
+        results.append(filter.sequence(frames.copy())["belief", "ensemble"])
+    torch.testing.assert_close(*results, rtol=0, atol=1e-12)
+
+
+def cloned_kalman(y, steps):
+    """Velocity and way (one dimension each, no turning in y's sense): exact mean and variance of [v, way since start].
+
+    The state is [v_t, v_t-1, v_t-2, way]; the way is a sum of the same velocities, so that all of it is linear.
+    """
+    moments = []
+    for dim in range(2):
+        mean = torch.tensor([4.0, 4.0, 4.0, 0.0]) if dim == 0 else torch.tensor([0.1, 0.1, 0.1, 0.0])
+        cov = torch.zeros(4, 4)
+        cov[:3, :3] = START[3 + dim] ** 2
+        shift = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [DT, 0, 0, 1]])
+        noise = torch.tensor([1.0, 0.0, 0.0, DT])
+        for value, count in zip(y[1:, dim], steps[1:], strict=True):
+            mean, cov = shift @ mean, shift @ cov @ shift.T + Q[dim] * noise[:, None] * noise
+            if count:
+                h = torch.tensor([float(lag < count) for lag in range(3)] + [0.0])
+                gain = cov @ h / (h @ cov @ h + R[dim])
+                mean, cov = mean + gain * (value - h @ mean), cov - gain[:, None] * (h @ cov)
+        moments.append((mean, cov))
+    return moments
+
+
+def test_a_reading_over_a_gap_corrects_velocity_and_way_like_a_kalman_filter_with_clones(float64):
+    # Two frames are missing after the start, so that the whole way since then lies in the reading.
+    size, steps = 40_000, [0, 0, 0, 3]
+    y = torch.tensor([[0.0, 0.0]] * 3 + [[16.0, 1.2]])
+    torch.manual_seed(0)
+    belief = pair_filter(size).sequence(frames_of(y, steps))["belief", "ensemble"][-1]
+    (mean_v, cov_v), (mean_w, cov_w) = cloned_kalman(y, steps)
+    # The analysis is linear, the way of the members is not (they turn): compare what stays linear.
+    found = torch.stack([belief[:, 3], belief[:, 4], belief[:, 2]], -1)
+    mean = torch.stack([mean_v[0], mean_w[0], mean_w[3]])
+    var = torch.stack([cov_v[0, 0], cov_w[0, 0], cov_w[3, 3]])
+    error = (found.mean(0) - mean).abs() / (var / size).sqrt()
+    assert (error < 4).all(), error  # standard errors; three of them
+    torch.testing.assert_close(found.var(0), var, rtol=4 * (2 / size) ** 0.5, atol=0)
+    # The reading says 16 over three steps where 12 was forecast: the way is corrected, and not the last step alone.
+    way = belief[:, :2].norm(dim=-1).mean()
+    assert abs(float(way) - float(mean_v[3])) < 0.05 * float(mean_v[3])
+
+
+def test_an_exact_reading_over_a_gap_leaves_no_doubt_about_the_way(float64):
+    filter = pair_filter(64, "etkf")
+    frames = frames_of(torch.tensor([[0.0, 0.0], [0.0, 0.0], [10.0, 0.9]]), [0, 0, 2])
+    frames["y"][-1] = torch.tensor([10.0, 0.9])
+    exact = DEnKF(
+        filter["transition"], None, filter["observation"], ConstantNoise([1e-6, 1e-6], in_key="y"), filter["analysis"],
+        initial=filter.initial,
+    )
+    torch.manual_seed(1)
+    out = exact.sequence(frames)["belief", "ensemble"][-1]
+    turned = torch.full((64,), 0.9 * DT)
+    torch.testing.assert_close(out[:, 2], turned, rtol=0, atol=1e-4)
+
+
+def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
+    before = torch.tensor([1.0, 2.0, 0.3, 9.0, 0.2]).expand(2, 5)
+    history = torch.tensor([[9.0, 0.2], [8.0, -0.1]]).expand(2, 2, 2)
+    analysis = torch.tensor([0.0, 0.0, 0.0, 5.0, 0.4, 6.0, 0.5, 7.0, 0.6]).expand(2, 9)
+    for steps, path in ((3, [(7.0, 0.6), (6.0, 0.5), (5.0, 0.4)]), (2, [(8.0, -0.1), (6.0, 0.5), (5.0, 0.4)])):
+        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
+        out = UnicycleMotion(DT, history_key=("belief", "history"))(td.set("steps", torch.tensor([steps])))
+        # By complex numbers: back along the two past steps, forwards along the corrected ones.
+        place, heading = complex(1.0, 2.0), 0.3
+        for v, w in ((9.0, 0.2), (8.0, -0.1)):
+            place -= v * DT * complex(torch.polar(torch.tensor(1.0), torch.tensor(heading - w * DT / 2)))
+            heading -= w * DT
+        for v, w in path:
+            place += v * DT * complex(torch.polar(torch.tensor(1.0), torch.tensor(heading + w * DT / 2)))
+            heading += w * DT
+        expected = torch.tensor([place.real, place.imag, heading, 5.0, 0.4])
+        torch.testing.assert_close(out["belief", "ensemble"][0], expected, rtol=0, atol=1e-12)
+        assert out["belief", "history"][0].tolist() == [[5.0, 0.4], list(path[1])]
+
+
+def test_what_is_out_of_reach_is_not_read(float64):
+    frames = frames_of(torch.full((4, 2), 9.0), [0, 0, 0, 3])
+    torch.manual_seed(0)
+    far = pair_filter(16, reach=[10.0, torch.inf]).sequence(frames.copy())
+    torch.manual_seed(0)
+    blind = pair_filter(16).sequence(frames.copy().set("observed", torch.zeros(4, 1, dtype=torch.bool)))
+    assert not far["forecast", "observed"][-1].any()  # 3 x 4 m/s
+    assert far["belief", "ensemble"].equal(blind["belief", "ensemble"])
+
+
+def test_steps_equal_the_sequence(float64):
+    filter = pair_filter(8, "etkf", change=torch.nn.Linear(2, 2))
+    frames = frames_of(torch.randn(10, 2) + torch.tensor([4.0, 0.1]), [0, 1, 0, 2, 1, 0, 0, 3, 1, 0])
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    row, rows = filter.initialise(frames[0].copy()), []
+    for t in range(1, 10):
+        row = filter.step(frames[t].copy().update(row.select(*filter.carry_keys)))
+        rows.append(row["belief", "ensemble"])
+    torch.testing.assert_close(torch.stack(rows), expected["belief", "ensemble"][1:], rtol=0, atol=1e-12)
+    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "history")]
+
+
+def test_gradients_reach_the_past(float64):
+    before, history, analysis = (torch.randn(*shape, requires_grad=True) for shape in ((2, 5), (2, 2, 2), (2, 9)))
+
+    def moved(before, history, analysis):
+        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
+        td = UnicycleMotion(0.1, history_key=("belief", "history"))(td.set("steps", torch.tensor([3])))
+        return td["belief", "ensemble"]
+
+    assert torch.autograd.gradcheck(moved, (before, history, analysis))
+
+
+def test_history_needs_a_lag():
+    with pytest.raises(ValueError, match="at least 1; got 0"):
+        WithHistory(AroundState([1.0] * 5), 0)
+
+
+def test_a_history_begins_with_the_present(float64):
+    start = WithHistory(AroundState([1.0] * 5, ensemble_size=7), 2)
+    out = start(TensorDict({"state": torch.zeros(3, 5)}, [3]))["belief"]
+    assert isinstance(start, SubModel)
+    for lag in range(2):
+        assert out["history"][:, :, lag].equal(out["ensemble"][..., 3:])

@@ -1,0 +1,63 @@
+"""Gaps in a drive: where frames are missing, a frame can be compared with the last one that is there."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+__all__ = ["bridge_gaps", "steps_between"]
+
+
+def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
+    """Pairs each frame with the last one before it that is there, so that a gap hides no motion.
+
+    Without it a missing frame blinds two pairs of neighbours. What comes after, :func:`torch_denkf.data.frames_at`,
+    :func:`torch_denkf.data.with_motion` and :class:`torch_denkf.envs.KITTIReplayEnv`, then takes differences and
+    optical flow over those pairs; a filter that knows what they mean has a
+    :class:`torch_denkf.modules.PairObservation`.
+
+    Args:
+        drive: as :func:`torch_denkf.data.read_kitti_drive` gives it, batch size ``[N]``.
+        longest: steps between the frames of a pair, at most; 1 pairs neighbours only.
+
+    Returns:
+        A shallow copy of the drive with ``"steps"`` ``[N, 1]``, int64: how many steps before this frame its pair
+        begins; 0 where the frame is missing, or none is there before it within reach.
+
+    Raises:
+        ValueError: if ``longest`` is not positive.
+
+    Examples:
+        >>> drive = TensorDict({"frame_valid": torch.tensor([1, 1, 0, 0, 1, 1, 0, 0, 0, 1]).bool().unsqueeze(-1)}, [10])
+        >>> bridge_gaps(drive)["steps"].flatten().tolist()
+        [0, 1, 0, 0, 3, 1, 0, 0, 0, 0]
+    """
+    if longest < 1:
+        raise ValueError(f"longest counts the steps between the frames of a pair, at least 1; got {longest}")
+    return drive.copy().set("steps", steps_between(drive["frame_valid"].squeeze(-1), longest).unsqueeze(-1))
+
+
+def steps_between(valid: Tensor, longest: int) -> Tensor:
+    """Steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
+
+    Args:
+        valid: whether a frame is there, bool ``[*B, N]``, time last.
+        longest: as in :func:`bridge_gaps`.
+    """
+    row = torch.arange(valid.shape[-1], device=valid.device)
+    never = -longest - 1
+    last = torch.where(valid, row, never).cummax(-1).values  # the last frame that is there, this one included
+    steps = row - torch.cat([torch.full_like(last[..., :1], never), last[..., :-1]], -1)
+    return torch.where(valid & (steps <= longest), steps, 0)
+
+
+def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
+    """How many steps before each frame its pair begins, ``[*B, 1]``; 0 for none.
+
+    Without :func:`bridge_gaps` a pair is of neighbours.
+    """
+    if "steps" in drive:
+        return drive["steps"][index]
+    before = drive["frame_valid"][(index - 1).clamp_min(0)]
+    return (drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)).long()
