@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from tensordict.nn import dispatch
-from torchrl.objectives import LossModule
+from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble, energy_score
 from torch_denkf.modules import StochasticMLP
+from torch_denkf.objectives._sequence import SequenceLoss
 
 __all__ = ["DEnKFLoss"]
 
 
-class DEnKFLoss(LossModule):
+class DEnKFLoss(SequenceLoss):
     r"""Scores a filter on sequences ``[*B, T]`` against the true states.
 
     The default score of an ensemble is the fair CRPS, a proper score: it teaches the mean *and* the spread. The
@@ -66,13 +64,14 @@ class DEnKFLoss(LossModule):
     Example:
         >>> from torch_denkf.filters import DEnKF
         >>> loss = DEnKFLoss(DEnKF.paper(5, 2, ensemble_size=4), sensor=0.0)
+        >>> from tensordict import TensorDict
         >>> batch = TensorDict({"pixels": torch.rand(2, 3, 6, 50, 150), "state": torch.randn(2, 3, 5)}, [2, 3])
         >>> sorted(loss(batch).keys())
         ['loss_state', 'loss_transition']
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
         """The entries that the loss reads.
 
         Attributes:
@@ -86,15 +85,13 @@ class DEnKFLoss(LossModule):
             log_likelihood: of the innovation.
         """
 
-        state: NestedKey = "state"
         target_observation: NestedKey = "target_observation"
-        observed: NestedKey = "observed"
         belief: NestedKey = ("belief", "ensemble")
         forecast: NestedKey = ("forecast", "ensemble")
         sensor: NestedKey = ("sensor", "ensemble")
-        log_likelihood: NestedKey = ("info", "log_likelihood")
 
     default_keys = _AcceptedKeys
+    SUPERVISED = ("state", "transition", "sensor", "observation")
     TERMS = ("state", "transition", "sensor", "observation", "nll", "kl")
 
     def __init__(
@@ -116,54 +113,22 @@ class DEnKFLoss(LossModule):
     ):
         if score not in ("crps", "energy", "mse"):
             raise ValueError(f'score is "crps", "energy" or "mse"; got {score!r}.')
-        super().__init__()
-        self.filter, self.score, self.reduction = filter, score, reduction
         weights = dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True))
-        self.weights = {name: weight for name, weight in weights.items() if weight}
-        self.angles, self.detach_every = list(angles), detach_every
-        dtype = torch.get_default_dtype()
-        for name, scale in (("state_scale", state_scale), ("observation_scale", observation_scale)):
-            self.register_buffer(name, None if scale is None else torch.as_tensor(scale, dtype=dtype))
-        self.out_keys = [f"loss_{name}" for name in self.weights]
+        super().__init__(
+            filter,
+            weights,
+            state_scale=state_scale,
+            angles=angles,
+            detach_every=detach_every,
+            reduction=reduction,
+        )
+        self.score = score
+        self.register_scale("observation_scale", observation_scale)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
         """The paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
         return cls(filter, **{"score": "mse", **kwargs})
-
-    @property
-    def functional(self) -> bool:
-        """The filter keeps its parameters."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What the filter reads beside its belief, and the true state."""
-        reads = [key for key in map(unravel_key, self.filter.in_keys) if key not in self.filter.carry_keys]
-        needs_state = not {"state", "transition", "sensor", "observation"}.isdisjoint(self.weights)
-        return reads + [self.tensor_keys.state] * needs_state
-
-    @in_keys.setter
-    def in_keys(self, value) -> None:
-        raise AttributeError("in_keys follow from the filter; rename the state with set_keys(state=...).")
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        pass
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Filters the sequence and returns the weighted terms; ``tensordict`` is left as it is."""
-        out = self.filter.sequence(tensordict.copy(), detach_every=self.detach_every)
-        counts = self._stepped(tensordict)
-        losses = TensorDict({}, batch_size=[])
-        for name, weight in self.weights.items():
-            if name == "kl":
-                losses["loss_kl"] = weight * self._kl()
-                continue
-            term, mask = getattr(self, f"_{name}")(tensordict, out)
-            mask = counts if mask is None else mask
-            losses[f"loss_{name}"] = weight * self._reduce_term(term, mask, tensordict)
-        return losses
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
@@ -187,45 +152,26 @@ class DEnKFLoss(LossModule):
         error = error if self.observation_scale is None else error / self.observation_scale
         return error.square().mean(-1), torch.ones_like(error[..., 0], dtype=torch.bool)
 
-    def _nll(self, tensordict, out):
-        return -self._entry(out, self.tensor_keys.log_likelihood).squeeze(-1), None
-
-    def _kl(self) -> torch.Tensor:
-        return sum(part.kl() for part in self.filter.modules() if isinstance(part, StochasticMLP))
+    def _kl(self, tensordict, out):
+        return sum(
+            (part.kl() for part in self.filter.modules() if isinstance(part, StochasticMLP)), torch.zeros(())
+        ), None
 
     # ------------------------------------------------------------------------------------------------------ helpers
 
     def _score(self, out: TensorDictBase, key: NestedKey, target: torch.Tensor, kind: str) -> torch.Tensor:
-        errors = self._entry(out, key) - target.unsqueeze(-2)
-        if kind == "state" and self.angles:
-            wrapped = torch.remainder(errors + pi, 2 * pi) - pi
-            is_angle = torch.zeros(errors.shape[-1], dtype=torch.bool, device=errors.device)
-            is_angle[self.angles] = True
-            errors = torch.where(is_angle, wrapped, errors)
-        scale = self.state_scale if kind == "state" else self.observation_scale
-        if scale is not None:
-            errors = errors / scale
+        samples, target = self._entry(out, key), target.unsqueeze(-2)
+        if kind == "state":
+            errors = self._state_error(samples, target)
+        else:
+            errors = samples - target
+            errors = errors if self.observation_scale is None else errors / self.observation_scale
         zero = torch.zeros_like(errors[..., 0, :])
         if self.score == "mse":
             return errors.mean(-2).square().mean(-1)
         if self.score == "energy":
             return energy_score(errors, zero)
         return crps_ensemble(errors, zero).mean(-1)
-
-    def _stepped(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """``False`` for the first element and for those that start anew, ``[*B, T]``."""
-        stepped = torch.ones(tensordict.batch_size, dtype=torch.bool, device=tensordict.device)
-        stepped[..., 0] = False
-        starts = self.filter._starts(tensordict)
-        return stepped if starts is None else stepped & ~starts.reshape(tensordict.batch_size)
-
-    def _reduce_term(self, term: torch.Tensor, mask: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
-        if self.reduction == "none":
-            return self._reduce_loss(torch.where(mask, term, torch.zeros_like(term)), tensordict)
-        return self._reduce_loss(term, tensordict, mask=mask)
-
-    def _true_state(self, tensordict: TensorDictBase) -> torch.Tensor:
-        return self._entry(tensordict, self.tensor_keys.state)
 
     def _observation_model(self):
         models = [module for module in self.filter.update_modules if hasattr(module, "observe")]
@@ -248,13 +194,3 @@ class DEnKFLoss(LossModule):
                 "set the weight sensor=0."
             )
         return model.observe(self._true_state(tensordict))
-
-    @staticmethod
-    def _entry(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            present = ", ".join(sorted(map(str, tensordict.keys(True, True))))
-            raise KeyError(
-                f"DEnKFLoss reads {key!r}, which is missing; there are {present}. Rename it with loss.set_keys(...)."
-            )
-        return value
