@@ -15,7 +15,7 @@ from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motio
 
 __all__ = ["with_motion"]
 
-_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 
 
 def with_motion(
