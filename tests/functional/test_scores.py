@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_denkf.functional import crps_ensemble, energy_score
+from torch_denkf.functional import crps_ensemble, crps_gaussian, energy_score
 
 BATCHES = [(), (3,), (2, 3)]
 # Sums of a few dozen numbers of size 1 in double precision.
@@ -94,3 +94,20 @@ def test_errors(score):
     with pytest.raises(ValueError, match="at least 2 are needed"):
         score(torch.zeros(1, 2), torch.zeros(2))
     assert score(torch.zeros(1, 2), torch.zeros(2), fair=False).sum() == 0
+
+
+def test_crps_of_a_gaussian_is_the_integral_of_the_squared_difference_of_distributions():
+    mean, variance = torch.tensor([[0.0, 1.0], [2.0, -1.0]]).double(), torch.tensor([[1.0, 0.25], [4.0, 0.01]]).double()
+    target = torch.tensor([[0.3, -2.0], [2.0, -1.05]]).double()
+    grid = torch.linspace(-30, 30, 600_001, dtype=torch.float64)
+    normal = torch.distributions.Normal(mean.unsqueeze(-1), variance.sqrt().unsqueeze(-1))
+    integral = torch.trapezoid((normal.cdf(grid) - (target.unsqueeze(-1) <= grid).double()).square(), grid)
+    # The jump at the target is misplaced by at most half a grid step, 5e-5.
+    torch.testing.assert_close(crps_gaussian(mean, variance, target), integral, rtol=0, atol=1e-4)
+    members = mean.unsqueeze(-2) + variance.sqrt().unsqueeze(-2) * torch.randn(2, 100_000, 2).double()
+    torch.testing.assert_close(crps_gaussian(mean, variance, target), crps_ensemble(members, target), rtol=0.02, atol=0)
+
+
+def test_gradients_of_the_crps_of_a_gaussian():
+    inputs = [torch.rand(3, 2, dtype=torch.float64, requires_grad=True) for _ in range(3)]
+    assert torch.autograd.gradcheck(lambda m, v, y: crps_gaussian(m, v + 0.1, y), inputs)

@@ -11,7 +11,7 @@ from torch_denkf.functional.moments import (
     ensemble_var,
 )
 from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
-from torch_denkf.functional.scores import crps_ensemble, energy_score
+from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
 
 __all__ = [
     "Analysis",
@@ -30,6 +30,7 @@ __all__ = [
     "kalman_update",
     "gaussian_log_prob",
     "crps_ensemble",
+    "crps_gaussian",
     "energy_score",
     "random_keep_mask",
     "random_signs",

@@ -6,6 +6,8 @@ depend on the ensemble's size, Ferro 2014, Q. J. R. Meteorol. Soc. 140.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -41,6 +43,35 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Ten
     rank = torch.arange(size, dtype=error.dtype, device=error.device)
     weights = (2 * rank - (size - 1)) / (size * (size - 1 if fair else size))
     return error.abs().mean(-2) - weights @ error
+
+
+def crps_gaussian(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
+    r"""Continuous ranked probability score of a Gaussian, for each dimension (Gneiting et al. 2005, eq. 5).
+
+    .. math:: \sigma \left( z (2 \Phi(z) - 1) + 2 \varphi(z) - 1/\sqrt{\pi} \right), \quad z = (y - m) / \sigma
+
+    Args:
+        mean: m, ``[*B, S]``.
+        variance: :math:`\sigma^2`, positive, ``[*B, S]``.
+        target: the truth y, ``[*B, S]``.
+
+    Returns:
+        The scores, ``[*B, S]``, in the units of the target.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> crps_gaussian(torch.zeros(1), torch.ones(1), torch.zeros(1))
+        tensor([0.2337])
+    """
+    for name, value in (("variance", variance), ("target", target)):
+        check_shape(name, value, tuple(mean.shape), "[*B, S]")
+    std = variance.sqrt()
+    z = (target - mean) / std
+    density = torch.exp(-0.5 * z.square()) / math.sqrt(2 * math.pi)
+    return std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
 
 
 def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
