@@ -26,10 +26,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))  # the parts of this example, wherever it is started from
 
-from kitti_study.filters import FILTERS, SENSORS
+from kitti_study.filters import FILTERS
 from kitti_study.fold import Part, with_disturbances
+from kitti_study.sensors import SENSORS
 from kitti_study.streams import find_streams, prepare, spans
-from kitti_study.study import Study, describe, evaluate_and_draw, make_jobs, prepare_jobs, run_jobs
+from kitti_study.study import Study, describe, evaluate_and_draw, make_jobs, prepare_jobs, read_rows, run_jobs
 from kitti_study.tables import markdown, write_csv
 from kitti_study.training import Budget, load_filter
 
@@ -81,9 +82,7 @@ def table(args: argparse.Namespace, study: Study) -> None:
     jobs = make_jobs(study, args.filters, args.sensors, args.seeds, args.test)
     (args.out / "settings.json").write_text(json.dumps(describe(study), indent=1))
     run_jobs(jobs, args.processes)
-    # All that --out holds: filters and seeds may come from several calls.
-    rows = [row for file in sorted((args.out / "folds").glob("*/rows.json")) for row in json.loads(file.read_text())]
-    write_table(args, rows, begun)
+    write_table(args, read_rows(args.out), begun)
 
 
 def train(args: argparse.Namespace, study: Study) -> None:
@@ -91,8 +90,10 @@ def train(args: argparse.Namespace, study: Study) -> None:
     jobs = make_jobs(study, args.filters, args.sensors, args.seeds, args.test)
     prepare_jobs(jobs, args.processes)
     for job in jobs:
-        job.train()
-        print(f"{job.out}: evaluate --checkpoint {job.out} --test {job.fold.name}")
+        base = job.base()
+        for name in job.filters:
+            job.train(name, base)
+            print(f"{job.out(name)}: evaluate --checkpoint {job.out(name)} --test {job.fold.name}")
 
 
 def evaluate(args: argparse.Namespace, study: Study) -> None:
@@ -100,12 +101,12 @@ def evaluate(args: argparse.Namespace, study: Study) -> None:
     begun = time.time()
     if args.checkpoint is None:
         raise SystemExit("evaluate needs --checkpoint: a folder that train or table left in --out/folds")
-    model, facts, name, sensor = load_filter(args.checkpoint)
+    recipe, model, name, sensor = load_filter(args.checkpoint)
     streams = find_streams(args.root, tuple(args.size), list(args.test) or None)
     parts = with_disturbances([Part(stream) for stream in streams])
     prepare([each for part in parts for each in spans(part.stream, sensor)], study.cache, args.processes)
     names = {"filter_name": name, "kind": sensor, "seed": 0}
-    write_table(args, evaluate_and_draw(model, facts, streams, study.cache, args.out / "plots", **names), begun)
+    write_table(args, evaluate_and_draw(recipe, model, streams, study.cache, args.out / "plots", **names), begun)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +10,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from kitti_study.filters import REACH, VELOCITIES, Statistics
-from kitti_study.fold import Part
+from kitti_study.filters import REACH, Recipe
+from kitti_study.fold import VELOCITIES, Part
+from kitti_study.readings import all_frames, lose_frames, read_spans
 from kitti_study.streams import CONDITIONS, DISTURBANCES, Stream
-from kitti_study.training import all_frames, lose_frames, read_spans, run_filter
+from kitti_study.training import run_filter
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_ensemble
+from torch_denkf.functional import crps_gaussian
 from torch_denkf.metrics import (
     dead_reckoning,
     gaussian_nll,
@@ -33,7 +35,8 @@ _ERRORS = ("translation_m_per_m", "rotation_deg_per_m", "coverage90", "coverage9
 _VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae_theta_dot_deg_per_s")
 _BELIEF = ("crps_v_m_per_s", "nll", "nees", "spread_skill")
 _OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent", "devkit_r_rel_deg_per_m", "blind")
-COLUMNS = (*_NAMES, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS)
+_COST = ("parameters", "ms_per_step")
+COLUMNS = (*_NAMES, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS, *_COST)
 
 
 def hold_last(reading: TensorDict, dt: float) -> Tensor:
@@ -56,7 +59,7 @@ def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
 
 
 def evaluate(
-    model: Filter, facts: Statistics, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
+    recipe: Recipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
@@ -65,20 +68,32 @@ def evaluate(
         part = Part(replace(stream, condition=condition))
         readings[condition] = all_frames(read_spans(model["sensor"], part, cache, kind))
     conditions = [condition for condition in CONDITIONS if condition in readings]
-    out = run_filter(model, [readings[condition] for condition in conditions])
-    table = []
+    out = run_filter(recipe, model, [readings[condition] for condition in conditions])
+    table, costs = [], cost(recipe, model, readings["clean"])
     for number, condition in enumerate(conditions):
         reading, belief, truth = readings[condition], out[number], clean["state"].double()
         common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
         common["blind"] = 1 - float(reading["observed"][1:].float().mean())
-        estimates = {filter_name: belief["belief", "mean"].double()}
-        estimates["dead_reckoning"] = integrate(hold_last(reading, facts.dt), truth, facts.dt)
+        estimates = {filter_name: belief["belief", "mean"][:, :5].double()}
+        estimates["dead_reckoning"] = integrate(hold_last(reading, recipe.facts.dt), truth, recipe.facts.dt)
         if condition == "clean":
-            estimates["floor"] = integrate(truth[:, VELOCITIES], truth, facts.dt)
+            estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
         for name, states in estimates.items():
-            scores = calibration(belief, truth) if name == filter_name else {}
+            scores = {**calibration(belief, truth), **costs} if name == filter_name else {}
             table += [{**common, **scores, "filter": name, **row} for row in errors(states, truth)]
     return table, {condition: out[number] for number, condition in enumerate(conditions)}
+
+
+@torch.no_grad()
+def cost(recipe: Recipe, model: Filter, reading: TensorDict, steps: int = 100) -> dict[str, float]:
+    """Parameters behind the sensor, and milliseconds a step of one drive there: the least of three runs."""
+    parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
+    seconds = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        run_filter(recipe, model, [reading[:steps]])
+        seconds.append(time.perf_counter() - begun)
+    return {"parameters": sum(parameters.values()), "ms_per_step": 1e3 * min(seconds) / len(reading[:steps])}
 
 
 def errors(states: Tensor, truth: Tensor) -> list[dict]:
@@ -118,16 +133,18 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
 
 def calibration(belief: TensorDict, truth: Tensor) -> dict[str, float]:
     """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
-    members = belief["belief", "ensemble"][1:, :, VELOCITIES].double()
-    mean, variance, truth = members.mean(1), members.var(1), truth[1:, VELOCITIES]
+    equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
+    members = belief["belief", "ensemble"].shape[1] if equal else None
+    mean, variance = (belief["belief", name][1:, VELOCITIES].double() for name in ("mean", "var"))
+    truth = truth[1:, VELOCITIES]
     covered = interval_coverage(mean, variance, truth, level=0.9)
     covariance = torch.diag_embed(variance)
     return {
         "coverage90": float(covered.mean()),
         "coverage90_v": float(covered[0]),
         "coverage90_theta_dot": float(covered[1]),
-        "crps_v_m_per_s": float(crps_ensemble(members, truth)[:, 0].mean()),
+        "crps_v_m_per_s": float(crps_gaussian(mean, variance, truth)[:, 0].mean()),
         "nll": float(gaussian_nll(mean, covariance, truth).mean()),
         "nees": float(nees(mean, covariance, truth).mean),
-        "spread_skill": float(spread_skill_ratio(mean, variance, truth, members.shape[1]).mean()),
+        "spread_skill": float(spread_skill_ratio(mean, variance, truth, members).mean()),
     }

@@ -1,22 +1,23 @@
-"""Sensors and filters by name. A filter of your own: one function here, with ``@register``."""
+"""Filters by name. One of your own: a :class:`Recipe` with ``@register`` in a file of this folder's ``recipes``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictSequential
-from torch import nn
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
 
+from kitti_study.fold import VELOCITIES, Statistics
+from kitti_study.sensors import SAMPLES
 from kitti_study.streams import LONGEST
-from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     AroundState,
     DiagonalNoise,
     EnsembleAnalysis,
     FlowSensor,
-    ImageSensor,
     LearnedObservation,
     PairObservation,
     StochasticMLP,
@@ -24,60 +25,73 @@ from torch_denkf.modules import (
     UnicycleMotion,
     UnicycleTransition,
     WithHistory,
-    convolutional_trunk,
 )
+from torch_denkf.objectives import DEnKFLoss
 
-ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
-# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
-UNITS = (0.1, 0.03)
+FILTERS: dict[str, type[Recipe]] = {}
 
 
-@dataclass
-class Statistics:
-    """Means and standard deviations of the training drives alone."""
+def register(recipe: type[Recipe]) -> type[Recipe]:
+    """Makes a filter available to all commands under its class's name in lower case."""
+    FILTERS[recipe.__name__.lower()] = recipe
+    return recipe
 
-    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
-    scale: torch.Tensor
-    pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
-    pixel_scale: torch.Tensor
-    dt: float  # s
+
+class Recipe:
+    """How to compose, train and tune one filter. All read the same sensor, and all carry the state
+    [x m, y m, theta rad, v m/s, theta_dot rad/s] in the first five entries of their mean.
+
+    Args:
+        sensor: the fold's.
+        facts: statistics of its training drives.
+    """
+
+    def __init__(self, sensor: SubModel, facts: Statistics):
+        self.sensor, self.facts = sensor, facts
+        self.pairs = isinstance(sensor, FlowSensor)  # it reads pairs of frames with a gap between them, too
+        self.encoding = sensor.encoding_features if self.pairs else sensor.module["head"].layers[-1].in_features
+
+    def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
+        """Everything behind the sensor, by name, in order."""
+        raise NotImplementedError
+
+    def initial(self, std: Sequence[float] | Tensor, state_key: str) -> TensorDictModuleBase:
+        """The belief around a state ``[*B, 5]``."""
+        raise NotImplementedError
+
+    def loss(self, model: Filter) -> nn.Module:
+        """What the training minimises, on windows with the true ``"state"``."""
+        raise NotImplementedError
+
+    def set_inflation(self, model: Filter, factor: float) -> None:
+        """The one number that is chosen on the validation readings: a factor on the belief's spread."""
+        raise NotImplementedError
+
+    def noise(self) -> SubModel:
+        """R, from what the sensor saw."""
+        return DiagonalNoise(2, r=self.facts.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
+
+    def transition(self, network: nn.Module) -> SubModel:
+        """Known motion of the pose; the velocities walk at random."""
+        facts = self.facts
+        return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, drift=False)
 
     @property
-    def unit(self) -> torch.Tensor:
-        """What counts as an error of one, in (m/s, rad/s)."""
-        return self.scale * torch.tensor(UNITS)
+    def state_scale(self) -> Tensor:
+        """Units of the loss; the pose follows from the velocities and does not count."""
+        return torch.cat([torch.full((3,), torch.inf), self.facts.unit])
 
+    def build(self) -> Filter:
+        """The whole filter."""
+        return Filter(OrderedDict(sensor=self.sensor, **self.modules()), initial=self.initial(INITIAL_STD, "state"))
 
-def flow_sensor(statistics: Statistics) -> SubModel:
-    """Optical flow and road correlation."""
-    return FlowSensor(dt=statistics.dt, ensemble_size=ENSEMBLE)
-
-
-def image_sensor(statistics: Statistics) -> SubModel:
-    """The paper's: Table I on a grey frame and its difference to the one before."""
-    return ImageSensor(
-        2,
-        image_shape=(2, 50, 150),
-        trunk=convolutional_trunk(2),
-        ensemble_size=ENSEMBLE,
-        loc=statistics.loc,
-        scale=statistics.scale,
-        pixel_loc=statistics.pixel_loc,
-        pixel_scale=statistics.pixel_scale,
-        encoding_key=("sensor", "encoding"),
-    )
-
-
-SENSORS: dict[str, Callable[[Statistics], SubModel]] = {"flow": flow_sensor, "image": image_sensor}
-FILTERS: dict[str, Callable[[SubModel | None, Statistics], Filter]] = {}
-
-
-def register(build: Callable[[SubModel | None, Statistics], Filter]):
-    """Makes a filter available to all commands under its function's name."""
-    FILTERS[build.__name__] = build
-    return build
+    def part(self, model: Filter, *, sensor: bool, start_std: Tensor | None = None) -> Filter:
+        """The same filter, sharing all parameters, with or without its sensor; from a wrong ``"start"`` if told so."""
+        names = [name for name in model.module if sensor or name != "sensor"]
+        initial = model.initial if start_std is None else self.initial(start_std, "start")
+        return Filter(OrderedDict((name, model[name]) for name in names), initial=initial)
 
 
 class SensorCurve(nn.Module):
@@ -96,48 +110,32 @@ class SensorCurve(nn.Module):
 
 
 @register
-def denkf(sensor: SubModel, statistics: Statistics) -> Filter:
-    """The differentiable ensemble Kalman filter with known motion of the pose."""
-    pairs = isinstance(sensor, FlowSensor)
-    encoding = sensor.encoding_features if pairs else sensor.module["head"].layers[-1].in_features
-    # The flow sensor reads metres, from pairs of frames with a gap between them, too. One that was trained on grey
-    # values hedges, and h is the curve by which it does.
-    if pairs:
-        observation = PairObservation([REACH / statistics.dt, torch.inf])
-        keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
-    else:
-        observation, keys = LearnedObservation(SensorCurve(statistics.loc, statistics.scale)), {}
-    # Innovations correct the velocities, and each member's pose moves with them.
-    motion = UnicycleMotion(statistics.dt, history_key=("belief", "history") if pairs else None)
-    initial = AroundState(INITIAL_STD, ensemble_size=ENSEMBLE)
-    return DEnKF(
-        transition=UnicycleTransition(
+class DEnKF(Recipe):
+    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
+
+    def modules(self):
+        # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
+        if self.pairs:
+            observation = PairObservation([REACH / self.facts.dt, torch.inf])
+            keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
+        else:
+            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
+            keys = {}
+        motion = UnicycleMotion(self.facts.dt, history_key=("belief", "history") if self.pairs else None)
+        return OrderedDict(
+            noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
-            StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
-            dt=statistics.dt,
-            loc=statistics.loc,
-            scale=statistics.scale,
-            drift=False,
-        ),
-        sensor=sensor,
-        observation=observation,
-        noise=DiagonalNoise(2, r=statistics.unit, in_features=encoding, in_key=("sensor", "encoding")),
-        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
-        initial=WithHistory(initial, LONGEST - 1) if pairs else initial,
-    )
+            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
+            observation=observation,
+            analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
+        )
 
+    def initial(self, std, state_key):
+        around = AroundState(std, ensemble_size=SAMPLES, state_key=state_key)
+        return WithHistory(around, LONGEST - 1) if self.pairs else around
 
-def analysis_of(model: Filter) -> EnsembleAnalysis:
-    """The module that updates the ensemble."""
-    return next(module for module in model.modules() if isinstance(module, EnsembleAnalysis))
+    def loss(self, model):
+        return DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)
 
-
-def parts_of(model: Filter, *, sensor: bool, start_std: torch.Tensor | None = None) -> Filter:
-    """The same filter, sharing all parameters, with or without its sensor; windows may start from a wrong velocity."""
-    parts = {name: model[name] for name in ("transition", "observation", "noise", "analysis")}
-    initial = model.initial
-    if start_std is not None:
-        initial = AroundState(start_std, ensemble_size=ENSEMBLE, state_key="start")
-        if isinstance(model.initial, WithHistory):
-            initial = WithHistory(initial, model.initial.lags)
-    return DEnKF(sensor=model["sensor"] if sensor else None, **parts, initial=initial)
+    def set_inflation(self, model, factor):
+        next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor

@@ -1,4 +1,4 @@
-"""Who trains, who tunes, who validates and who is tested; and the batches drawn from them."""
+"""Who trains, who tunes, who validates and who is tested; and batches of their frames."""
 
 from __future__ import annotations
 
@@ -10,9 +10,27 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from kitti_study.filters import VELOCITIES, Statistics
-from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
-from torch_denkf.data import steps_between
+from kitti_study.streams import DISTURBANCES, Stream, mirror, rows
+
+VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
+UNITS = (0.1, 0.03)
+
+
+@dataclass
+class Statistics:
+    """Means and standard deviations of the training drives alone."""
+
+    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
+    scale: torch.Tensor
+    pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
+    pixel_scale: torch.Tensor
+    dt: float  # s
+
+    @property
+    def unit(self) -> torch.Tensor:
+        """What counts as an error of one, in (m/s, rad/s)."""
+        return self.scale * torch.tensor(UNITS)
 
 
 @dataclass(frozen=True)
@@ -125,69 +143,6 @@ class FrameSampler:
             frames = rows(data, torch.arange(first, first + length), self.sensor)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
         return with_start(torch.stack(chosen), start_std, generator)
-
-
-def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
-    """Of readings of pairs of 1, 2, ... steps ``[*B, K]``, those of ``steps`` ``[*B]``; none where that is 0.
-
-    A copy, with ``"observed"`` and ``"steps"`` ``[*B, 1]``.
-    """
-    spans = readings["spans"]
-    index = (steps - 1).clamp(0, spans.shape[-1] - 1).unsqueeze(-1)
-    taken = {}
-    for key in ("observed", "ensemble", "encoding"):
-        value = spans[key]
-        where = index.reshape(*index.shape, *[1] * (value.ndim - index.ndim))
-        taken[key] = value.gather(steps.ndim, where.expand(*index.shape, *value.shape[steps.ndim + 1 :])).squeeze(
-            steps.ndim
-        )
-    steps = torch.where(steps > spans.shape[-1], 0, steps).unsqueeze(-1)
-    seen = taken.pop("observed") & (steps > 0)
-    sensor = TensorDict(taken, batch_size=readings.batch_size)
-    return readings.select("state").clone().update({"observed": seen, "steps": steps, "sensor": sensor})
-
-
-class ReadingSampler:
-    """Draws windows of a frozen sensor's readings.
-
-    Args:
-        readings: of each part, ``[n]``, with those of all ``LONGEST`` spans.
-        weights: shares of the batches.
-        length: of the windows.
-        gain_error: standard deviation of the logarithm of a factor on all speeds that a window's sensor reads: cameras
-            are mounted a little higher or lower, or look a little further up, and the sensor cannot know.
-    """
-
-    def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int, gain_error: float):
-        self.readings, self.length, self.gain_error = torch.cat(list(readings)), length, gain_error
-        starts, weight, offset = [], [], 0
-        for reading, share in zip(readings, weights, strict=True):
-            count = len(reading) - length
-            if count > 0:  # row 0 has no reading
-                starts.append(offset + 1 + torch.arange(count))
-                weight.append(torch.full((count,), share / count))
-            offset += len(reading)
-        if not starts:
-            lengths = [len(reading) for reading in readings]
-            raise ValueError(
-                f"windows of {length} rows do not fit in readings of {lengths} rows; pass a shorter --length"
-            )
-        self.starts, self.weight = torch.cat(starts), torch.cat(weight)
-
-    def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 48) -> TensorDict:
-        """Windows ``[batch, length]``, faster or slower than they were, of which up to half of the frames are lost."""
-        start = self.starts[torch.multinomial(self.weight, batch, replacement=True, generator=generator)]
-        windows = self.readings[start.unsqueeze(-1) + torch.arange(self.length)]
-        # Few drives have few speeds, and the transition would learn to return to those.
-        low, high = torch.tensor([-1.0, -0.7]), torch.tensor([0.7, 0.7])
-        speed = (low + (high - low) * torch.rand(batch, 1, 2, generator=generator)).exp()
-        gain = (self.gain_error * torch.tensor([1.0, 0.3]) * torch.randn(batch, 1, 2, generator=generator)).exp()
-        share = 0.5 * torch.rand(batch, 1, generator=generator)
-        kept = torch.rand(batch, self.length + 1, generator=generator) >= share
-        windows = take_spans(windows, steps_between(kept, LONGEST)[:, 1:])
-        windows["state"][..., VELOCITIES] *= speed
-        windows["sensor", "ensemble"] *= (speed * gain).unsqueeze(-2)
-        return with_start(windows, start_std, generator)
 
 
 def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:

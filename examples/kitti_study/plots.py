@@ -9,7 +9,7 @@ import matplotlib
 import torch
 from tensordict import TensorDict
 
-from kitti_study.filters import VELOCITIES
+from kitti_study.fold import VELOCITIES
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # after the choice of a back-end without a window
@@ -25,12 +25,14 @@ def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, 
         dt: s.
         file: PNG.
     """
-    truth, mean, members = belief["state"], belief["belief", "mean"], belief["belief", "ensemble"]
-    deviation = belief["belief", "var"].sqrt()
+    truth, mean = belief["state"], belief["belief", "mean"][..., :5]
+    deviation = belief["belief", "var"][..., :5].sqrt()
     layout = "pvv;pww;lss"
     figure, axes = plt.subplot_mosaic(layout, figsize=(14, 10), width_ratios=[1.2, 1, 1], layout="constrained")
     path = axes["p"]
-    path.plot(-members[..., 1], members[..., 0], color="tab:blue", alpha=0.06, linewidth=1)
+    if "ensemble" in belief["belief"]:
+        members = belief["belief", "ensemble"][:, :32]
+        path.plot(-members[..., 1], members[..., 0], color="tab:blue", alpha=0.06, linewidth=1)
     path.plot(-truth[:, 1], truth[:, 0], "k-", linewidth=1.5, label="truth")
     path.plot(-mean[:, 1], mean[:, 0], "b-", linewidth=1.5, label="filter, never set back")
     path.plot([], [], color="tab:blue", alpha=0.4, label="ensemble members")

@@ -13,14 +13,15 @@ import torch
 from tqdm import tqdm
 
 from kitti_study.evaluation import evaluate
-from kitti_study.filters import SENSORS
 from kitti_study.fold import Fold, Part, statistics, with_disturbances, with_spans
 from kitti_study.plots import draw_drive
+from kitti_study.sensors import SENSORS, SensorOfFold, sensor_of_fold, train_sensor
 from kitti_study.streams import Stream, find_streams, prepare, spans
-from kitti_study.training import Budget, train_fold, train_sensor
+from kitti_study.training import Budget, train_filter
 from torch_denkf.data import render_drives
 
 RENDERED_FRAMES = 160
+SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
 
 
 @dataclass(frozen=True)
@@ -101,48 +102,51 @@ def _rows(stream: Stream) -> int:
 
 @dataclass(frozen=True)
 class Job:
-    """One filter with one sensor on one fold from one seed."""
+    """Some filters on one sensor on one fold from one seed: they share the sensor's weights and its readings."""
 
     study: Study
     fold: Fold
-    filter: str
+    filters: tuple[str, ...]
     sensor: str
     seed: int
     rendered: tuple[tuple[Part, ...], tuple[Part, ...]] = ((), ())
 
-    @property
-    def out(self) -> Path:
-        """Checkpoints, logs and rows."""
-        return self.study.out / "folds" / f"{self.fold.name}-{self.filter}-{self.sensor}-{self.seed}"
+    def out(self, name: str) -> Path:
+        """Checkpoints, logs and rows of one filter."""
+        return self.study.out / "folds" / f"{self.fold.name}-{name}-{self.sensor}-{self.seed}"
 
-    def train(self):
-        """Trains, or goes on where it was broken off; returns the filter and the training drives' statistics."""
+    def base(self) -> SensorOfFold:
+        """The sensor, trained, and its readings."""
         torch.set_num_threads(1)
-        return train_fold(
+        budget = self.study.budget
+        return sensor_of_fold(
             self.fold,
-            self.filter,
             self.sensor,
-            out=self.out,
+            out=self.study.out / "sensors" / f"{self.fold.name}-{self.sensor}-{self.seed}",
             cache=self.study.cache,
             seed=self.seed,
-            budget=self.study.budget,
+            updates=budget.sensor,
+            fine_tuning=budget.fine_tuning,
             pretrained=self.pretrain() if self.rendered[0] else None,
-            loggers=("csv", "tensorboard"),
         )
 
-    def run(self) -> list[dict]:
-        """Trains, evaluates and draws; what is done already is read."""
-        file = self.out / "rows.json"
-        if file.exists():
-            return json.loads(file.read_text())
-        model, facts = self.train()
-        names = {"filter_name": self.filter, "kind": self.sensor, "seed": self.seed}
-        plots = self.study.out / "plots" if self.seed == 0 else None
-        rows = evaluate_and_draw(model, facts, self.fold.test, self.study.cache, plots, **names)
-        beside = file.with_suffix(".part")
-        beside.write_text(json.dumps(rows))
-        beside.replace(file)
-        return rows
+    def train(self, name: str, base: SensorOfFold):
+        """Trains one filter, or goes on where it was broken off."""
+        loggers = ("csv", "tensorboard")
+        settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
+        return train_filter(self.fold, name, base, out=self.out(name), **settings)
+
+    def run(self) -> None:
+        """Trains, evaluates and draws what is not done already; leaves the rows in each filter's folder."""
+        left = [name for name in self.filters if not (self.out(name) / "rows.json").exists()]
+        base = self.base() if left else None
+        for name in left:
+            names = {"filter_name": name, "kind": self.sensor, "seed": self.seed}
+            plots = self.study.out / "plots" if self.seed == 0 else None
+            rows = evaluate_and_draw(*self.train(name, base), self.fold.test, self.study.cache, plots, **names)
+            beside = self.out(name) / "rows.json.part"
+            beside.write_text(json.dumps(rows))
+            beside.replace(self.out(name) / "rows.json")
 
     def pretrain(self):
         """The sensor that all folds of this seed begin with."""
@@ -167,11 +171,11 @@ class Job:
         self.pretrain()
 
 
-def evaluate_and_draw(model, facts, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
+def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
     """Rows of some drives, and pictures of each, clean and with missing frames, in a folder if one is given."""
     rows = []
     for stream in streams:
-        own, beliefs = evaluate(model, facts, stream, cache, **names)
+        own, beliefs = evaluate(recipe, model, stream, cache, **names)
         rows += own
         for condition in ("clean", "missing") if plots else ():
             shown = [row for row in own if row["condition"] == condition]
@@ -179,7 +183,7 @@ def evaluate_and_draw(model, facts, streams: Sequence[Stream], cache: Path, plot
             title = f"{stream.name}, {condition}: {method}, on a drive that it has not seen"
             plots.mkdir(parents=True, exist_ok=True)
             picture = plots / f"{stream.drive}-{stream.camera}-{method}-{condition}.png"
-            draw_drive(beliefs[condition], shown, title, facts.dt, picture)
+            draw_drive(beliefs[condition], shown, title, recipe.facts.dt, picture)
     return rows
 
 
@@ -192,10 +196,9 @@ def make_jobs(
     folds = [make_fold(name, streams, *rendered) for name in (tests or names)]
     both = (tuple(rendered[0]), tuple(rendered[1]))
     return [
-        Job(study, fold, name, sensor, seed, both)
+        Job(study, fold, tuple(filters), sensor, seed, both)
         for seed in range(seeds)
         for sensor in sensors
-        for name in filters
         for fold in folds
     ]
 
@@ -210,22 +213,41 @@ def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
     prepare(list(dict.fromkeys(streams)), jobs[0].study.cache, processes)
 
 
-def run_jobs(jobs: Sequence[Job], processes: int) -> list[dict]:
+def run_jobs(jobs: Sequence[Job], processes: int) -> None:
     """Computes all streams, pre-trains, then runs all folds side by side."""
     prepare_jobs(jobs, processes)
     first = {(job.sensor, job.seed): job for job in jobs if job.rendered[0]}
     _side_by_side([job.prepare_sensor for job in first.values()], processes, "training on rendered drives")
-    return [row for rows in _side_by_side([job.run for job in jobs], processes, "folds") for row in rows]
+    _side_by_side([job.run for job in jobs], processes, "folds")
 
 
-def _side_by_side(calls: Sequence, processes: int, title: str) -> list:
+def read_rows(out: Path) -> list[dict]:
+    """All rows that a study's folder holds: filters, sensors and seeds may come from several calls.
+
+    Each filter's rows bring dead reckoning with its sensor and the floor; those of the first one are kept.
+    """
+    rows, seen = [], set()
+    for file in sorted((out / "folds").glob("*/rows.json"), key=lambda file: ("-denkf-" not in file.parent.name, file)):
+        own = json.loads(file.read_text())
+        shared = {_identity(row) for row in own if row["filter"] in SHARED}
+        rows += [row for row in own if _identity(row) not in seen]
+        seen |= shared
+    return rows
+
+
+def _identity(row: dict) -> tuple:
+    return tuple(row[key] for key in ("filter", "sensor", "drive", "condition", "window", "seed"))
+
+
+def _side_by_side(calls: Sequence, processes: int, title: str) -> None:
     if processes < 2:
-        return [call() for call in tqdm(calls, desc=title, disable=None)]
+        for call in tqdm(calls, desc=title, disable=None):
+            call()
+        return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(call) for call in calls]
         for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
             future.result()  # raises what the job raised
-        return [future.result() for future in futures]
 
 
 def describe(study: Study) -> dict:

@@ -10,11 +10,11 @@ from tensordict import TensorDict
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
-from kitti_study.fold import Fold, Part, ReadingSampler, take_spans, with_disturbances
+from kitti_study.fold import Fold, Part, with_disturbances
+from kitti_study.readings import ReadingSampler, all_frames, lose_frames, take_spans
 from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from kitti_study.study import make_fold
 from kitti_study.tables import by_drive, markdown, read_csv, write_csv
-from kitti_study.training import all_frames, lose_frames
 
 from torch_denkf.metrics import dead_reckoning
 
