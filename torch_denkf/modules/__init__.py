@@ -10,10 +10,11 @@ from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
+from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
-from torch_denkf.modules.unicycle import PairObservation, UnicycleMotion, UnicycleTransition, WithHistory
+from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
 
 __all__ = [
     "SubModel",
@@ -25,6 +26,8 @@ __all__ = [
     "UnicycleMotion",
     "PairObservation",
     "WithHistory",
+    "ClonedPrior",
+    "ClonedTransition",
     "LearnedObservation",
     "LinearObservation",
     "Select",

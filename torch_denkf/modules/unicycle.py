@@ -1,7 +1,4 @@
-r"""A vehicle whose pose follows from its velocities: the motion is known, their change is learned (section IV-A).
-
-Readings may span several steps: where frames are missing, a sensor can compare a frame with the last one that arrived.
-"""
+r"""A vehicle whose pose follows from its velocities: the motion is known, their change is learned (section IV-A)."""
 
 from __future__ import annotations
 
@@ -9,14 +6,14 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.pairs import within_pair
 from torch_denkf.modules.transition import StochasticTransition
 
-__all__ = ["PairObservation", "UnicycleMotion", "UnicycleTransition", "WithHistory"]
+__all__ = ["UnicycleMotion", "UnicycleTransition"]
 
 
 class UnicycleTransition(StochasticTransition):
@@ -89,116 +86,6 @@ class UnicycleTransition(StochasticTransition):
         return tensordict
 
 
-class WithHistory(SubModel):
-    """An initial belief with a past: each member has had its present velocities all along.
-
-    Args:
-        initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
-        lags: past steps to carry, L: one less than the longest span of a reading.
-        ensemble_key: what ``initial`` writes.
-        history_key: velocities (v m/s, theta_dot rad/s) of the last L steps, the latest first, ``[*B, E, L, 2]``.
-
-    Raises:
-        ValueError: if ``lags`` is not positive.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import AroundState
-        >>> start = WithHistory(AroundState([0.0, 0.0, 0.0, 0.3, 0.02], ensemble_size=8), lags=2)
-        >>> start(TensorDict({"state": torch.zeros(5)}))["belief", "history"].shape
-        torch.Size([8, 2, 2])
-    """
-
-    def __init__(
-        self,
-        initial: TensorDictModuleBase,
-        lags: int,
-        *,
-        ensemble_key: NestedKey = ("belief", "ensemble"),
-        history_key: NestedKey = ("belief", "history"),
-    ):
-        if lags < 1:
-            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
-        super().__init__(initial, initial.in_keys, [*initial.out_keys, history_key])
-        self.ensemble_key, self.lags = ensemble_key, lags
-        self.ensemble_size, self.state_dim = initial.ensemble_size, 5
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and its history."""
-        tensordict = self.module(tensordict)
-        velocity = self.read(tensordict, self.ensemble_key)[..., 3:]
-        return tensordict.set(self.out_keys[-1], velocity.unsqueeze(-2).repeat_interleave(self.lags, -2))
-
-
-class PairObservation(SubModel):
-    r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
-
-    .. math:: H x^i_t = \sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}
-
-    Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
-    between them. The members carry their velocities of the past steps, and the analysis corrects those, too
-    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap anew. Use with
-    ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
-    belief_key="analysis")`` and an initial belief :class:`WithHistory`.
-
-    Args:
-        reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
-            of zero: where the forecast's mean says more, the frame counts as not observed.
-        in_key: forecast ensemble ``[*B, E, 5]``.
-        history_key: see :class:`WithHistory`.
-        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
-            the key is not there. :func:`torch_denkf.data.bridge_gaps` counts them.
-        observed_key: optional mask ``[*B, 1]``.
-        out_key: predicted observations ``[*B, E, 2]``.
-        clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
-        out_observed_key: the mask of what can be read, ``[*B, 1]``.
-
-    Source:
-        Roumeliotis & Burdick 2002, "Stochastic cloning: a generalized framework for processing relative state
-        measurements"; here by an ensemble.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
-        >>> td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
-        >>> PairObservation()(td)["forecast", "observation"]
-        tensor([[19.0000,  0.3000]])
-    """
-
-    def __init__(
-        self,
-        reach: Sequence[float] | torch.Tensor | None = None,
-        *,
-        in_key: NestedKey = ("forecast", "ensemble"),
-        history_key: NestedKey = ("belief", "history"),
-        steps_key: NestedKey = "steps",
-        observed_key: NestedKey = "observed",
-        out_key: NestedKey = ("forecast", "observation"),
-        clone_key: NestedKey = ("forecast", "clone"),
-        out_observed_key: NestedKey = ("forecast", "observed"),
-    ):
-        out_keys = [out_key, clone_key, out_observed_key]
-        super().__init__(nn.Identity(), [in_key, history_key], out_keys, optional_keys=[steps_key, observed_key])
-        reach = [torch.inf, torch.inf] if reach is None else reach
-        self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
-        self.observation_dim = 2
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the predicted observations, the ensemble that the analysis is to update, and the mask."""
-        forecast, history = (self.read(tensordict, key) for key in self.in_keys)
-        past = _within(tensordict.get(self.optional_keys[0], None), history)
-        predicted = forecast[..., 3:] + torch.where(past, history, 0.0).sum(-2)
-        readable = (predicted.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
-        for key in self.optional_keys:
-            value = tensordict.get(key, None)
-            if value is not None:
-                readable = readable & (value > 0)
-        clone = torch.cat([forecast, history.flatten(-2)], -1)
-        for key, value in zip(self.out_keys, (predicted, clone, readable), strict=True):
-            tensordict.set(key, value)
-        return tensordict
-
-
 class UnicycleMotion(SubModel):
     r"""Moves the pose of the last belief with the velocities of the analysis, put *after* an :class:`EnsembleAnalysis`.
 
@@ -239,9 +126,7 @@ class UnicycleMotion(SubModel):
         histories = [] if history_key is None else [history_key]
         out_keys = [(belief_key, name) for name in ("ensemble", "mean", "var")] + histories
         optional_keys = [steps_key] if histories else []
-        super().__init__(
-            nn.Identity(), [before_key, analysis_key, *histories], out_keys, optional_keys=optional_keys
-        )
+        super().__init__(nn.Identity(), [before_key, analysis_key, *histories], out_keys, optional_keys=optional_keys)
         self.dt, self.history_key = dt, history_key
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -250,7 +135,7 @@ class UnicycleMotion(SubModel):
         pose, velocity = before[..., :3], analysis[..., 3:5]
         if self.history_key is not None:
             history = self.read(tensordict, self.history_key)
-            past = _within(tensordict.get(self.optional_keys[0], None), history)
+            past = within_pair(tensordict.get(self.optional_keys[0], None), history)
             corrected = torch.where(past, analysis[..., 5:].unflatten(-1, (-1, 2)), history)
             moved = pose
             for step in history.unbind(-2):  # back to where the history begins
@@ -265,13 +150,6 @@ class UnicycleMotion(SubModel):
         for key, value in zip(self.out_keys, values, strict=False):
             tensordict.set(key, value)
         return tensordict
-
-
-def _within(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:
-    """Which past steps lie between the two frames of a pair: ``[*B, 1, L, 1]``."""
-    lags = torch.arange(1, history.shape[-2] + 1, device=history.device)
-    steps = torch.ones(1, dtype=torch.int64, device=history.device) if steps is None else steps
-    return (lags < steps)[..., None, :, None]
 
 
 def _move(pose: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:

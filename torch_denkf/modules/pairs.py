@@ -1,0 +1,208 @@
+r"""Readings that span several steps: where frames are missing, a sensor can compare a frame with the last that arrived.
+
+What it reads then is the way over the whole gap. A filter that is to learn from it must remember its own velocities of
+the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either beside the state (:class:`WithHistory`,
+for :class:`torch_denkf.modules.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for filters
+whose covariance or weights carry the pose along).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "WithHistory"]
+
+
+class WithHistory(SubModel):
+    """An initial belief with a past: each member has had its present velocities all along.
+
+    Args:
+        initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
+        lags: past steps to carry, L: one less than the longest span of a reading.
+        ensemble_key: what ``initial`` writes.
+        history_key: velocities (v m/s, theta_dot rad/s) of the last L steps, the latest first, ``[*B, E, L, 2]``.
+
+    Raises:
+        ValueError: if ``lags`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import AroundState
+        >>> start = WithHistory(AroundState([0.0, 0.0, 0.0, 0.3, 0.02], ensemble_size=8), lags=2)
+        >>> start(TensorDict({"state": torch.zeros(5)}))["belief", "history"].shape
+        torch.Size([8, 2, 2])
+    """
+
+    def __init__(
+        self,
+        initial: TensorDictModuleBase,
+        lags: int,
+        *,
+        ensemble_key: NestedKey = ("belief", "ensemble"),
+        history_key: NestedKey = ("belief", "history"),
+    ):
+        if lags < 1:
+            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
+        super().__init__(initial, initial.in_keys, [*initial.out_keys, history_key])
+        self.ensemble_key, self.lags = ensemble_key, lags
+        self.ensemble_size, self.state_dim = initial.ensemble_size, 5
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and its history."""
+        tensordict = self.module(tensordict)
+        velocity = self.read(tensordict, self.ensemble_key)[..., 3:]
+        return tensordict.set(self.out_keys[-1], velocity.unsqueeze(-2).repeat_interleave(self.lags, -2))
+
+
+class PairObservation(SubModel):
+    r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
+
+    .. math:: H x^i_t = \sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}
+
+    Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
+    between them. The members carry their velocities of the past steps, and the analysis corrects those, too
+    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap anew. Use with
+    ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
+    belief_key="analysis")`` and an initial belief :class:`WithHistory`.
+
+    Args:
+        reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
+            of zero: where the forecast's mean says more, the frame counts as not observed.
+        in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
+        history_key: see :class:`WithHistory`; ``None`` where the past is part of the state, see
+            :class:`ClonedTransition`.
+        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
+            the key is not there. :func:`torch_denkf.data.bridge_gaps` counts them.
+        observed_key: optional mask ``[*B, 1]``.
+        out_key: predicted observations ``[*B, E, 2]``.
+        clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
+        out_observed_key: the mask of what can be read, ``[*B, 1]``.
+
+    Source:
+        Roumeliotis & Burdick 2002, "Stochastic cloning: a generalized framework for processing relative state
+        measurements"; here by an ensemble.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
+        >>> td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
+        >>> PairObservation()(td)["forecast", "observation"]
+        tensor([[19.0000,  0.3000]])
+    """
+
+    def __init__(
+        self,
+        reach: Sequence[float] | torch.Tensor | None = None,
+        *,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        history_key: NestedKey | None = ("belief", "history"),
+        steps_key: NestedKey = "steps",
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = ("forecast", "observation"),
+        clone_key: NestedKey = ("forecast", "clone"),
+        out_observed_key: NestedKey = ("forecast", "observed"),
+    ):
+        out_keys = [out_key, clone_key, out_observed_key]
+        in_keys = [in_key] if history_key is None else [in_key, history_key]
+        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=[steps_key, observed_key])
+        reach = [torch.inf, torch.inf] if reach is None else reach
+        self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
+        self.observation_dim = 2
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the predicted observations, the ensemble that the analysis is to update, and the mask."""
+        forecast, *history = (self.read(tensordict, key) for key in self.in_keys)
+        history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
+        past = within_pair(tensordict.get(self.optional_keys[0], None), history)
+        predicted = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
+        readable = (predicted.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        for key in self.optional_keys:
+            value = tensordict.get(key, None)
+            if value is not None:
+                readable = readable & (value > 0)
+        clone = torch.cat([forecast[..., :5], history.flatten(-2)], -1)
+        for key, value in zip(self.out_keys, (predicted, clone, readable), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+class ClonedPrior(SubModel):
+    """An initial belief whose state also holds the velocities of past steps, all equal to the present ones.
+
+    Args:
+        initial: writes an ensemble ``[*B, E, 5]``, or a mean ``[*B, 5]`` and a covariance ``[*B, 5, 5]``, of
+            [x, y, theta, v, theta_dot].
+        lags: past steps to carry, L: one less than the longest span of a reading.
+
+    Raises:
+        ValueError: if ``lags`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import AroundState
+        >>> start = ClonedPrior(AroundState([0.0, 0.0, 0.0, 0.3, 0.02], ensemble_size=8), lags=2)
+        >>> start(TensorDict({"state": torch.zeros(5)}))["belief", "ensemble"].shape
+        torch.Size([8, 9])
+    """
+
+    def __init__(self, initial: TensorDictModuleBase, lags: int):
+        if lags < 1:
+            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
+        super().__init__(initial, initial.in_keys, initial.out_keys)
+        self.state_dim = 5
+        if hasattr(initial, "ensemble_size"):
+            self.ensemble_size = initial.ensemble_size
+        eye = torch.eye(5, dtype=torch.get_default_dtype())
+        self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        tensordict = self.module(tensordict)
+        for key in self.out_keys:
+            name, value = key[-1] if isinstance(key, tuple) else key, tensordict.get(key)
+            copies = self.copies.to(value.dtype)
+            if name == "cov":
+                tensordict.set(key, copies @ value @ copies.mT)
+            elif value.shape[-1] == 5:  # ensemble, mean, variances; weights have no state dimension
+                tensordict.set(key, value @ copies.mT)
+        return tensordict
+
+
+class ClonedTransition(SubModel):
+    """A transition whose state also holds the velocities of past steps, the latest first: they move on by one.
+
+    Args:
+        transition: forecasts ensembles ``[*B, E, 5]``, see :class:`torch_denkf.modules.UnicycleTransition`; its keys
+            are kept.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import UnicycleTransition
+        >>> cloned = ClonedTransition(UnicycleTransition(torch.zeros_like, dt=0.1))
+        >>> state = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.0, 9.0, 0.0, 8.0, 0.0]])
+        >>> cloned(TensorDict({("belief", "ensemble"): state}))["forecast", "ensemble"].tolist()
+        [[1.0, 0.0, 0.0, 10.0, 0.0, 10.0, 0.0, 9.0, 0.0]]
+    """
+
+    def __init__(self, transition: SubModel):
+        super().__init__(transition, transition.in_keys, transition.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the forecast ensemble."""
+        state = self.read(tensordict, self.in_keys[0])
+        forecast = self.module(tensordict.copy().set(self.in_keys[0], state[..., :5])).get(self.out_keys[0])
+        return tensordict.set(self.out_keys[0], torch.cat([forecast, state[..., 3:-2]], -1))
+
+
+def within_pair(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:
+    """Which past steps lie between the two frames of a pair: ``[*B, 1, L, 1]``."""
+    lags = torch.arange(1, history.shape[-2] + 1, device=history.device)
+    steps = torch.ones(1, dtype=torch.int64, device=history.device) if steps is None else steps
+    return (lags < steps)[..., None, :, None]
