@@ -48,6 +48,8 @@ class Recipe:
         facts: statistics of its training drives.
     """
 
+    needs_training = False  # True where the state follows from the readings only by learned weights
+
     def __init__(self, sensor: SubModel, facts: Statistics):
         self.sensor, self.facts = sensor, facts
         self.pairs = isinstance(sensor, FlowSensor)  # it reads pairs of frames with a gap between them, too

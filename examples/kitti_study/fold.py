@@ -95,7 +95,7 @@ def with_spans(parts: Sequence[Part]) -> list[Part]:
     longer = [
         replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
         for part in parts
-        for steps, weight in ((2, 0.5), (3, 0.25))
+        for steps, weight in ((2, 0.25), (3, 0.12))
         if part.stream.condition == "clean"
     ]
     return [*parts, *longer]

@@ -1,5 +1,6 @@
 """The parts of examples/kitti_odometry.py that a wrong table could come from."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -10,11 +11,14 @@ from tensordict import TensorDict
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
-from kitti_study.fold import Fold, Part, with_disturbances
+from kitti_study.filters import FILTERS
+from kitti_study.fold import Fold, Part, Statistics, with_disturbances
 from kitti_study.readings import ReadingSampler, all_frames, lose_frames, take_spans
+from kitti_study.sensors import SENSORS
 from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
-from kitti_study.study import make_fold
+from kitti_study.study import make_fold, read_rows
 from kitti_study.tables import by_drive, markdown, read_csv, write_csv
+from kitti_study.training import run_filter
 
 from torch_denkf.metrics import dead_reckoning
 
@@ -196,3 +200,46 @@ def test_the_table_survives_its_file(tmp_path):
     text = markdown(again, "header")
     assert "| clean | denkf | flow | 0.500 ± 0.250 |" in text
     assert "| clean | floor: true v and theta_dot | truth | 0.125 ± 0.000 |" in text
+
+
+def test_rows_of_several_filters_bring_dead_reckoning_once(tmp_path):
+    for name, value in (("denkf", 1.0), ("dekf", 2.0)):
+        folder = tmp_path / "folds" / f"a-{name}-flow-0"
+        folder.mkdir(parents=True)
+        rows = [row("a/image_0", 0, value, filter=name)]
+        rows += [row("a/image_0", 0, 10 * value, filter=shared) for shared in ("dead_reckoning", "floor")]
+        (folder / "rows.json").write_text(json.dumps(rows))
+    found = {(r["filter"], r["translation_m_per_m"]) for r in read_rows(tmp_path)}
+    assert found == {("denkf", 1.0), ("dekf", 2.0), ("dead_reckoning", 10.0), ("floor", 10.0)}
+
+
+def facts():
+    return Statistics(torch.tensor([9.0, 0.0]), torch.tensor([3.0, 0.1]), torch.zeros(2), torch.ones(2), 0.1)
+
+
+@pytest.mark.parametrize("name", sorted(FILTERS))
+def test_every_recipe_follows_readings_over_gaps_with_one_set_of_parameters(name):
+    """Untrained filters on readings of a known truth: a drive whose speed changes, 30 % of the frames missing."""
+    torch.manual_seed(0)
+    recipe = FILTERS[name](SENSORS["flow"](facts()), facts())
+    model = recipe.build()
+    sensorless = recipe.part(model, sensor=False)
+    own = {id(p) for p in model.parameters()}
+    assert {id(p) for p in sensorless.parameters()} <= own
+    assert any(True for _ in sensorless.parameters())
+    count = 60
+    velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
+    path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
+    state = torch.cat([path, velocity], -1)
+    sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)
+    samples = sums.unsqueeze(2) + 0.02 * torch.randn(count, LONGEST, 32, 2)
+    encoding = torch.zeros(count, LONGEST, recipe.encoding)
+    entries = {"observed": torch.ones(count, LONGEST, 1).bool(), "ensemble": samples, "encoding": encoding}
+    read = TensorDict({"state": state, "spans": TensorDict(entries, batch_size=[count, LONGEST])}, [count])
+    with torch.no_grad():
+        out = run_filter(recipe, model, [all_frames(read), lose_frames(read, seed=1)])
+    assert out["belief", "var"][..., :5].isfinite().all()
+    if recipe.needs_training:  # before it, nothing connects its readings with its state
+        return
+    end = (out["belief", "mean"][:, -1, :2] - state[-1, :2]).norm(dim=-1)
+    assert (end < 0.1 * 8 * 0.1 * count).all(), end  # a tenth of the way
