@@ -11,7 +11,10 @@ from torch_denkf.functional.moments import (
     ensemble_var,
 )
 from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
+from torch_denkf.functional.resampling import effective_sample_size, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
+from torch_denkf.functional.transport import transport_resample
+from torch_denkf.functional.weighted import crps_weighted, weighted_mean, weighted_var
 
 __all__ = [
     "Analysis",
@@ -38,4 +41,11 @@ __all__ = [
     "cholesky",
     "inverse_square_root",
     "inverse_square_root_difference",
+    "effective_sample_size",
+    "soft_resample",
+    "systematic_resample",
+    "transport_resample",
+    "weighted_mean",
+    "weighted_var",
+    "crps_weighted",
 ]

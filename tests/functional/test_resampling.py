@@ -1,0 +1,285 @@
+"""Oracles: the definition of each scheme, Monte Carlo over uniforms, linear programming, closed forms, gradcheck."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+
+from torch_denkf.functional import (
+    crps_ensemble,
+    crps_weighted,
+    effective_sample_size,
+    ensemble_mean,
+    ensemble_var,
+    soft_resample,
+    systematic_resample,
+    transport_resample,
+    weighted_mean,
+    weighted_var,
+)
+
+E, S = 6, 2
+BATCHES = [(), (3,), (2, 2)]
+SCHEMES = {
+    "systematic": lambda x, w, u: systematic_resample(x, w, u),
+    "soft": lambda x, w, u: soft_resample(x, w, u, alpha=0.3),
+    "transport": lambda x, w, u: transport_resample(x, w, epsilon=0.3),
+}
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+def problem(batch=(), size=E, dim=S, spread=1.0):
+    return torch.randn(*batch, size, dim), (spread * torch.randn(*batch, size)).log_softmax(-1)
+
+
+# ------------------------------------------------------------------------------------------- weighted particles
+
+
+def test_weighted_moments_and_sample_size_by_hand():
+    particles, log_weights = problem((3,))
+    weights = log_weights.exp()
+    mean = sum(weights[:, i, None] * particles[:, i] for i in range(E))
+    square = sum(weights[:, i, None] * (particles[:, i] - mean) ** 2 for i in range(E))
+    torch.testing.assert_close(weighted_mean(particles, log_weights), mean)
+    torch.testing.assert_close(weighted_var(particles, log_weights), square * E / (E - 1))
+    torch.testing.assert_close(effective_sample_size(log_weights), 1 / weights.square().sum(-1))
+
+
+def test_equal_weights_give_the_ensembles_moments():
+    particles = torch.randn(3, E, S)
+    equal = torch.full((3, E), -math.log(E))
+    torch.testing.assert_close(weighted_mean(particles, equal), ensemble_mean(particles))
+    torch.testing.assert_close(weighted_var(particles, equal), ensemble_var(particles))
+    torch.testing.assert_close(effective_sample_size(equal), torch.full((3,), float(E)))
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_crps_of_rational_weights_is_that_of_repeated_particles(batch):
+    particles, target = torch.randn(*batch, 4, S), torch.randn(*batch, S)
+    counts = torch.tensor([1, 3, 0, 4])
+    repeated = particles.repeat_interleave(counts, -2)
+    log_weights = (counts / 8).log().expand(*batch, 4)
+    expected = crps_ensemble(repeated, target, fair=False)
+    torch.testing.assert_close(crps_weighted(particles, log_weights, target), expected)
+
+
+def test_gradient_of_the_weighted_crps():
+    particles, log_weights = problem((2,))
+    inputs = particles.requires_grad_(), log_weights.requires_grad_(), torch.randn(2, S, requires_grad=True)
+    assert torch.autograd.gradcheck(crps_weighted, inputs)
+
+
+# ------------------------------------------------------------------------------------------------ each scheme
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("batch", BATCHES)
+def test_rows_are_resampled_by_themselves(scheme, batch):
+    particles, log_weights = problem(batch)
+    uniform = torch.rand(*batch, 1)
+    out, weights = SCHEMES[scheme](particles, log_weights, uniform)
+    torch.testing.assert_close(weights.logsumexp(-1), torch.zeros(batch))
+    flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in (particles, log_weights, uniform, out, weights)]
+    for x, w, u, expected, expected_weights in zip(*flat, strict=True):
+        one, one_weights = SCHEMES[scheme](x, w, u)
+        torch.testing.assert_close(one, expected)
+        torch.testing.assert_close(one_weights, expected_weights)
+
+
+def counts_of(picked, particles):
+    """How often each of the particles was picked, ``[N, E]``."""
+    return (picked.unsqueeze(-2) == particles.unsqueeze(-3)).all(-1).sum(-2)
+
+
+def test_systematic_counts_are_floor_or_ceil():
+    particles, log_weights = problem((50,), size=40)
+    out, weights = systematic_resample(particles, log_weights, torch.rand(50, 1))
+    counts, expected = counts_of(out, particles), 40 * log_weights.exp()
+    assert ((counts == expected.floor()) | (counts == expected.ceil())).all()
+    assert (counts.sum(-1) == 40).all()
+    assert (weights == -math.log(40)).all()
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_soft_weights_correct_for_the_proposal(alpha):
+    particles, log_weights = problem((50,), size=40)
+    out, weights = soft_resample(particles, log_weights, torch.rand(50, 1), alpha)
+    proposal = (1 - alpha) * log_weights.exp() + alpha / 40
+    counts = counts_of(out, particles)
+    assert ((counts >= (40 * proposal - 1e-9).floor()) & (counts <= (40 * proposal + 1e-9).ceil())).all()
+    # All copies of particle i have the same weight, and these weights are in the ratio of w / q.
+    index = (out.unsqueeze(-2) == particles.unsqueeze(-3)).all(-1).int().argmax(-1)
+    ratio = (log_weights.exp() / proposal).gather(-1, index)
+    torch.testing.assert_close(weights.exp(), ratio / ratio.sum(-1, keepdim=True))
+
+
+def test_alpha_one_changes_nothing():
+    particles, log_weights = problem((5,))
+    out, weights = soft_resample(particles, log_weights, 0.2 + 0.6 * torch.rand(5, 1), alpha=1.0)
+    assert out.equal(particles)
+    torch.testing.assert_close(weights, log_weights)
+
+
+@pytest.mark.parametrize("width", [1, E])
+@pytest.mark.parametrize("alpha", [None, 0.3])
+def test_weighted_sums_are_kept_in_expectation(width, alpha):
+    # Unbiased: the sum of the unnormalised weights w / (E q) times any function of the particles.
+    draws = 20_000
+    particles, log_weights = problem(size=E)
+    x, w = particles.expand(draws, E, S), log_weights.expand(draws, E)
+    uniform = torch.rand(draws, width)
+    if alpha is None:
+        out, weights = systematic_resample(x, w, uniform)
+        weights = weights.exp()
+    else:
+        out, _ = soft_resample(x, w, uniform, alpha)
+        index = (out.unsqueeze(-2) == x.unsqueeze(-3)).all(-1).int().argmax(-1)
+        weights = (w.exp() / ((1 - alpha) * w.exp() + alpha / E)).gather(-1, index) / E
+    values = torch.cat([out, out.square()], -1)
+    sums = (weights.unsqueeze(-1) * values).sum(-2)
+    expected = weighted_mean(torch.cat([particles, particles.square()], -1), log_weights)
+    standard_error = sums.std(0) / draws**0.5
+    assert (standard_error > 0).all()
+    assert ((sums.mean(0) - expected).abs() < 4 * standard_error).all()
+
+
+@pytest.mark.parametrize("resample", [systematic_resample, soft_resample])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_particles_without_weight_are_never_picked(resample, dtype):
+    # Uniforms at both ends, where rounding decides: the largest below one over E may round up to one.
+    largest = 1 - torch.finfo(dtype).eps / 2
+    uniform = torch.tensor([[0.0], [largest]], dtype=dtype)
+    weights = torch.zeros(2, 1000, dtype=dtype)
+    weights[:, 300:600] = 1 / 300
+    particles = torch.arange(1000.0, dtype=dtype).expand(2, 1000).unsqueeze(-1)
+    args = (0.0,) if resample is soft_resample else ()
+    out, log_weights = resample(particles, weights.log(), uniform, *args)
+    assert (out >= 300).all()
+    assert (out < 600).all()
+    assert log_weights.isfinite().all()
+
+
+def test_no_gradient_through_hard_resampling():
+    particles, log_weights = (value.requires_grad_() for value in problem())
+    assert not any(value.requires_grad for value in systematic_resample(particles, log_weights, torch.rand(1)))
+
+
+@pytest.mark.parametrize("width", [1, E])
+def test_gradient_of_soft_resampling(width):
+    particles, log_weights = (value.requires_grad_() for value in problem((2,)))
+    # Half-way between jumps; if a difference of 1e-6 crossed one, gradcheck would fail by a mile.
+    uniform = torch.rand(2, width)
+    assert torch.autograd.gradcheck(
+        lambda x, w: soft_resample(x, w.log_softmax(-1), uniform, 0.3), (particles, log_weights)
+    )
+    out = soft_resample(particles, log_weights, uniform, 0.3)
+    (gradient,) = torch.autograd.grad(weighted_mean(*out).sum(), log_weights)
+    assert gradient.abs().max() > 0.01
+
+
+# -------------------------------------------------------------------------------------------------- transport
+
+
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_transport_keeps_the_weighted_mean(iterations):
+    particles, log_weights = problem((4,), size=30, spread=2.0)
+    out, weights = transport_resample(particles + 100, log_weights, iterations=iterations)
+    torch.testing.assert_close(out.mean(-2), 100 + weighted_mean(particles, log_weights), rtol=0, atol=1e-12)
+    assert (weights == -math.log(30)).all()
+
+
+def test_transport_does_not_depend_on_units():
+    particles, log_weights = problem((4,))
+    out, _ = transport_resample(particles, log_weights)
+    units, origin = torch.tensor([1e-3, 1e4]), torch.tensor([5.0, -7.0])
+    moved, _ = transport_resample(particles * units + origin, log_weights)
+    torch.testing.assert_close((moved - origin) / units, out, rtol=0, atol=1e-9)
+
+
+def test_transport_without_regularisation_is_the_linear_programme():
+    particles, log_weights = problem(size=5)
+    scale = ensemble_var(particles).sqrt()
+    cost = ((particles.unsqueeze(1) - particles) / scale).square().sum(-1) / 2
+    rows, columns = np.kron(np.eye(5), np.ones(5)), np.kron(np.ones(5), np.eye(5))
+    marginals = np.concatenate([np.full(5, 0.2), log_weights.exp().numpy()])
+    plan = linprog(cost.flatten().numpy(), A_eq=np.concatenate([rows, columns]), b_eq=marginals).x.reshape(5, 5)
+    out, _ = transport_resample(particles, log_weights, epsilon=0.005, iterations=5000)
+    expected = 5 * torch.from_numpy(plan) @ particles
+    # The regularised plan is off by exp(-gap / epsilon), and the gaps of five random points exceed ten epsilon.
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize("epsilon", [0.1, 0.5])
+def test_transport_shrinks_the_spread_as_stated(dim, epsilon):
+    # Quantiles of N(0, I) as particles, weighted with N(1, I): their weighted distribution is N(1/2, I/2), k^2 = 2.
+    size = 400 if dim == 1 else 24
+    nodes = torch.distributions.Normal(0.0, 1.0).icdf((torch.arange(size) + 0.5) / size)
+    particles = torch.cartesian_prod(*[nodes] * dim).reshape(-1, dim)
+    log_weights = (-0.5 * (particles - 1).square().sum(-1)).log_softmax(-1)
+    out, _ = transport_resample(particles, log_weights, epsilon=epsilon, iterations=100)
+    c = epsilon / 2 * (ensemble_var(particles) / weighted_var(particles, log_weights)).sqrt()
+    share = out.std(-2) / weighted_var(particles, log_weights).sqrt()
+    # Quantiles cut the tails: a few per mille in 400 points, a percent in 24.
+    torch.testing.assert_close(share, (1 + c.square()).sqrt() - c, rtol=0, atol=0.003 if dim == 1 else 0.015)
+
+
+def test_gradient_of_transport():
+    particles, log_weights = (value.requires_grad_() for value in problem((2,), size=4))
+
+    def moved(x, w):
+        # The scale takes no gradient; that of particles with a standard deviation of one is constant.
+        x = x / ensemble_var(x).sqrt().unsqueeze(-2)
+        return transport_resample(x, w.log_softmax(-1), epsilon=0.3, iterations=10)[0]
+
+    assert torch.autograd.gradcheck(moved, (particles, log_weights))
+
+
+def test_transport_of_one_point():
+    particles = torch.ones(2, 4, 1, requires_grad=True)
+    out, _ = transport_resample(particles, torch.randn(2, 4).log_softmax(-1))
+    torch.testing.assert_close(out, torch.ones(2, 4, 1))
+    out.sum().backward()
+    assert particles.grad.isfinite().all()
+
+
+def test_transport_of_a_single_likely_particle():
+    particles, log_weights = problem(size=8, spread=500.0)
+    assert effective_sample_size(log_weights) < 1.001
+    out, _ = transport_resample(particles.requires_grad_(), log_weights.requires_grad_())
+    torch.testing.assert_close(out, weighted_mean(particles, log_weights).expand(8, S), rtol=0, atol=1e-3)
+    out.sum().backward()
+    assert particles.grad.isfinite().all()
+    assert log_weights.grad.isfinite().all()
+
+
+# ----------------------------------------------------------------------------------------------------- errors
+
+
+def test_errors():
+    particles, log_weights = problem()
+    with pytest.raises(ValueError, match=r"uniform must be \[\*B, 1\] = \[1\] or \[\*B, E\] = \[6\], got \[2\]"):
+        systematic_resample(particles, log_weights, torch.rand(2))
+    with pytest.raises(ValueError, match=r"log_weights must be \[\*B, E\] = \[6\], got \[3\]"):
+        weighted_mean(particles, log_weights[:3])
+    with pytest.raises(ValueError, match=r"between 0 and 1; got 1.5"):
+        soft_resample(particles, log_weights, torch.rand(1), 1.5)
+    with pytest.raises(ValueError, match="epsilon and iterations must be positive"):
+        transport_resample(particles, log_weights, epsilon=0.0)
+    with pytest.raises(ValueError, match="at least 2"):
+        weighted_var(particles[:1], log_weights[:1])
+
+
+def test_compiled_equals_eager():
+    def everything(x, w, u):
+        return [*systematic_resample(x, w, u), *soft_resample(x, w, u), *transport_resample(x, w, iterations=3)]
+
+    inputs = *problem((3,)), torch.rand(3, 1)
+    compiled = torch.compile(everything, fullgraph=True, backend="aot_eager")(*inputs)
+    torch.testing.assert_close(compiled, everything(*inputs))

@@ -1,0 +1,73 @@
+"""Resampling by optimal transport: no particle is picked or lost, all of them move a little."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional.weighted import check_particles, weighted_mean
+
+
+def transport_resample(
+    particles: Tensor, log_weights: Tensor, *, epsilon: float = 0.05, iterations: int = 20
+) -> tuple[Tensor, Tensor]:
+    r"""Moves weighted particles to equally weighted ones along an entropy-regularised optimal transport plan.
+
+    .. math:: \tilde x^i = \bar x + E \sum_j P_{ij} (x^j - \bar x), \qquad
+        P = \arg\min \sum_{ij} P_{ij} C_{ij} + \epsilon\, \mathrm{KL}(P \,\|\, 1/E \otimes w)
+
+    with rows of P summing to 1/E and columns to :math:`w^j` (Corenflos, Thornton, Deligiannidis & Doucet 2021,
+    "Differentiable particle filtering via entropy-regularized optimal transport", arXiv:2102.07850, eqs. 8 to 12).
+    There is no randomness in it, and it is differentiable in particles and weights, through Sinkhorn's iterations in
+    the log domain; they keep ``iterations`` matrices ``[*B, E, E]`` for the backward pass.
+
+    The cost is :math:`C_{ij} = \|(x^i - x^j) / \sigma\|^2 / 2` with the particles' own standard deviation
+    :math:`\sigma` of each dimension, so that units do not matter; no gradient flows through :math:`\sigma`, which only
+    sets how much is regularised. The weighted mean is kept to rounding, also where the iterations have not converged.
+    The spread shrinks: the standard deviation of a Gaussian in independent dimensions, between particles that are k
+    times as wide as their weighted distribution, to a share :math:`\sqrt{1 + c^2} - c`, :math:`c = k \epsilon / 2`, of
+    itself (0.95 for :math:`\epsilon = 0.05` and k = 2). It is a bias that more particles do not remove.
+
+    Args:
+        particles: X, ``[*B, E, S]``.
+        log_weights: log wⁱ, normalised, ``[*B, E]``.
+        epsilon: regularisation, relative to a squared standard deviation.
+        iterations: of Sinkhorn; smaller ``epsilon`` needs more.
+
+    Returns:
+        The moved particles, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if ``epsilon`` or ``iterations`` is not positive.
+
+    Examples:
+        >>> import torch
+        >>> particles, weights = torch.tensor([[0.0], [1.0]]), torch.tensor([0.25, 0.75])
+        >>> moved, _ = transport_resample(particles, weights.log(), iterations=100)
+        >>> moved.flatten()  # half of the first's share comes from the second
+        tensor([0.5000, 1.0000])
+    """
+    check_particles(particles, log_weights, min_size=2)
+    if epsilon <= 0 or iterations < 1:
+        raise ValueError(f"epsilon and iterations must be positive; got {epsilon} and {iterations}.")
+    size = particles.shape[-2]
+    mean = weighted_mean(particles, log_weights).unsqueeze(-2)
+    anomalies = particles - mean
+    with torch.no_grad():
+        # Not the weighted one: where a single particle has all the weight, it would be zero, and Sinkhorn would stall.
+        variance = particles.var(-2, keepdim=True)
+        scale = torch.where(variance > 0, variance, 1).sqrt() * math.sqrt(2)
+    scaled = anomalies / scale
+    # ||a - b||^2 from its three parts: no [E, E, S] tensor.
+    square = scaled.square().sum(-1)
+    cost = (square.unsqueeze(-1) + square.unsqueeze(-2) - 2 * scaled @ scaled.mT) / epsilon
+
+    row, column = torch.zeros_like(log_weights), torch.zeros_like(log_weights)  # potentials over epsilon
+    for _ in range(iterations):
+        row = -torch.logsumexp((log_weights + column).unsqueeze(-2) - cost, -1)
+        # The columns last: their sums, the weights, are then exact, and with them the mean.
+        column = math.log(size) - torch.logsumexp(row.unsqueeze(-1) - cost, -2)
+    plan = torch.exp(row.unsqueeze(-1) + (log_weights + column).unsqueeze(-2) - cost)  # E P
+    return mean + plan @ anomalies, torch.full_like(log_weights, -math.log(size)).detach()
