@@ -3,5 +3,6 @@
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.kalman import KalmanFilter
+from torch_denkf.filters.particle import DPF, PFM, ParticleFilter
 
-__all__ = ["Filter", "DEnKF", "KalmanFilter"]
+__all__ = ["Filter", "DEnKF", "KalmanFilter", "ParticleFilter", "DPF", "PFM"]

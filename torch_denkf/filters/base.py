@@ -21,7 +21,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
 from torch_denkf.modules import SubModel
 
 __all__ = ["Filter", "submodels", "where_rows"]
@@ -29,6 +29,7 @@ __all__ = ["Filter", "submodels", "where_rows"]
 #: What follows from what: the summaries of a belief that a filter carries under these names.
 _SUMMARIES = {
     "ensemble": {"mean": ensemble_mean, "var": ensemble_var},
+    "particles": {"mean": weighted_mean, "var": weighted_var},
     "cov": {"var": lambda cov: cov.diagonal(dim1=-2, dim2=-1)},
 }
 
@@ -207,7 +208,10 @@ class Filter(TensorDictSequential):
         for key in self.belief_keys:
             if key not in self.carry_keys:
                 source = next(k for k in self.carry_keys if k[-1] in _SUMMARIES and key[-1] in _SUMMARIES[k[-1]])
-                tensordict.set(key, _SUMMARIES[source[-1]][key[-1]](tensordict.get(source)))
+                kind, values = source[-1], [tensordict.get(source)]
+                if (*source[:-1], "log_weight") in self.carry_keys:  # an ensemble with weights
+                    kind, values = "particles", [*values, tensordict.get((*source[:-1], "log_weight"))]
+                tensordict.set(key, _SUMMARIES[kind][key[-1]](*values))
         return tensordict
 
     def _check_carry(self, tensordict: TensorDictBase) -> None:

@@ -9,6 +9,10 @@ from torch import Tensor
 
 from torch_denkf.functional.weighted import check_particles, weighted_mean
 
+#: The regularisation that Sinkhorn's iterations begin with, in squared standard deviations, and which share of them
+#: comes down from there to the one that is wanted.
+_COARSE, _COARSE_SHARE = 2.0, 0.25
+
 
 def transport_resample(
     particles: Tensor, log_weights: Tensor, *, epsilon: float = 0.05, iterations: int = 20
@@ -21,7 +25,9 @@ def transport_resample(
     with rows of P summing to 1/E and columns to :math:`w^j` (Corenflos, Thornton, Deligiannidis & Doucet 2021,
     "Differentiable particle filtering via entropy-regularized optimal transport", arXiv:2102.07850, eqs. 8 to 12).
     There is no randomness in it, and it is differentiable in particles and weights, through Sinkhorn's iterations in
-    the log domain; they keep ``iterations`` matrices ``[*B, E, E]`` for the backward pass.
+    the log domain with a regularisation that comes down to :math:`\epsilon` (Schmitzer 2019, "Stabilized sparse
+    scaling algorithms for entropy regularized transport problems"). The backward pass keeps a few matrices
+    ``[*B, E, E]`` for each of them.
 
     The cost is :math:`C_{ij} = \|(x^i - x^j) / \sigma\|^2 / 2` with the particles' own standard deviation
     :math:`\sigma` of each dimension, so that units do not matter; no gradient flows through :math:`\sigma`, which only
@@ -62,12 +68,19 @@ def transport_resample(
     scaled = anomalies / scale
     # ||a - b||^2 from its three parts: no [E, E, S] tensor.
     square = scaled.square().sum(-1)
-    cost = (square.unsqueeze(-1) + square.unsqueeze(-2) - 2 * scaled @ scaled.mT) / epsilon
+    cost = square.unsqueeze(-1) + square.unsqueeze(-2) - 2 * scaled @ scaled.mT
 
-    row, column = torch.zeros_like(log_weights), torch.zeros_like(log_weights)  # potentials over epsilon
-    for _ in range(iterations):
-        row = -torch.logsumexp((log_weights + column).unsqueeze(-2) - cost, -1)
-        # The columns last: their sums, the weights, are then exact, and with them the mean.
-        column = math.log(size) - torch.logsumexp(row.unsqueeze(-1) - cost, -2)
-    plan = torch.exp(row.unsqueeze(-1) + (log_weights + column).unsqueeze(-2) - cost)  # E P
-    return mean + plan @ anomalies, torch.full_like(log_weights, -math.log(size)).detach()
+    row = torch.zeros_like(log_weights)  # the dual potentials of the rows, and of the columns
+    for iteration in range(iterations):
+        # From coarse to fine: potentials have a long way to go, and go it in large steps where much is regularised.
+        coarse = max(1 - (iteration + 1) / (_COARSE_SHARE * iterations), 0)
+        sharp = epsilon * (max(_COARSE, epsilon) / epsilon) ** coarse
+        column = sharp * (math.log(size) - torch.logsumexp((row.unsqueeze(-1) - cost) / sharp, -2))
+        # The rows last, so that their sums are exact and each particle becomes an average of others: with the columns
+        # last, particles are flung out where the iterations have not converged.
+        log_column = (column.unsqueeze(-2) - cost) / sharp + log_weights.unsqueeze(-2)
+        row = -sharp * torch.logsumexp(log_column, -1)
+    moved = torch.exp(row.unsqueeze(-1) / sharp + log_column) @ anomalies  # E P
+    # What the columns' sums still lack of the weights shows in the mean; a common shift puts it right.
+    moved = moved - moved.mean(-2, keepdim=True)
+    return mean + moved, torch.full_like(log_weights, -math.log(size)).detach()

@@ -8,9 +8,11 @@ from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
+from torch_denkf.modules.particles import NoisyTransition, ParticleAnalysis, ResampledTransition, WithWeights
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
@@ -44,4 +46,10 @@ __all__ = [
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",
+    "GaussianLikelihood",
+    "LearnedLikelihood",
+    "WithWeights",
+    "NoisyTransition",
+    "ResampledTransition",
+    "ParticleAnalysis",
 ]

@@ -1,0 +1,367 @@
+"""Oracles: torch.distributions, Bayes' rule by hand, the functional resampling schemes, statistics of large samples."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Normal
+
+from torch_denkf.functional import (
+    soft_resample,
+    systematic_resample,
+    transport_resample,
+    weighted_mean,
+    weighted_var,
+)
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    DiagonalNoise,
+    FromSensor,
+    GaussianLikelihood,
+    GaussianPrior,
+    LearnedLikelihood,
+    LearnedTransition,
+    NoisyTransition,
+    ParticleAnalysis,
+    ResampledTransition,
+    SubModel,
+    UnicycleTransition,
+    WithWeights,
+)
+
+E, S, OBS, F = 7, 3, 2, 5
+BATCHES = [(), (4,), (2, 3)]
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+class Shift(SubModel):
+    """A transition that adds one, deterministically."""
+
+    def __init__(self):
+        super().__init__(torch.nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
+
+    def forward(self, tensordict):
+        return tensordict.set(self.out_keys[0], self.read(tensordict, self.in_keys[0]) + 1)
+
+
+def belief(batch=(), size=E):
+    entries = {"ensemble": torch.randn(*batch, size, S), "log_weight": torch.randn(*batch, size).log_softmax(-1)}
+    return TensorDict({"belief": TensorDict(entries, batch)}, batch)
+
+
+# ------------------------------------------------------------------------------------------- initial weights
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_initial_weights_are_equal(batch):
+    start = WithWeights(GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=E))
+    out = start(TensorDict({}, batch))
+    assert (out["belief", "log_weight"] == torch.full((*batch, E), -math.log(E))).all()
+    particles, weights = out["belief", "ensemble"], out["belief", "log_weight"]
+    torch.testing.assert_close(out["belief", "mean"], weighted_mean(particles, weights))
+    torch.testing.assert_close(out["belief", "var"], weighted_var(particles, weights))
+    assert (start.ensemble_size, start.state_dim) == (E, S)
+
+
+def test_initial_weights_keep_what_the_belief_reads():
+    assert WithWeights(AroundState(torch.zeros(S), state_key="truth")).in_keys == ["truth"]
+    assert WithWeights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).observation_dim == 2
+    assert not hasattr(WithWeights(AroundState(torch.zeros(S))), "observation_dim")
+
+
+# ------------------------------------------------------------------------------------------------ likelihoods
+
+
+def reading(batch=(), members=None):
+    shape = (*batch, OBS) if members is None else (*batch, members, OBS)
+    return TensorDict(
+        {
+            "forecast": {"observation": torch.randn(*batch, E, OBS)},
+            "sensor": {
+                "ensemble": torch.randn(shape),
+                "noise": 0.1 + torch.rand(*batch, OBS),
+                "encoding": torch.randn(*batch, F),
+            },
+        },
+        batch,
+    )
+
+
+@pytest.mark.parametrize("members", [None, 3])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_gaussian_likelihood_is_the_normal_density(batch, members):
+    td = reading(batch, members)
+    y = td["sensor", "ensemble"] if members is None else td["sensor", "ensemble"].mean(-2)
+    normal = Normal(td["forecast", "observation"], td["sensor", "noise"].sqrt().unsqueeze(-2))
+    expected = normal.log_prob(y.unsqueeze(-2)).sum(-1)
+    torch.testing.assert_close(GaussianLikelihood()(td)["forecast", "log_likelihood"], expected)
+
+
+def test_gaussian_likelihood_of_what_is_observed():
+    td = reading((4,))
+    observed = torch.tensor([[True, True], [True, False], [False, True], [False, False]])
+    normal = Normal(td["forecast", "observation"], td["sensor", "noise"].sqrt().unsqueeze(-2))
+    each = normal.log_prob(td["sensor", "ensemble"].unsqueeze(-2))
+    for key in (("sensor", "ensemble"), ("sensor", "noise")):
+        td[key] = torch.where(observed, td[key], torch.nan)
+    out = GaussianLikelihood()(td.set("observed", observed))["forecast", "log_likelihood"]
+    expected = torch.stack([each[0].sum(-1), each[1, :, 0], each[2, :, 1], torch.zeros(E)])
+    torch.testing.assert_close(out, expected)
+    assert (out[3] == 0).all()
+    one = GaussianLikelihood()(td.set("observed", torch.tensor([[True], [False], [False], [False]])))
+    torch.testing.assert_close(one["forecast", "log_likelihood"][0], each[0].sum(-1))
+    assert (one["forecast", "log_likelihood"][1:] == 0).all()
+
+
+def test_covariance_is_refused():
+    td = reading((4,)).set(("sensor", "noise"), torch.eye(OBS).expand(4, OBS, OBS))
+    with pytest.raises(ValueError, match=r"variances \[\*B, O\].*DiagonalNoise"):
+        GaussianLikelihood()(td)
+
+
+@pytest.mark.parametrize("bound", ["scaled", "clipped"])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_learned_likelihood_by_hand(batch, bound):
+    loc, scale = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
+    model = LearnedLikelihood(F, OBS, num_cells=(8,), bound=bound, loc=loc, scale=scale)
+    td = reading(batch)
+    out = model(td)["forecast", "log_likelihood"]
+    assert out.shape == (*batch, E)
+    assert out.std() > 1e-3, "the particles differ"
+    predicted = (td["forecast", "observation"] - loc) / scale
+    for i in range(E):
+        value = model.module(torch.cat([td["sensor", "encoding"], predicted[..., i, :]], -1))[..., 0]
+        likelihood = 1 / (1 + (-value).exp())
+        expected = (0.004 + 0.996 * likelihood).log() if bound == "scaled" else likelihood.log()
+        torch.testing.assert_close(out[..., i], expected)
+
+
+@pytest.mark.parametrize(("bound", "lowest"), [("scaled", math.log(0.004)), ("clipped", -20.0)])
+def test_learned_likelihood_is_bounded(bound, lowest):
+    model = LearnedLikelihood(F, OBS, bound=bound, network=torch.nn.Linear(F + OBS, 1))
+    td = reading((500,)).set(("sensor", "encoding"), 1e3 * torch.randn(500, F))
+    out = model(td)["forecast", "log_likelihood"]
+    torch.testing.assert_close(out.min(), torch.tensor(lowest))
+    assert out.max() <= 0
+    out.sum().backward()
+    assert model.module.weight.grad.isfinite().all()
+
+
+def test_learned_likelihood_of_what_is_observed():
+    model = LearnedLikelihood(F, OBS, num_cells=(8,), loc=[1.0, -2.0])
+    observed = torch.tensor([[True, True], [True, False], [False, False]])
+    td = reading((3,)).set("observed", observed)
+    plain = model(td.copy())["forecast", "log_likelihood"]
+    td["sensor", "encoding"][2] = torch.nan
+    other = td.clone()
+    other["forecast", "observation"][1, :, 1] += 5.0
+    out, out_of_other = (model(part)["forecast", "log_likelihood"] for part in (td, other))
+    assert out[0].equal(plain[0])
+    assert out[1].equal(out_of_other[1]), "what is not observed does not count"
+    assert (out[2] == 0).all()
+    at_mean = td[1].exclude("observed")
+    at_mean["forecast", "observation"][:, 1] = -2.0
+    torch.testing.assert_close(out[1], model(at_mean)["forecast", "log_likelihood"])
+
+
+def test_learned_likelihood_takes_the_mean_of_members():
+    model = LearnedLikelihood(OBS, OBS, encoding_key=("sensor", "ensemble"))
+    td = reading((4,), members=3)
+    mean = td.clone().set(("sensor", "ensemble"), td["sensor", "ensemble"].mean(-2))
+    torch.testing.assert_close(model(td)["forecast", "log_likelihood"], model(mean)["forecast", "log_likelihood"])
+
+
+@pytest.mark.parametrize("model", [GaussianLikelihood(), LearnedLikelihood(F, OBS, num_cells=(4,)).double()])
+def test_nan_behind_a_mask_leaves_gradients_finite(model):
+    td = reading((4,)).set("observed", torch.tensor([[True], [False], [True], [False]]))
+    hidden = ~td["observed"]
+    leaves = []
+    for key in (("sensor", "ensemble"), ("sensor", "noise"), ("sensor", "encoding")):
+        leaves.append(torch.where(hidden, torch.nan, td[key]).requires_grad_())
+        td[key] = leaves[-1]
+    leaves.append(td["forecast", "observation"].requires_grad_())
+    model(td)["forecast", "log_likelihood"].sum().backward()
+    grads = [leaf.grad for leaf in (*leaves, *model.parameters()) if leaf.grad is not None]
+    assert len(grads) >= 2
+    assert all(grad.isfinite().all() for grad in grads)
+    assert (leaves[-1].grad[[0, 2]] != 0).any()
+    assert (leaves[-1].grad[[1, 3]] == 0).all()
+
+
+# ------------------------------------------------------------------------------------------------ motion noise
+
+
+def statistics(transition, rows=4000):
+    """Mean and covariance over the members of what one state becomes, and that state."""
+    state = torch.randn(S)
+    td = TensorDict({("belief", "ensemble"): state.expand(rows, S)})
+    out = transition(td)["forecast", "ensemble"]
+    return state, out.mean(0), out.T.cov()
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_motion_noise_has_its_variance(before):
+    rows = 4000
+    matrix = torch.nn.Linear(S, S)
+    linear = LearnedTransition(matrix, residual=False)
+    noisy = NoisyTransition(linear, ConstantNoise([0.5, 2.0], in_key=("belief", "ensemble")), [2, 0], before=before)
+    state, mean, cov = statistics(noisy, rows)
+    noise = torch.diag(torch.tensor([4.0, 0.0, 0.25]))
+    expected = matrix.weight @ noise @ matrix.weight.T if before else noise
+    sd = expected.diagonal().sqrt()
+    assert ((mean - matrix(state)).abs() <= 4 * sd / rows**0.5 + 1e-12).all()
+    # A sample covariance has a standard error of sqrt((s_ii s_jj + s_ij^2) / N).
+    error = ((sd.outer(sd).square() + expected.square()) / rows).sqrt()
+    assert ((cov - expected).abs() <= 4 * error + 1e-12).all()
+
+
+def test_motion_noise_before_the_motion_moves_the_pose():
+    noise = ConstantNoise([1.0, 0.1], in_key=("belief", "ensemble"))
+    td = TensorDict({("belief", "ensemble"): torch.zeros(50, 5)})
+    still = UnicycleTransition(torch.zeros_like, dt=0.1)
+    after = NoisyTransition(still, noise, [3, 4])(td.copy())["forecast", "ensemble"]
+    assert (after[:, :3] == 0).all()
+    before = NoisyTransition(still, noise, [3, 4], before=True)(td.copy())["forecast", "ensemble"]
+    torch.testing.assert_close(before[:, 2], 0.1 * before[:, 4])
+    torch.testing.assert_close(before[:, 0], 0.1 * before[:, 3] * (0.05 * before[:, 4]).cos())
+
+
+@pytest.mark.parametrize("weights", [False, True])
+def test_noise_model_reads_the_weighted_mean(weights):
+    model = DiagonalNoise(1, in_features=S, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q"))
+    torch.nn.init.normal_(model.module.layers[-1].weight)
+    noisy = NoisyTransition(Shift(), model, [1])
+    assert noisy.in_keys == [("belief", "ensemble")]
+    td = belief((4,)) if weights else belief((4,)).exclude(("belief", "log_weight"))
+    td["belief", "mean"] = torch.full((4, S), torch.nan)  # whatever it was before
+    td["noise", "motion"] = torch.ones(4, E, 1)
+    out = noisy(td.copy())
+    x = td["belief", "ensemble"]
+    mean = weighted_mean(x, td["belief", "log_weight"]) if weights else x.mean(-2)
+    variance = model(TensorDict({("belief", "mean"): mean}, [4]))["forecast", "q"]
+    expected = x + 1
+    expected[..., 1] += variance.sqrt()
+    torch.testing.assert_close(out["forecast", "ensemble"], expected)
+    assert out["belief", "mean"].isnan().all(), "the tensordict's own mean is left as it is"
+    out["forecast", "ensemble"].sum().backward()
+    assert model.module.layers[0].weight.grad.abs().sum() > 0
+
+
+def test_noise_of_the_wrong_size():
+    noisy = NoisyTransition(Shift(), ConstantNoise([1.0, 1.0], in_key=("belief", "ensemble")), [1])
+    with pytest.raises(ValueError, match=r"writes 2 variances .* for 1 dims"):
+        noisy(belief())
+
+
+# -------------------------------------------------------------------------------------------------- resampling
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("scheme", ["systematic", "soft", "transport", None])
+def test_resampling_before_the_motion(scheme, batch):
+    td = belief(batch).set(("noise", "resampling"), torch.rand(*batch, 1))
+    particles, log_weights = td["belief", "ensemble"], td["belief", "log_weight"]
+    expected, weights = {
+        "systematic": lambda u: systematic_resample(particles, log_weights, u),
+        "soft": lambda u: soft_resample(particles, log_weights, u, 0.3),
+        "transport": lambda u: transport_resample(particles, log_weights, epsilon=0.2, iterations=7),
+        None: lambda u: (particles, log_weights),
+    }[scheme](td["noise", "resampling"])
+    module = ResampledTransition(Shift(), scheme, alpha=0.3, epsilon=0.2, iterations=7)
+    out = module(td.copy())
+    assert out["forecast", "ensemble"].equal(expected + 1)
+    assert out["forecast", "log_weight"].equal(weights)
+    assert out["belief", "ensemble"].equal(particles), "the belief is left as it is"
+    assert out["belief", "log_weight"].equal(log_weights)
+    assert module.in_keys[:2] == [("belief", "ensemble"), ("belief", "log_weight")]
+    assert module.out_keys == [("forecast", "ensemble"), ("forecast", "log_weight")]
+
+
+def test_uniforms_are_drawn_where_none_are_given():
+    module = ResampledTransition(Shift())
+    assert module.draw_noise([3, 4]).shape == (3, 4, 1)
+    assert ResampledTransition(Shift(), "transport").draw_noise([3]) is None
+    td = belief((100,))
+    first, second = (module(td.copy())["forecast", "ensemble"] for _ in range(2))
+    assert not first.equal(second)
+
+
+@pytest.mark.parametrize("width", [1, OBS])
+def test_no_resampling_in_front_of_a_missing_frame(width):
+    td = belief((4,)).set("observed", torch.tensor([[True], [False], [True], [False]]).expand(4, width).clone())
+    if width > 1:
+        td["observed"][0, 0] = False  # something is observed
+    out = ResampledTransition(Shift())(td.copy())
+    for row, seen in enumerate([True, False, True, False]):
+        assert (out["forecast", "log_weight"][row].equal(td["belief", "log_weight"][row])) != seen
+        assert (out["forecast", "ensemble"][row].equal(td["belief", "ensemble"][row] + 1)) != seen
+
+
+def test_resampling_where_few_particles_are_effective():
+    td = belief((2,))
+    weights = torch.full((2, E), 1e-3)
+    weights[0, :5] = 1.0  # 5 of 7 are effective, and 2 of 7
+    weights[1, :2] = 1.0
+    td["belief", "log_weight"] = weights.log().log_softmax(-1)
+    out = ResampledTransition(Shift(), ess_threshold=0.5)(td.copy())
+    assert out["forecast", "log_weight"][0].equal(td["belief", "log_weight"][0])
+    assert (out["forecast", "log_weight"][1] == -math.log(E)).all()
+    both = ResampledTransition(Shift(), ess_threshold=0.5)(td.set("observed", torch.zeros(2, 1, dtype=torch.bool)))
+    assert both["forecast", "log_weight"].equal(td["belief", "log_weight"])
+
+
+def test_unknown_scheme():
+    with pytest.raises(ValueError, match="'multinomial'"):
+        ResampledTransition(Shift(), "multinomial")
+
+
+# ----------------------------------------------------------------------------------------------------- update
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_analysis_is_bayes_rule(batch):
+    td = TensorDict({"forecast": belief(batch)["belief"]}, batch)
+    td["forecast", "log_likelihood"] = torch.randn(*batch, E)
+    out = ParticleAnalysis()(td)
+    joint = td["forecast", "log_weight"].exp() * td["forecast", "log_likelihood"].exp()
+    weights = joint / joint.sum(-1, keepdim=True)
+    particles = td["forecast", "ensemble"]
+    mean = (weights.unsqueeze(-1) * particles).sum(-2)
+    var = (weights.unsqueeze(-1) * (particles - mean.unsqueeze(-2)).square()).sum(-2) * E / (E - 1)
+    assert out["belief", "ensemble"].equal(particles)
+    torch.testing.assert_close(out["belief", "log_weight"], weights.log())
+    torch.testing.assert_close(out["belief", "mean"], mean)
+    torch.testing.assert_close(out["belief", "var"], var)
+    torch.testing.assert_close(out["info", "ess"], 1 / weights.square().sum(-1, keepdim=True))
+    torch.testing.assert_close(out["info", "log_likelihood"], joint.sum(-1, keepdim=True).log())
+
+
+def test_analysis_of_unlikely_readings_does_not_underflow():
+    td = TensorDict({"forecast": belief((2,))["belief"]}, [2])
+    td["forecast", "log_likelihood"] = torch.randn(2, E) - 1e5
+    out = ParticleAnalysis()(td)
+    expected = (td["forecast", "log_weight"] + td["forecast", "log_likelihood"] + 1e5).log_softmax(-1)
+    torch.testing.assert_close(out["belief", "log_weight"], expected, rtol=0, atol=1e-9)  # 1e5 costs five digits
+
+
+def test_analysis_without_an_observation_keeps_the_weights():
+    td = TensorDict({"forecast": belief((200,))["belief"]}, [200])
+    td["forecast", "log_likelihood"] = torch.zeros(200, E)
+    td["forecast", "log_likelihood"][0] = 1.0
+    out = ParticleAnalysis()(td)
+    assert out["belief", "log_weight"][1:].equal(td["forecast", "log_weight"][1:])
+    assert (out["info", "log_likelihood"][1:] == 0).all()
+    torch.testing.assert_close(out["info", "log_likelihood"][0], torch.ones(1))
+
+
+@pytest.mark.parametrize("key", [("forecast", "log_weight"), ("forecast", "log_likelihood")])
+def test_missing_entries_name_themselves(key):
+    td = TensorDict({"forecast": belief()["belief"].set("log_likelihood", torch.zeros(E))})
+    with pytest.raises(KeyError, match=f"ParticleAnalysis reads .*{key[1]}"):
+        ParticleAnalysis()(td.exclude(key))

@@ -1,0 +1,239 @@
+"""Differentiable particle filters: the sub-models of an ensemble filter, with weights instead of an ensemble update."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Literal
+
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.filters.base import Filter
+from torch_denkf.modules import (
+    GaussianLikelihood,
+    NoisyTransition,
+    ParticleAnalysis,
+    ResampledTransition,
+    SubModel,
+    WithWeights,
+)
+
+__all__ = ["DPF", "PFM", "ParticleFilter"]
+
+
+class ParticleFilter(Filter):
+    r"""Particle filter: each step resamples, moves the particles, and weights them with the reading's likelihood.
+
+    Its belief is the particles ``("belief", "ensemble")`` ``[*B, E, S]`` and their normalised log-weights
+    ``("belief", "log_weight")`` ``[*B, E]``, both carried on, with weighted ``("belief", "mean")`` and
+    ``("belief", "var")``. With the true models, Gaussian likelihood and systematic resampling it is the bootstrap
+    filter (Gordon, Salmond & Smith 1993), whose error falls like :math:`1/\sqrt{E}`.
+
+    Args:
+        transition: forecasts ``("forecast", "ensemble")``; its randomness is the motion noise, see
+            :class:`~torch_denkf.modules.NoisyTransition`. Without any, particles become copies of one.
+        sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where ``likelihood`` reads the tensordict.
+        observation: writes the predicted observations ``("forecast", "observation")``.
+        likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
+        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default.
+        noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
+        resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
+            :class:`~torch_denkf.modules.ResampledTransition`; a transition that is one already is left as it is.
+        alpha: share of the uniform distribution in soft resampling.
+        epsilon: regularisation of transport.
+        ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
+        initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling heeds; the likelihood has its own key.
+        control_keys: see :class:`Filter`.
+        init_key: see :class:`Filter`.
+        update_at_reset: see :class:`Filter`.
+
+    Raises:
+        ValueError: on an unknown ``resampling``.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearObservation
+        >>> from torch_denkf.modules import StochasticMLP
+        >>> pf = ParticleFilter(
+        ...     LearnedTransition(StochasticMLP(2, 2)),
+        ...     None,
+        ...     LinearObservation(torch.eye(2)),
+        ...     GaussianLikelihood(sensor_key="position"),
+        ...     noise=ConstantNoise([0.1, 0.1], in_key="position"),
+        ...     initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=100),
+        ... )
+        >>> pf.carry_keys
+        [('belief', 'ensemble'), ('belief', 'log_weight')]
+        >>> pf.sequence(TensorDict({"position": torch.randn(3, 5, 2)}, [3, 5]))["info", "ess"].shape
+        torch.Size([3, 5, 1])
+    """
+
+    def __init__(
+        self,
+        transition: SubModel,
+        sensor: TensorDictModuleBase | None,
+        observation: TensorDictModuleBase,
+        likelihood: TensorDictModuleBase | None = None,
+        analysis: TensorDictModuleBase | None = None,
+        *,
+        initial: TensorDictModuleBase,
+        noise: TensorDictModuleBase | None = None,
+        resampling: Literal["systematic", "soft", "transport"] | None = "systematic",
+        alpha: float = 0.05,
+        epsilon: float = 0.05,
+        ess_threshold: float | None = None,
+        observed_key: NestedKey = "observed",
+        control_keys: Sequence[NestedKey] = ("action",),
+        init_key: NestedKey = "is_init",
+        update_at_reset: bool = False,
+    ):
+        if not isinstance(transition, ResampledTransition):
+            transition = ResampledTransition(
+                transition,
+                resampling,
+                alpha=alpha,
+                epsilon=epsilon,
+                ess_threshold=ess_threshold,
+                observed_key=observed_key,
+            )
+        if unravel_key(transition.in_keys[1]) not in map(unravel_key, initial.out_keys):
+            initial = WithWeights(initial, ensemble_key=transition.in_keys[0], log_weight_key=transition.in_keys[1])
+        modules = OrderedDict(
+            sensor=sensor,
+            noise=noise,
+            transition=transition,
+            observation=observation,
+            likelihood=GaussianLikelihood() if likelihood is None else likelihood,
+            analysis=ParticleAnalysis() if analysis is None else analysis,
+        )
+        super().__init__(
+            OrderedDict((name, module) for name, module in modules.items() if module is not None),
+            initial=initial,
+            control_keys=control_keys,
+            init_key=init_key,
+            update_at_reset=update_at_reset,
+        )
+
+
+class DPF(ParticleFilter):
+    """Differentiable particle filter of Jonschkowski et al.: all learned, hard resampling that ends the gradient.
+
+    Train it with :class:`torch_denkf.objectives.MixtureLoss`: the likelihood of each step learns from that step's
+    belief alone.
+
+    Args:
+        transition: forecasts ``("forecast", "ensemble")``.
+        sensor: writes the encoding that ``likelihood`` reads.
+        observation: writes ``("forecast", "observation")``.
+        likelihood: learned, bounded from below, see :class:`~torch_denkf.modules.LearnedLikelihood`.
+        motion_noise: learned variances of some dimensions of the state, see
+            :class:`~torch_denkf.modules.NoisyTransition`; ``None`` where ``transition`` is random already.
+        noisy_dims: those dimensions. The noise is added before the motion; to have it after, or inside of a
+            :class:`~torch_denkf.modules.ClonedTransition`, give a ``transition`` with noise instead.
+        initial: the initial belief.
+        **kwargs: of :class:`ParticleFilter`.
+
+    Reference:
+        Jonschkowski, Rastogi & Brock, "Differentiable particle filters: end-to-end learning with algorithmic priors",
+        2018, arXiv:1805.11122. There the motion noise is a sampler and on KITTI 100 particles start at the truth.
+
+    Example:
+        >>> import torch
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, Select, UnicycleTransition
+        >>> from torch_denkf.modules import VectorSensor
+        >>> dpf = DPF(
+        ...     UnicycleTransition(torch.nn.Linear(2, 2), dt=0.1),
+        ...     VectorSensor(6, 2, ensemble_size=1, layer="none"),
+        ...     Select([3, 4]),
+        ...     LearnedLikelihood(2, 2, encoding_key=("sensor", "ensemble")),
+        ...     DiagonalNoise(2, in_features=5, in_key=("belief", "mean"), out_key=("forecast", "noise")),
+        ...     noisy_dims=[3, 4],
+        ...     initial=AroundState([0.0] * 5, ensemble_size=100),
+        ... )
+        >>> dpf["transition"].scheme
+        'systematic'
+    """
+
+    def __init__(
+        self,
+        transition: SubModel,
+        sensor: TensorDictModuleBase | None,
+        observation: TensorDictModuleBase,
+        likelihood: TensorDictModuleBase,
+        motion_noise: TensorDictModuleBase | None = None,
+        *,
+        noisy_dims: Sequence[int] = (),
+        initial: TensorDictModuleBase,
+        **kwargs,
+    ):
+        if motion_noise is not None:
+            transition = NoisyTransition(transition, motion_noise, noisy_dims, before=True)
+        super().__init__(transition, sensor, observation, likelihood, initial=initial, **kwargs)
+
+
+class PFM(ParticleFilter):
+    """Differentiable particle filters of Kloss et al. for the mixture loss: dPF-M and dPF-M-lrn.
+
+    Soft resampling in every step, so that the gradient goes on from step to step; "M" is the loss,
+    :class:`torch_denkf.objectives.MixtureLoss`, and "lrn" the likelihood.
+
+    Args:
+        transition: forecasts ``("forecast", "ensemble")``.
+        sensor: writes ``("sensor", "ensemble")``, or the encoding that ``learned_likelihood`` reads.
+        observation: writes ``("forecast", "observation")``.
+        noise: writes ``("sensor", "noise")``, of the Gaussian likelihood; not needed with a learned one.
+        learned_likelihood: a :class:`~torch_denkf.modules.LearnedLikelihood`, theirs is ``bound="clipped"``;
+            ``None`` for the Gaussian one.
+        initial: the initial belief.
+        alpha: share of the uniform distribution in soft resampling.
+        **kwargs: of :class:`ParticleFilter`.
+
+    Raises:
+        ValueError: if neither ``noise`` nor ``learned_likelihood`` is given.
+
+    Reference:
+        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 4.
+
+    Example:
+        >>> import torch
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, Select, UnicycleTransition, VectorSensor
+        >>> from torch_denkf.modules import StochasticMLP
+        >>> pf = PFM(
+        ...     UnicycleTransition(StochasticMLP(2, 2), dt=0.1),
+        ...     VectorSensor(6, 2, ensemble_size=1, layer="none"),
+        ...     Select([3, 4]),
+        ...     DiagonalNoise(2),
+        ...     initial=AroundState([0.0] * 5, ensemble_size=100),
+        ... )
+        >>> pf["transition"].scheme, type(pf["likelihood"]).__name__
+        ('soft', 'GaussianLikelihood')
+    """
+
+    def __init__(
+        self,
+        transition: SubModel,
+        sensor: TensorDictModuleBase | None,
+        observation: TensorDictModuleBase,
+        noise: TensorDictModuleBase | None = None,
+        *,
+        learned_likelihood: TensorDictModuleBase | None = None,
+        initial: TensorDictModuleBase,
+        alpha: float = 0.05,
+        **kwargs,
+    ):
+        if noise is None and learned_likelihood is None:
+            raise ValueError("PFM needs noise, for its Gaussian likelihood, or a learned_likelihood.")
+        super().__init__(
+            transition,
+            sensor,
+            observation,
+            learned_likelihood,
+            noise=noise,
+            resampling="soft",
+            alpha=alpha,
+            initial=initial,
+            **kwargs,
+        )

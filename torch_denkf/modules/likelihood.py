@@ -1,0 +1,172 @@
+r"""Likelihoods of particles: how well each one's predicted observation :math:`h(x^i)` explains what the sensor saw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.stochastic import StochasticMLP
+
+__all__ = ["GaussianLikelihood", "LearnedLikelihood"]
+
+#: Jonschkowski et al.: the smallest likelihood, so that no particle dies of a single reading.
+_SMALLEST_LIKELIHOOD = 0.004
+#: Kloss et al.: the smallest log-likelihood.
+_SMALLEST_LOG_LIKELIHOOD = -20.0
+
+
+class GaussianLikelihood(SubModel):
+    r"""Log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
+
+    Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
+
+    Args:
+        predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
+        sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
+        noise_variance_key: variances ``[*B, O]``, the diagonal of R.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; what is not may be NaN.
+        out_key: log-likelihoods ``[*B, E]``, in nats.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if the noise is a covariance.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({
+        ...     "forecast": {"observation": torch.tensor([[0.0], [1.0]])},
+        ...     "sensor": {"ensemble": torch.tensor([1.0]), "noise": torch.tensor([1.0])},
+        ... })
+        >>> GaussianLikelihood()(td)["forecast", "log_likelihood"]
+        tensor([-1.4189, -0.9189])
+    """
+
+    def __init__(
+        self,
+        *,
+        predicted_key: NestedKey = ("forecast", "observation"),
+        sensor_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = ("forecast", "log_likelihood"),
+    ):
+        super().__init__(
+            nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the log-likelihoods."""
+        predicted, reading, variance = (self.read(tensordict, key) for key in self.in_keys)
+        if variance.ndim > tensordict.ndim + 1:
+            raise ValueError(
+                f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
+                "Use DiagonalNoise or ConstantNoise."
+            )
+        reading, variance = _mean_of_members(reading, tensordict).unsqueeze(-2), variance.unsqueeze(-2)
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observed is not None:
+            # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
+            observed = observed.unsqueeze(-2)
+            reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
+        terms = -0.5 * ((reading - predicted).square() / variance + variance.log() + math.log(2 * math.pi))
+        if observed is not None:
+            terms = torch.where(observed, terms, 0.0)
+        return tensordict.set(self.out_keys[0], terms.sum(-1))
+
+
+class LearnedLikelihood(SubModel):
+    r"""A learned likelihood: a network looks at the sensor's encoding and at a particle's predicted observation.
+
+    .. math:: \log l^i = b(g(e \oplus (h(x^i) - m) / s))
+
+    It needs no noise model and is not normalised over readings. The bound b keeps a single reading from killing all
+    particles. Where nothing is observed it is zero for all particles; where some dimensions are, the network sees the
+    mean of the others in place of the particle's.
+
+    Args:
+        encoding_dim: F, size of the encoding.
+        observation_dim: O.
+        num_cells: hidden layers; both papers have (128, 128).
+        bound: ``"scaled"``, :math:`\log(0.004 + 0.996\, \mathrm{sigmoid}(g))` (Jonschkowski et al. 2018), or
+            ``"clipped"``, :math:`\max(\log \mathrm{sigmoid}(g), -20)` (the limit of Kloss et al. 2021).
+        loc: mean m of each observation dimension ``[O]``; zero by default.
+        scale: standard deviation s of each observation dimension ``[O]``; one by default.
+        network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
+        encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
+            mean is used.
+        predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
+            be NaN.
+        out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
+
+    Raises:
+        ValueError: on an unknown ``bound``.
+        KeyError: if an entry is missing.
+
+    Reference:
+        Jonschkowski, Rastogi & Brock, "Differentiable particle filters", 2018, arXiv:1805.11122, section IV-C;
+        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 4. There the
+        particle's state goes into the network; its predicted observation is all of it that a reading can tell.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"forecast": {"observation": torch.randn(32, 2)}, "sensor": {"encoding": torch.randn(16)}})
+        >>> LearnedLikelihood(16, 2)(td)["forecast", "log_likelihood"].shape
+        torch.Size([32])
+    """
+
+    def __init__(
+        self,
+        encoding_dim: int,
+        observation_dim: int,
+        *,
+        num_cells: Sequence[int] = (128, 128),
+        bound: Literal["scaled", "clipped"] = "scaled",
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        network: nn.Module | None = None,
+        encoding_key: NestedKey = ("sensor", "encoding"),
+        predicted_key: NestedKey = ("forecast", "observation"),
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = ("forecast", "log_likelihood"),
+    ):
+        if bound not in ("scaled", "clipped"):
+            raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
+        if network is None:
+            network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
+        super().__init__(network, [encoding_key, predicted_key], [out_key], optional_keys=[observed_key])
+        self.bound, self.observation_dim = bound, observation_dim
+        dtype = torch.get_default_dtype()
+        for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
+            value = torch.as_tensor(default if value is None else value, dtype=dtype)
+            self.register_buffer(name, value.expand(observation_dim).clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the log-likelihoods."""
+        encoding, predicted = (self.read(tensordict, key) for key in self.in_keys)
+        encoding = _mean_of_members(encoding, tensordict)
+        predicted = (predicted - self.loc) / self.scale
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observed is not None:
+            seen = observed.any(-1, keepdim=True)
+            encoding = torch.where(seen, encoding, 0.0)
+            predicted = torch.where(observed.unsqueeze(-2), predicted, 0.0)
+        encoding = encoding.unsqueeze(-2).expand(*predicted.shape[:-1], encoding.shape[-1])
+        value = self.module(torch.cat([encoding, predicted], -1)).squeeze(-1)
+        if self.bound == "scaled":
+            value = (_SMALLEST_LIKELIHOOD + (1 - _SMALLEST_LIKELIHOOD) * value.sigmoid()).log()
+        else:
+            value = nn.functional.logsigmoid(value).clamp(min=_SMALLEST_LOG_LIKELIHOOD)
+        if observed is not None:
+            value = torch.where(seen, value, 0.0)
+        return tensordict.set(self.out_keys[0], value)
+
+
+def _mean_of_members(value: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
+    return value.mean(-2) if value.ndim > tensordict.ndim + 1 else value

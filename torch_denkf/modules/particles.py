@@ -1,0 +1,339 @@
+r"""What makes an ensemble a set of weighted particles: their weights, resampling, motion noise, the update.
+
+Weights are normalised log-weights ``[*B, E]`` beside the ensemble. The order of a step is
+
+    resample -- move -- observe -- weight
+
+so that the belief is what the update leaves: all particles, with their weights. Resampling adds nothing but noise to
+it, and belongs to the step that needs equal particles, the next (as in Jonschkowski et al. 2018). A loss of the belief
+then reaches the likelihood also where no gradient flows through resampling.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf.functional import (
+    effective_sample_size,
+    soft_resample,
+    systematic_resample,
+    transport_resample,
+    weighted_mean,
+    weighted_var,
+)
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["NoisyTransition", "ParticleAnalysis", "ResampledTransition", "WithWeights"]
+
+
+class WithWeights(SubModel):
+    """An initial belief whose members are particles of equal weight.
+
+    Args:
+        initial: writes an ensemble ``[*B, E, S]``, see :mod:`torch_denkf.modules.belief`.
+        ensemble_key: what ``initial`` writes.
+        log_weight_key: the log-weights, −log E, ``[*B, E]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> start = WithWeights(GaussianPrior([0.0], [1.0], ensemble_size=4))
+        >>> start(TensorDict({}, []))["belief", "log_weight"].exp()
+        tensor([0.2500, 0.2500, 0.2500, 0.2500])
+    """
+
+    def __init__(
+        self,
+        initial: TensorDictModuleBase,
+        *,
+        ensemble_key: NestedKey = ("belief", "ensemble"),
+        log_weight_key: NestedKey = ("belief", "log_weight"),
+    ):
+        super().__init__(initial, initial.in_keys, [*initial.out_keys, log_weight_key])
+        self.ensemble_key = ensemble_key
+        for name in ("ensemble_size", "state_dim", "observation_dim"):
+            if hasattr(initial, name):
+                setattr(self, name, getattr(initial, name))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and its weights."""
+        tensordict = self.module(tensordict)
+        ensemble = self.read(tensordict, self.ensemble_key)
+        return tensordict.set(self.out_keys[-1], torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2])))
+
+
+class NoisyTransition(SubModel):
+    r"""A transition with learned Gaussian motion noise :math:`N(0, Q)` in some dimensions of the state.
+
+    Args:
+        transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
+            kept.
+        noise: writes the diagonal of Q, variances ``[*B, len(dims)]``, e.g.
+            ``DiagonalNoise(2, in_features=5, in_key=("belief", "mean"))`` or ``ConstantNoise``. It may read the
+            belief's weighted mean at ``mean_key``, which is worked out for it.
+        dims: state dimensions that the noise acts on, in the order of Q.
+        before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
+            their noise, such as the pose of a :class:`torch_denkf.modules.UnicycleTransition` with its velocities.
+        ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
+        mean_key: the belief's mean ``[*B, S]``.
+        log_weight_key: optional log-weights of the belief ``[*B, E]``.
+        noise_key: optional standard-normal noise ``[*B, E, len(dims)]``.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if ``noise`` does not write one variance for each of ``dims``.
+
+    Reference:
+        Learned motion noise of a particle filter: Jonschkowski et al. 2018, section IV-B (there a sampler); Kloss et
+        al. 2021, section 4 (the diagonal of Q).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import ConstantNoise, LearnedTransition
+        >>> still = LearnedTransition(nn.Linear(2, 2))
+        >>> noisy = NoisyTransition(still, ConstantNoise([0.1], in_key=("belief", "ensemble")), dims=[1])
+        >>> td = TensorDict({("belief", "ensemble"): torch.zeros(100, 2)})
+        >>> noisy(td)["forecast", "ensemble"].std(0) > 0.05
+        tensor([False,  True])
+    """
+
+    def __init__(
+        self,
+        transition: SubModel,
+        noise: TensorDictModuleBase,
+        dims: Sequence[int],
+        *,
+        before: bool = False,
+        ensemble_size: int | None = None,
+        mean_key: NestedKey = ("belief", "mean"),
+        log_weight_key: NestedKey = ("belief", "log_weight"),
+        noise_key: NestedKey = ("noise", "motion"),
+    ):
+        self_made = {unravel_key(mean_key)}
+        keys = dict.fromkeys(map(unravel_key, [*transition.in_keys, *noise.in_keys]))
+        super().__init__(
+            nn.ModuleDict({"transition": transition, "noise": noise}),
+            [key for key in keys if key not in self_made],
+            transition.out_keys,
+            optional_keys=[log_weight_key],
+            noise_key=noise_key,
+        )
+        self.before, self.mean_key, self.ensemble_size = before, mean_key, ensemble_size
+        self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws standard-normal values ``[*batch_size, E, len(dims)]``; needs ``ensemble_size``."""
+        if self.ensemble_size is None:
+            return None
+        shape = (*batch_size, self.ensemble_size, len(self.dims))
+        return torch.randn(shape, device=device, dtype=dtype, generator=generator)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the forecast ensemble."""
+        key, out_key = self.in_keys[0], self.out_keys[0]
+        state = self.read(tensordict, key)
+        work = tensordict.copy().set(self.mean_key, self._mean(state, tensordict))
+        noise_model = self.module["noise"]
+        variance = noise_model(work).get(noise_model.out_keys[0])
+        if variance.shape[-1] != len(self.dims):
+            raise ValueError(
+                f"The noise model writes {variance.shape[-1]} variances in {noise_model.out_keys[0]!r} for "
+                f"{len(self.dims)} dims; give it an output for each of dims={self.dims.tolist()}."
+            )
+        normal = self.read_noise(tensordict)
+        if normal is None:
+            normal = torch.randn((*state.shape[:-1], len(self.dims)), device=state.device, dtype=state.dtype)
+        noise = variance.sqrt().unsqueeze(-2) * normal
+        if self.before:
+            work.set(key, state.index_add(-1, self.dims, noise))
+            return self._hand_over(self.module["transition"](work), tensordict)
+        tensordict = self._hand_over(self.module["transition"](work.set(key, state)), tensordict)
+        return tensordict.set(out_key, tensordict.get(out_key).index_add(-1, self.dims, noise))
+
+    def _mean(self, state: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
+        log_weights = tensordict.get(self.optional_keys[0], None)
+        return state.mean(-2) if log_weights is None else weighted_mean(state, log_weights)
+
+    def _hand_over(self, source: TensorDictBase, target: TensorDictBase) -> TensorDictBase:
+        for key in self.out_keys:
+            target.set(key, source.get(key))
+        return target
+
+
+class ResampledTransition(SubModel):
+    r"""Resamples the particles of the belief, then moves them.
+
+    Only frames that are observed change weights, so that only in front of those there is something to resample; over
+    missing frames particles and weights go on as they are.
+
+    Args:
+        transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
+            kept.
+        scheme: ``"systematic"`` (hard, no gradient), ``"soft"`` (hard, but the weights keep a gradient),
+            ``"transport"`` (optimal transport, differentiable, biased) or ``None`` for none at all; see
+            :mod:`torch_denkf.functional.resampling` and :func:`~torch_denkf.functional.transport_resample`.
+        alpha: share of the uniform distribution in soft resampling.
+        epsilon: regularisation of transport.
+        iterations: of Sinkhorn in transport.
+        ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
+        log_weight_key: log-weights of the belief ``[*B, E]``.
+        out_log_weight_key: log-weights of the forecast ``[*B, E]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.
+        noise_key: optional uniform numbers in [0, 1), ``[*B, 1]``.
+
+    Raises:
+        ValueError: on an unknown ``scheme``.
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import LearnedTransition
+        >>> step = ResampledTransition(LearnedTransition(nn.Linear(1, 1)), "systematic")
+        >>> td = TensorDict({"belief": {"ensemble": torch.randn(8, 1), "log_weight": torch.randn(8).log_softmax(-1)}})
+        >>> step(td)["forecast", "log_weight"].exp().unique()
+        tensor([0.1250])
+    """
+
+    def __init__(
+        self,
+        transition: SubModel,
+        scheme: Literal["systematic", "soft", "transport"] | None = "systematic",
+        *,
+        alpha: float = 0.05,
+        epsilon: float = 0.05,
+        iterations: int = 20,
+        ess_threshold: float | None = None,
+        log_weight_key: NestedKey = ("belief", "log_weight"),
+        out_log_weight_key: NestedKey = ("forecast", "log_weight"),
+        observed_key: NestedKey = "observed",
+        noise_key: NestedKey = ("noise", "resampling"),
+    ):
+        if scheme not in ("systematic", "soft", "transport", None):
+            raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
+        ensemble_key, *others = transition.in_keys
+        others = [key for key in others if unravel_key(key) != unravel_key(log_weight_key)]
+        super().__init__(
+            transition,
+            [ensemble_key, log_weight_key, *others],
+            # In the order of the carry, see Filter.
+            [transition.out_keys[0], out_log_weight_key, *transition.out_keys[1:]],
+            optional_keys=[observed_key],
+            noise_key=noise_key,
+        )
+        self.scheme, self.alpha, self.ess_threshold = scheme, alpha, ess_threshold
+        self.epsilon, self.iterations = epsilon, iterations
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws uniform numbers ``[*batch_size, 1]``; ``None`` where the scheme needs none."""
+        if self.scheme not in ("systematic", "soft"):
+            return None
+        return torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the forecast ensemble and its weights."""
+        (key, weight_key), (_, out_weight_key) = self.in_keys[:2], self.out_keys[:2]
+        particles, log_weights = self.read(tensordict, key), self.read(tensordict, weight_key)
+        wanted = self._wanted(log_weights, tensordict)
+        moved, weights = self._resample(particles, log_weights, tensordict)
+        if wanted is not None:
+            moved = torch.where(wanted.unsqueeze(-1), moved, particles)
+            weights = torch.where(wanted, weights, log_weights)
+        work = self.module(tensordict.copy().set(key, moved).set(weight_key, weights))
+        tensordict.set(out_weight_key, weights)
+        for out_key in self.module.out_keys:
+            tensordict.set(out_key, work.get(out_key))
+        return tensordict
+
+    def _wanted(self, log_weights: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor | None:
+        """Which rows to resample, ``[*B, 1]``; ``None`` for all."""
+        observed = tensordict.get(self.optional_keys[0], None)
+        wanted = None if observed is None else observed.any(-1, keepdim=True)
+        if self.ess_threshold is not None:
+            few = effective_sample_size(log_weights) < self.ess_threshold * log_weights.shape[-1]
+            wanted = few.unsqueeze(-1) if wanted is None else wanted & few.unsqueeze(-1)
+        return wanted
+
+    def _resample(self, particles, log_weights, tensordict) -> tuple[torch.Tensor, torch.Tensor]:
+        if self.scheme is None:
+            return particles, log_weights
+        if self.scheme == "transport":
+            return transport_resample(particles, log_weights, epsilon=self.epsilon, iterations=self.iterations)
+        uniform = self.read_noise(tensordict)
+        if uniform is None:
+            uniform = self.draw_noise(log_weights.shape[:-1], device=log_weights.device, dtype=log_weights.dtype)
+        if self.scheme == "systematic":
+            return systematic_resample(particles, log_weights, uniform)
+        return soft_resample(particles, log_weights, uniform, self.alpha)
+
+
+class ParticleAnalysis(SubModel):
+    r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
+
+    Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
+    errors. Where nothing is observed the weights stay, exactly.
+
+    Args:
+        forecast_key: particles ``[*B, E, S]``.
+        log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
+        log_likelihood_key: :math:`\log p(y | x^i)`, ``[*B, E]``, see :mod:`torch_denkf.modules.likelihood`.
+        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
+            ``var`` ``[*B, S]``.
+        info_key: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
+            and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`.
+
+    Raises:
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"forecast": {
+        ...     "ensemble": torch.tensor([[0.0], [1.0]]),
+        ...     "log_weight": torch.tensor([0.5, 0.5]).log(),
+        ...     "log_likelihood": torch.tensor([0.1, 0.3]).log(),
+        ... }})
+        >>> ParticleAnalysis()(td)["belief", "mean"]
+        tensor([0.7500])
+    """
+
+    def __init__(
+        self,
+        *,
+        forecast_key: NestedKey = ("forecast", "ensemble"),
+        log_weight_key: NestedKey = ("forecast", "log_weight"),
+        log_likelihood_key: NestedKey = ("forecast", "log_likelihood"),
+        belief_key: str = "belief",
+        info_key: str = "info",
+    ):
+        super().__init__(
+            nn.Identity(),
+            [forecast_key, log_weight_key, log_likelihood_key],
+            [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
+            + [(info_key, name) for name in ("ess", "log_likelihood")],
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and the diagnostics."""
+        particles, prior, log_likelihood = (self.read(tensordict, key) for key in self.in_keys)
+        joint = prior + log_likelihood
+        total = torch.logsumexp(joint, -1, keepdim=True)
+        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
+        seen = (log_likelihood != 0).any(-1, keepdim=True)
+        log_weights = torch.where(seen, joint - total, prior)
+        values = (
+            particles,
+            log_weights,
+            weighted_mean(particles, log_weights),
+            weighted_var(particles, log_weights),
+            effective_sample_size(log_weights).unsqueeze(-1),
+            torch.where(seen, total, torch.zeros_like(total)),
+        )
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
