@@ -14,6 +14,7 @@ setup(
     license_files=["LICENSE"],
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
+    package_data={"torch_denkf.envs": ["assets/*.xml"]},
     install_requires=[
         "torch>=2.13,<2.14",
         "torchrl>=0.14.1,<0.15",

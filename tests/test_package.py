@@ -33,7 +33,8 @@ def test_point_10_the_wheel_holds_the_package_alone(wheel):
     top = {name.split("/")[0] for name in names}
     (info,) = (name for name in top if name.endswith(".dist-info"))
     assert top == {"torch_denkf", info}
-    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "torch_denkf").rglob("*.py")}
+    package = ROOT / "torch_denkf"
+    sources = {str(path.relative_to(ROOT)) for kind in ("*.py", "*.xml") for path in package.rglob(kind)}
     assert {name for name in names if name.startswith("torch_denkf/")} == sources
     assert any(name.startswith(info) and name.endswith("LICENSE") for name in names)
     metadata = wheel.read(f"{info}/METADATA").decode()
