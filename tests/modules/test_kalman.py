@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules import CholeskyNoise, GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 
 
 @pytest.fixture
@@ -67,3 +67,47 @@ def test_analysis(system, mask, full):
     np.testing.assert_allclose(out["info", "innovation"], np.where(kept, y - system["H"] @ m, 0), atol=1e-13)
     np.testing.assert_allclose(out["info", "nis"], [nis], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(out["info", "log_likelihood"], [log_likelihood], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_prior_around_a_state(float64, batch):
+    state = torch.randn(*batch, 2)
+    td = GaussianAround([0.0, 3.0], state_key="start")(TensorDict({"start": state.float()}, batch))
+    torch.testing.assert_close(td["belief", "mean"], state, rtol=1e-6, atol=1e-6)
+    assert td["belief", "mean"].dtype == torch.float64
+    assert td["belief", "cov"].equal(torch.tensor([[0.0, 0.0], [0.0, 9.0]]).expand(*batch, 2, 2))
+    assert td["belief", "var"].equal(torch.tensor([0.0, 9.0]).expand(*batch, 2))
+    with pytest.raises(ValueError, match="non-negative"):
+        GaussianAround([-1.0])
+
+
+def test_control_and_learned_noise(system):
+    F, m, P = tensors(*(system[name] for name in "FmP"))
+    B, noise = torch.randn(3, 2), CholeskyNoise(3, r=[0.1, 0.2, 0.3])
+    with torch.no_grad():
+        noise.raw.normal_()
+    td = TensorDict({"belief": {"mean": m.expand(4, 3), "cov": P.expand(4, 3, 3)}, "push": torch.randn(4, 2)}, [4])
+    module = LinearTransition(F, noise, control=B, trainable=True, action_key="push")
+    assert module.in_keys == [("belief", "mean"), ("belief", "cov"), "push"]
+    out = module(td.copy())
+    Q = noise(td.copy())["forecast", "noise"]
+    torch.testing.assert_close(out["forecast", "mean"], m @ F.mT + td["push"] @ B.mT, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(out["forecast", "cov"], F @ P @ F.mT + Q, rtol=1e-12, atol=1e-12)
+    assert {name for name, _ in module.named_parameters()} == {"matrix", "control", "noise.raw"}
+
+
+def test_noise_and_samples_from_the_tensordict(system):
+    H, R, m, P = tensors(*(system[name] for name in "HRmP"))
+    samples = torch.randn(5, 2)
+    td = TensorDict(
+        {"forecast": {"mean": m, "cov": P}, "sensor": {"ensemble": samples, "noise": R}, "y": samples.mean(0)}
+    )
+    known = KalmanAnalysis(H, R, observation_key="y")(td.copy())
+    read = KalmanAnalysis(H, None, observation_key=("sensor", "ensemble"))(td.copy())
+    for name in ("mean", "cov", "var"):
+        assert read["belief", name].equal(known["belief", name])
+    inflated = KalmanAnalysis(H, R, observation_key="y", inflation=2.0)(td.copy())
+    torch.testing.assert_close(inflated["belief", "cov"], 4 * known["belief", "cov"])
+    td["observed"] = torch.tensor([False])
+    unseen = KalmanAnalysis(H, R, observation_key="y", inflation=2.0)(td)
+    torch.testing.assert_close(unseen["belief", "cov"], P, rtol=1e-13, atol=1e-13)

@@ -1,8 +1,11 @@
 """Filters: compositions of sub-models on one base."""
 
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
+from torch_denkf.filters.ekf import EKF
 from torch_denkf.filters.kalman import KalmanFilter
+from torch_denkf.filters.ukf import UKF
 from torch_denkf.filters.particle import DPF, PFM, ParticleFilter
 
-__all__ = ["Filter", "DEnKF", "KalmanFilter", "ParticleFilter", "DPF", "PFM"]
+__all__ = ["Filter", "DEnKF", "KalmanFilter", "EKF", "UKF", "BackpropKF", "ParticleFilter", "DPF", "PFM"]

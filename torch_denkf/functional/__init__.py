@@ -14,6 +14,14 @@ from torch_denkf.functional.random_bits import random_keep_mask, random_signs, r
 from torch_denkf.functional.resampling import effective_sample_size, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
 from torch_denkf.functional.transport import transport_resample
+from torch_denkf.functional.unscented import (
+    UnscentedWeights,
+    sigma_points,
+    unscented_moments,
+    unscented_update,
+    unscented_weights,
+    wrap_angles,
+)
 from torch_denkf.functional.weighted import crps_weighted, weighted_mean, weighted_var
 
 __all__ = [
@@ -32,6 +40,12 @@ __all__ = [
     "kalman_predict",
     "kalman_update",
     "gaussian_log_prob",
+    "UnscentedWeights",
+    "unscented_weights",
+    "sigma_points",
+    "unscented_moments",
+    "unscented_update",
+    "wrap_angles",
     "crps_ensemble",
     "crps_gaussian",
     "energy_score",

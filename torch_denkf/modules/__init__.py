@@ -6,16 +6,19 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
-from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import NoisyTransition, ParticleAnalysis, ResampledTransition, WithWeights
+from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
+from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
 
 __all__ = [
@@ -46,6 +49,14 @@ __all__ = [
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",
+    "GaussianAround",
+    "CholeskyNoise",
+    "MappedNoise",
+    "UnicycleNoise",
+    "EKFTransition",
+    "EKFAnalysis",
+    "UKFTransition",
+    "UKFAnalysis",
     "GaussianLikelihood",
     "LearnedLikelihood",
     "WithWeights",

@@ -1,0 +1,235 @@
+"""Oracles of all Gaussian filters (EKF, UKF, Backprop KF): the Kalman filter, differences of losses, the true noise."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
+
+from tests.filters.factories import linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import (
+    BELIEF,
+    CONTROL,
+    FILTERS,
+    INFO,
+    directional_check,
+    learned_filter,
+    learned_frames,
+    linear_filter,
+    linear_frames,
+    prior,
+)
+from tests.filters.test_base import assert_equal, stepwise
+from torch_denkf.envs.linear import LinearGaussianEnv
+from torch_denkf.modules import (
+    CholeskyNoise,
+    ConstantNoise,
+)
+from torch_denkf.objectives import GaussianLoss
+from torch_denkf.transforms import DEnKFTransform
+
+ALL = pytest.mark.parametrize("name", FILTERS)
+
+
+@ALL
+@pytest.mark.parametrize("width", [1, 2])
+@pytest.mark.parametrize("update_at_reset", [False, True])
+def test_on_a_linear_system_all_are_the_kalman_filter(float64, name, width, update_at_reset):
+    frames = linear_frames(3, 50, width=width)
+    assert frames["is_init"][:, 1:].any()
+    expected = linear_kalman(update_at_reset=update_at_reset).sequence(frames.copy())
+    got = linear_filter(name, update_at_reset=update_at_reset).sequence(frames.copy())
+    # Rounding of 1e-15 a step, contracted; the sigma points' ridge is 4e-14.
+    assert_equal(got, expected, [*BELIEF, *INFO, ("forecast", "mean"), ("forecast", "cov")], atol=1e-11)
+
+
+@ALL
+def test_actions_move_the_mean_alone(float64, name):
+    F, *_ = linear_system()
+    frames = linear_frames(3, 20)
+    with_control, without = (linear_filter(name, control=c).sequence(frames.copy()) for c in (True, False))
+    torch.testing.assert_close(with_control["belief", "cov"], without["belief", "cov"], rtol=0, atol=1e-13)
+    moved = with_control["belief", "mean"][:, :-1] @ F.mT + frames["action"][:, :-1] @ torch.tensor(CONTROL).mT
+    stepped = ~frames["is_init"][:, 1:].squeeze(-1)
+    torch.testing.assert_close(with_control["forecast", "mean"][:, 1:][stepped], moved[stepped], rtol=0, atol=1e-12)
+
+
+@ALL
+def test_a_missing_reading_still_lets_the_covariance_grow(float64, name):
+    F, Q, *_ = linear_system()
+    out = linear_filter(name).sequence(linear_frames(10, missing=1.0, resets=False))
+    cov = out["belief", "cov"]
+    torch.testing.assert_close(cov[1:], F @ cov[:-1] @ F.mT + Q, rtol=0, atol=1e-12)
+    assert (out["info", "log_likelihood"] == 0).all()
+
+
+@ALL
+@pytest.mark.parametrize("update_at_reset", [False, True])
+def test_step_equals_sequence(float64, name, update_at_reset):
+    filter = learned_filter(name, update_at_reset=update_at_reset)
+    frames = learned_frames(2, 12)
+    # Matrix products sum in another order for another number of rows: 1e-15, which the recursion may amplify.
+    assert_equal(stepwise(filter, frames), filter.sequence(frames.copy()), [*BELIEF, *INFO], atol=1e-11)
+
+
+@ALL
+def test_keys_and_modules(name):
+    filter = learned_filter(name)
+    assert filter.carry_keys == [("belief", "mean"), ("belief", "cov")]
+    assert filter.belief_keys == BELIEF
+    assert len(filter.frame_modules) == 2, "sensor and R run once on all frames"
+    assert filter.transition_module is filter["transition"]
+
+
+@pytest.mark.parametrize("name", ["EKF", "UKF"])
+@pytest.mark.parametrize("layer", ["dropout", "flipout"])
+def test_stochastic_networks_run_deterministically(name, layer):
+    filter, frames = learned_filter(name, layer=layer), learned_frames(2, 6)
+    first, second = (filter.sequence(frames.copy()) for _ in range(2))
+    assert first["belief", "mean"].equal(second["belief", "mean"])
+    assert "noise" not in filter.draw_noise(frames.copy())
+
+
+# --------------------------------------------------------------------------------------------------- gradients
+
+
+@ALL
+def test_gradcheck_through_two_steps(float64, name):
+    filter = learned_filter(name).requires_grad_(False)
+    frames = learned_frames(1, 3).exclude("is_init")
+    frames["observed"][0, 1:] = torch.tensor([[True, True], [True, False]])
+
+    def belief(mean, root, measurement):
+        td = frames.copy().set("measurement", measurement)
+        td["belief", "mean"] = mean.expand(1, 3, 3)
+        td["belief", "cov"] = (root @ root.mT).expand(1, 3, 3, 3)
+        td["belief", "var"] = td["belief", "mean"]
+        out = filter.sequence(td)
+        return [out[key][:, 1:] for key in (*BELIEF, *INFO)]
+
+    inputs = [torch.randn(3), torch.randn(3, 3), torch.randn(1, 3, 4)]
+    start = belief(*inputs)
+    moved = belief(inputs[0] + 1, *inputs[1:])
+    assert not start[0].equal(moved[0]), "the sequence starts from the stored belief"
+    assert torch.autograd.gradcheck(belief, [value.requires_grad_() for value in inputs])
+
+
+@ALL
+def test_all_parameters_have_the_gradient_of_a_difference(float64, name):
+    filter, frames = learned_filter(name), learned_frames(2, 6)
+    target = torch.randn(2, 6, 3)
+
+    def loss():
+        out = filter.sequence(frames.copy())
+        return (out["belief", "mean"] - target).square().sum() - out["info", "log_likelihood"].sum()
+
+    directional_check(loss, filter.parameters())
+
+
+@pytest.mark.parametrize("name", ["EKF", "UKF"])
+def test_unobserved_nan_leaves_gradients_finite(float64, name):
+    frames = linear_frames(2, 10)
+    q = CholeskyNoise(2, r=0.3)
+    r = ConstantNoise([0.7, 0.5], trainable=True, in_key="observation")
+    filter = linear_filter(name, process_noise=q, noise=r)
+    out = filter.sequence(frames)
+    total = out["belief", "mean"].square().sum() + out["info", "log_likelihood"].sum()
+    for gradient in torch.autograd.grad(total, (q.raw, r.log_variance)):
+        assert gradient.isfinite().all()
+        assert (gradient != 0).all()
+
+
+# ------------------------------------------------------------------------------------------------------- training
+
+
+@pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
+def test_the_likelihood_finds_the_true_noise(name):
+    F, Q, H, R = linear_system()
+    generator, rows, steps = torch.Generator().manual_seed(0), 4000, 10
+    initial, readings = prior(), []
+    state = initial.mean + torch.randn(rows, 2, generator=generator) * initial.cov.diagonal().sqrt()
+    for _ in range(steps):
+        readings.append(state @ H.mT + R.sqrt() * torch.randn(rows, 2, generator=generator))
+        state = state @ F.mT + torch.randn(rows, 2, generator=generator) @ torch.linalg.cholesky(Q).mT
+    frames = TensorDict({"observation": torch.stack(readings, 1)}, [rows, steps])
+    q = CholeskyNoise(2, r=0.5)
+    r = ConstantNoise([1.0, 0.4], trainable=True, in_key="observation")
+    filter = linear_filter(name, process_noise=q, noise=r)
+    loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
+    optimiser = torch.optim.LBFGS(filter.parameters(), max_iter=20, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimiser.zero_grad()
+        value = loss(frames)["loss_nll"]
+        value.backward()
+        return value
+
+    before, after = optimiser.step(closure), closure()
+    assert after < before
+    learned = q(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"].detach()
+    # 40,000 readings would tell one variance to sqrt(2 / 40,000) = 0.7 %; Q and R share them: 1 % and 4 % over seeds.
+    torch.testing.assert_close(r.log_variance.exp().detach(), R, rtol=0.1, atol=0)
+    torch.testing.assert_close(learned.diagonal(), Q.diagonal(), rtol=0.1, atol=0)
+    torch.testing.assert_close(learned[0, 1], Q[0, 1], rtol=0, atol=0.1 * Q.diagonal().prod().sqrt().item())
+
+
+# --------------------------------------------------------------------------------------------- in an environment
+
+
+def base_env(**kwargs):
+    F, Q, H, R = linear_system()
+    control = torch.tensor(CONTROL)
+    return LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), control=control, missing=0.3, **kwargs)
+
+
+@ALL
+def test_in_the_transform(float64, name):
+    filter = linear_filter(name, control=True)
+    env = TransformedEnv(base_env(batch_size=[3], max_steps=[3, 5, 30]), DEnKFTransform(filter, diagnostics=INFO))
+    env.append_transform(InitTracker())
+    check_env_specs(env)
+    rollout = env.rollout(12, break_when_any_done=False)
+    assert rollout["is_init"].sum() > 3, "resets on the way"
+    frames = rollout.select("observation", "observed", "is_init", "action")
+    expected = filter.sequence(frames.copy())
+    assert_equal(rollout, expected, BELIEF, atol=1e-11)
+    # At a reset the belief is the prior, and the other rows keep theirs.
+    start = rollout["is_init"].squeeze(-1)
+    assert (rollout["belief", "mean"][start] == filter.initial.mean).all()
+    assert (rollout["belief", "cov"][start] == filter.initial.cov).all()
+
+
+@ALL
+def test_as_part_of_a_policy(float64, name):
+    filter = linear_filter(name, control=True)
+    gain = TensorDictModule(lambda mean: -0.3 * mean[..., :1], [("belief", "mean")], ["action"])
+    env = TransformedEnv(base_env(batch_size=[2], max_steps=[4, 30]), InitTracker())
+    env.append_transform(filter.make_tensordict_primer())
+    # The action of this step is not known when the filter runs: here it moves the state of the *next* belief.
+    policy = TensorDictSequential(linear_filter(name), gain)
+    rollout = env.rollout(9, policy, break_when_any_done=False)
+    frames = rollout.select("observation", "observed", "is_init")
+    assert_equal(rollout, linear_filter(name).sequence(frames), BELIEF, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["EKF", "UKF"])
+def test_copies_and_state_dicts(float64, name, tmp_path):
+    filter, other = learned_filter(name), learned_filter(name)
+    frames = learned_frames(2, 5)
+    expected = filter.sequence(frames.copy())
+    torch.save(filter.state_dict(), tmp_path / "filter.pt")
+    other.load_state_dict(torch.load(tmp_path / "filter.pt"))
+    assert_equal(other.sequence(frames.copy()), expected, BELIEF)
+    torch.save(filter, tmp_path / "whole.pt")
+    whole = torch.load(tmp_path / "whole.pt", weights_only=False)
+    assert_equal(whole.sequence(frames.copy()), expected, BELIEF)
+
+
+@ALL
+def test_compiled_step_equals_eager(name):
+    filter = linear_filter(name, control=True)
+    td = filter.initialise(linear_frames(3, resets=False))
+    eager = filter.step(td.copy())
+    torch.compiler.reset()
+    compiled = torch.compile(filter.step, backend="aot_eager")(td.copy())
+    assert_equal(compiled, eager, BELIEF, atol=1e-5)

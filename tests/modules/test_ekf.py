@@ -1,0 +1,266 @@
+"""Oracles: Jacobians by reverse-mode differentiation and finite differences, the Kalman update, a filter in numpy."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+
+from torch_denkf.functional import kalman_update
+from torch_denkf.modules import (
+    ClonedTransition,
+    ConstantNoise,
+    DiagonalNoise,
+    EKFAnalysis,
+    EKFTransition,
+    FlipoutLinear,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    PairObservation,
+    Select,
+    StochasticMLP,
+    UKFAnalysis,
+    UKFTransition,
+    UnicycleTransition,
+)
+
+TRANSITIONS, ANALYSES = [EKFTransition, UKFTransition], [EKFAnalysis, UKFAnalysis]
+
+
+def constant_noise(size):
+    return ConstantNoise([0.3] * size, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+
+
+def spread(*batch, dim):
+    root = torch.randn(*batch, dim, dim)
+    return root @ root.mT
+
+
+def belief(*batch, dim=5, **entries):
+    mean = torch.randn(*batch, dim)
+    return TensorDict({"belief": {"mean": mean, "cov": spread(*batch, dim=dim)}, **entries}, batch)
+
+
+def network(n_in, n_out, layer="none"):
+    return StochasticMLP(n_in, n_out, (8, 8), layer=layer, activation=nn.Tanh)
+
+
+def by_rows(function, mean):
+    """Jacobian of one row at a time, by torch's reverse mode."""
+    return torch.stack([torch.autograd.functional.jacobian(function, row) for row in mean])
+
+
+@pytest.mark.parametrize("layer", ["none", "dropout", "flipout"])
+@pytest.mark.parametrize("clones", [0, 2])
+def test_forecast_is_f_p_f_with_the_jacobian_of_any_transition(float64, layer, clones):
+    unicycle = UnicycleTransition(network(2, 2, layer), dt=0.2, scale=[3.0, 0.5], loc=[1.0, 0.0])
+    transition = ClonedTransition(unicycle) if clones else unicycle
+    dim = 5 + 2 * clones
+    td = belief(4, dim=dim)
+    out = EKFTransition(transition, constant_noise(dim))(td.copy())
+    velocity = unicycle.module
+    assert velocity.sample, "left as it was"
+    velocity.sample = False
+
+    def move(state):
+        return transition(TensorDict({("belief", "ensemble"): state.unsqueeze(-2)}, state.shape[:-1]))[
+            "forecast", "ensemble"
+        ].squeeze(-2)
+
+    mean, cov = td["belief", "mean"], td["belief", "cov"]
+    F = by_rows(move, mean)
+    basis = torch.eye(dim).unsqueeze(1) * 1e-6
+    differences = ((move(mean + basis) - move(mean - basis)) / 2e-6).permute(1, 2, 0)
+    torch.testing.assert_close(F, differences, rtol=0, atol=1e-8)  # the step's square, and eps / step
+    torch.testing.assert_close(out["forecast", "mean"], move(mean), rtol=0, atol=1e-14)
+    expected = F @ cov @ F.mT + 0.09 * torch.eye(dim)
+    torch.testing.assert_close(out["forecast", "cov"], expected, rtol=1e-11, atol=1e-11)
+    assert "ensemble" not in out["belief"], "the members are in a copy"
+
+
+@pytest.mark.parametrize("Transition", TRANSITIONS)
+def test_actions_and_state_dependent_process_noise(float64, Transition):
+    noise = DiagonalNoise(3, r=0.5, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    nn.init.normal_(noise.module.layers[-1].weight)
+    matrix = nn.Linear(5, 3)
+    module = Transition(LearnedTransition(matrix, action_key="action", residual=False), noise)
+    assert module.in_keys == [("belief", "mean"), ("belief", "cov"), "action"]
+    assert module.out_keys == [("forecast", "mean"), ("forecast", "cov")]
+    td = belief(2, 3, dim=3, action=torch.randn(2, 3, 2))
+    out = module(td.copy())
+    F = matrix.weight[:, :3]
+    mean = matrix(torch.cat([td["belief", "mean"], td["action"]], -1))
+    Q = noise(td.copy())["forecast", "noise"].diag_embed()
+    torch.testing.assert_close(out["forecast", "mean"], mean, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(out["forecast", "cov"], F @ td["belief", "cov"] @ F.mT + Q, rtol=1e-10, atol=1e-10)
+
+
+def test_the_jacobian_has_a_gradient_unless_it_is_stopped(float64):
+    net, td = network(2, 2), belief(3)
+    stopped, module = (
+        EKFTransition(UnicycleTransition(net, 0.2), constant_noise(5), stop_jacobian_gradient=stop)
+        for stop in (True, False)
+    )
+    # The covariance depends on the network through F alone, and Q is fixed.
+    out = stopped(td.copy())
+    assert not out["forecast", "cov"].requires_grad
+    assert (torch.autograd.grad(out["forecast", "mean"].sum(), net.layers[0].weight)[0] != 0).any()
+    weight, step = net.layers[0].weight, torch.randn_like(net.layers[0].weight)
+    (gradient,) = torch.autograd.grad(module(td.copy())["forecast", "cov"].sum(), weight)
+    values = []
+    with torch.no_grad():
+        for size in (1e-6, -2e-6):
+            weight.add_(size * step)
+            values.append(module(td.copy())["forecast", "cov"].sum())
+    torch.testing.assert_close((gradient * step).sum(), (values[0] - values[1]) / 2e-6, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_jacobians_without_a_graph(float64, mode):
+    module, td = EKFTransition(UnicycleTransition(network(2, 2), 0.2), constant_noise(5)), belief(3)
+    expected = module(td.copy())["forecast", "cov"]
+    with mode():
+        got = module(td.copy())["forecast", "cov"]
+    assert not got.requires_grad
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("Transition", TRANSITIONS)
+@pytest.mark.parametrize("layer", [nn.Dropout(), FlipoutLinear(3, 3)])
+def test_random_layers_are_refused(Transition, layer):
+    random = LearnedTransition(nn.Sequential(nn.Linear(3, 3), layer))
+    with pytest.raises(
+        ValueError, match=r"deterministic model; LearnedTransition holds random layers \(\['module.1'\]"
+    ):
+        Transition(random, constant_noise(3))
+
+
+@pytest.mark.parametrize("Analysis", ANALYSES)
+def test_random_observation_models_are_refused_or_made_deterministic(Analysis):
+    with pytest.raises(ValueError, match="needs a deterministic model; LearnedObservation"):
+        Analysis(LearnedObservation(nn.Sequential(nn.Linear(3, 3), nn.Dropout())))
+    module = Analysis(LearnedObservation(StochasticMLP(3, 2, (64,), rate=0.5)))
+    td = forecast(4)
+    assert module(td.copy())["belief", "mean"].equal(module(td.copy())["belief", "mean"])
+
+
+def test_other_randomness_in_a_transition_is_an_error():
+    module = EKFTransition(LearnedTransition(lambda x: x + torch.randn_like(x)), constant_noise(3))
+    with pytest.raises(RuntimeError, match="randomness"):
+        module(belief(2, dim=3))
+
+
+# ------------------------------------------------------------------------------------------------------ analysis
+
+
+def forecast(*batch, dim=3, observations=2):
+    return TensorDict(
+        {
+            "forecast": {"mean": torch.randn(*batch, dim), "cov": spread(*batch, dim=dim)},
+            "sensor": {
+                "ensemble": torch.randn(*batch, 7, observations),
+                "noise": torch.rand(*batch, observations) + 0.5,
+            },
+        },
+        batch,
+    )
+
+
+def assert_is_update(out, update, *, atol=1e-10):
+    names = {"belief": ("mean", "cov"), "info": ("innovation", "nis", "log_likelihood")}
+    for prefix, keys in names.items():
+        for name in keys:
+            torch.testing.assert_close(out[prefix, name], getattr(update, name), rtol=1e-9, atol=atol)
+    assert out["belief", "var"].equal(out["belief", "cov"].diagonal(dim1=-2, dim2=-1))
+
+
+@pytest.mark.parametrize("layer", ["none", "dropout"])
+def test_update_is_linear_in_the_jacobian(float64, layer):
+    model = LearnedObservation(network(3, 2, layer), scale=[1.0, 2.0, 3.0])
+    td = forecast(4)
+    out = EKFAnalysis(model)(td.copy())
+    model.module.sample = False
+    mean, cov = td["forecast", "mean"], td["forecast", "cov"]
+    H = by_rows(model.observe, mean)
+    reading = td["sensor", "ensemble"].mean(-2)
+    shifted = reading - model.observe(mean) + (H @ mean.unsqueeze(-1)).squeeze(-1)
+    assert_is_update(out, kalman_update(mean, cov, shifted, H, td["sensor", "noise"]))
+
+
+@pytest.mark.parametrize("Analysis", ANALYSES)
+@pytest.mark.parametrize("width", [1, 2])
+def test_masks_full_noise_and_plain_readings(float64, Analysis, width):
+    td = forecast(2, 3)
+    H = torch.randn(2, 3)
+    td["observed"] = torch.rand(2, 3, width) < 0.5
+    td["reading"] = torch.where(td["observed"], torch.randn(2, 3, 2), torch.nan).requires_grad_()
+    td["R"] = spread(2, 3, dim=2) + torch.eye(2)
+    td["R"] = torch.where(td["observed"].unsqueeze(-1), td["R"], torch.nan)
+    td["R"] = torch.where(td["observed"].unsqueeze(-2), td["R"], torch.nan).requires_grad_()
+    out = Analysis(LinearObservation(H), observation_key="reading", noise_variance_key="R")(td.copy())
+    moments = td["forecast", "mean"], td["forecast", "cov"]
+    assert_is_update(out, kalman_update(*moments, td["reading"], H, td["R"], observed=td["observed"]))
+    total = sum(value.square().sum() for value in out["belief"].values()) + out["info", "log_likelihood"].sum()
+    for gradient in torch.autograd.grad(total, (td["reading"], td["R"])):
+        assert gradient.isfinite().all()
+    nothing = ~td["observed"].any(-1)
+    torch.testing.assert_close(out["belief", "mean"][nothing], moments[0][nothing], rtol=0, atol=0)
+    torch.testing.assert_close(out["belief", "cov"][nothing], moments[1][nothing], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("Analysis", ANALYSES)
+def test_the_observation_model_may_read_steps_and_write_the_mask(float64, Analysis):
+    # Pairs over 1, 2 and 3 steps, one that does not exist, and one beyond the sensor's reach.
+    td = forecast(5, dim=9)
+    td["forecast", "mean"][4, 3] = 100.0
+    td["steps"] = torch.tensor([[1], [2], [3], [0], [1]])
+    module = Analysis(PairObservation([50.0, torch.inf], history_key=None), observed_key=("forecast", "observed"))
+    assert ("forecast", "ensemble") not in module.in_keys
+    out = module(td.copy())
+    velocities = torch.eye(9)[3:].unflatten(0, (3, 2))
+    for row, pairs in enumerate((1, 2, 3)):
+        one = td[row]
+        H = velocities[:pairs].sum(0)
+        reading = one["sensor", "ensemble"].mean(-2)
+        update = kalman_update(one["forecast", "mean"], one["forecast", "cov"], reading, H, one["sensor", "noise"])
+        assert_is_update(out[row], update)
+    assert (out["info", "log_likelihood"][3:] == 0).all()
+    torch.testing.assert_close(out["belief", "mean"][3:], td["forecast", "mean"][3:], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("Analysis", ANALYSES)
+def test_inflation_acts_where_something_is_observed(float64, Analysis):
+    td = forecast(4)
+    td["observed"] = torch.tensor([[True, True], [True, False], [False, True], [False, False]])
+    plain, inflated = (Analysis(Select([0, 2]), inflation=factor)(td.copy()) for factor in (1.0, 1.5))
+    factor = torch.tensor([2.25, 2.25, 2.25, 1.0])
+    for name, shape in (("cov", (4, 1, 1)), ("var", (4, 1))):
+        torch.testing.assert_close(inflated["belief", name], factor.reshape(shape) * plain["belief", name])
+    assert inflated["belief", "mean"].equal(plain["belief", "mean"])
+
+
+@pytest.mark.parametrize("Analysis", ANALYSES)
+def test_angles_are_compared_across_pi(float64, Analysis):
+    td = forecast(1)
+    td["forecast", "mean"][0, 0], td["sensor", "ensemble"][..., 0] = 3.1, -3.1
+    innovation = Analysis(Select([0, 1]), angles=[0])(td.copy())["info", "innovation"]
+    torch.testing.assert_close(innovation[0, 0], torch.tensor(2 * torch.pi - 6.2), rtol=0, atol=1e-12)
+
+
+def test_a_sequence_of_modules_observes(float64):
+    double = TensorDictModule(lambda x: 2 * x, [("forecast", "ensemble")], [("forecast", "double")])
+    select = Select([1], in_key=("forecast", "double"))
+    td = forecast(2, observations=1)
+    out = EKFAnalysis(TensorDictSequential(double, select))(td.copy())
+    H = torch.tensor([[0.0, 2.0, 0.0]])
+    reading = td["sensor", "ensemble"].mean(-2)
+    update = kalman_update(td["forecast", "mean"], td["forecast", "cov"], reading, H, td["sensor", "noise"])
+    assert_is_update(out, update)
+
+
+def test_missing_entries_are_named():
+    with pytest.raises(KeyError, match=r"EKFAnalysis reads \('sensor', 'noise'\)"):
+        EKFAnalysis(Select([0]))(forecast(2).exclude(("sensor", "noise")))
+    with pytest.raises(KeyError, match=r"EKFTransition reads \('belief', 'cov'\)"):
+        EKFTransition(UnicycleTransition(network(2, 2), 0.1), constant_noise(5))(belief(2).exclude(("belief", "cov")))

@@ -1,0 +1,94 @@
+"""The Backprop KF (Haarnoja et al. 2016): a Kalman filter behind a learned sensor that also says how sure it is."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.filters.base import Filter
+from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
+
+__all__ = ["BackpropKF"]
+
+
+class BackpropKF(Filter):
+    r"""Linear-Gaussian filter of :math:`x_t = A x_{t-1} + B a + N(0, Q)`, :math:`z_t = C x_t + N(0, R_t)`.
+
+    A sensor network reads :math:`z_t` from the frame and a noise network :math:`R_t`; both are trained through the
+    filter's recursion. For a nonlinear motion, such as a vehicle's, give an :class:`~torch_denkf.filters.EKF` the
+    same sensor and noise modules. The belief is that of :class:`~torch_denkf.filters.KalmanFilter`.
+
+    Args:
+        transition: A, ``[S, S]``.
+        process_noise: Q, ``[S, S]``, or a module that writes it, e.g.
+            :class:`~torch_denkf.modules.CholeskyNoise`.
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is :math:`z_t`; ``None`` where it is in
+            the tensordict, under ``observation_key``.
+        observation: C, ``[O, S]``.
+        noise: writes R: variances (:class:`~torch_denkf.modules.DiagonalNoise`) or a covariance
+            (:class:`~torch_denkf.modules.CholeskyNoise`), usually from the sensor's encoding.
+        initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
+            :class:`~torch_denkf.modules.GaussianAround`.
+        control: B, ``[S, A]``; ``None`` for none.
+        trainable: whether A and B are parameters.
+        inflation: factor on the belief's standard deviations, where anything is observed.
+        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
+        control_keys: see :class:`Filter`; the first drives the transition where ``control`` is given.
+        init_key: see :class:`Filter`.
+        update_at_reset: see :class:`Filter`.
+
+    Reference:
+        Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,
+        arXiv:1605.07148.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import CholeskyNoise, MomentPrior, VectorSensor
+        >>> sensor = VectorSensor(4, 2, ensemble_size=1, layer="none", in_key="features")
+        >>> r = CholeskyNoise(2, constant=False, in_features=4, in_key="features", out_key=("sensor", "noise"))
+        >>> prior = MomentPrior(torch.zeros(2), torch.eye(2))
+        >>> bkf = BackpropKF(torch.eye(2), 0.1 * torch.eye(2), sensor, torch.eye(2), r, initial=prior)
+        >>> bkf.sequence(TensorDict({"features": torch.randn(3, 5, 4)}, [3, 5]))["belief", "mean"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(
+        self,
+        transition: torch.Tensor,
+        process_noise: torch.Tensor | TensorDictModuleBase,
+        sensor: TensorDictModuleBase | None,
+        observation: torch.Tensor,
+        noise: TensorDictModuleBase,
+        *,
+        initial: TensorDictModuleBase,
+        control: torch.Tensor | None = None,
+        trainable: bool = False,
+        inflation: float = 1.0,
+        observation_key: NestedKey = ("sensor", "ensemble"),
+        observed_key: NestedKey = "observed",
+        control_keys: Sequence[NestedKey] = ("action",),
+        init_key: NestedKey = "is_init",
+        update_at_reset: bool = False,
+    ):
+        action = {} if control is None else {"control": control, "action_key": control_keys[0]}
+        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
+        modules.update(
+            noise=noise,
+            transition=LinearTransition(transition, process_noise, trainable=trainable, **action),
+            analysis=KalmanAnalysis(
+                observation,
+                None,
+                inflation=inflation,
+                observation_key=observation_key,
+                noise_variance_key=noise.out_keys[0],
+                observed_key=observed_key,
+            ),
+        )
+        super().__init__(
+            modules, initial=initial, control_keys=control_keys, init_key=init_key, update_at_reset=update_at_reset
+        )

@@ -1,0 +1,98 @@
+"""The differentiable extended Kalman filter: the same sub-models as an ensemble filter's, and their Jacobians."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.filters.base import Filter
+from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
+
+__all__ = ["EKF"]
+
+
+class EKF(Filter):
+    """Extended Kalman filter whose transition, sensor, observation and noise models may all be learned (dEKF).
+
+    It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise: what an ensemble filter's
+    stochastic transition does with its members, a covariance Q does here. Its belief is ``("belief", "mean")``
+    ``[*B, S]``, ``("belief", "cov")`` ``[*B, S, S]`` and ``("belief", "var")`` ``[*B, S]``. Where nothing is observed
+    the covariance still grows by F P F^T + Q.
+
+    Args:
+        transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
+        process_noise: Q, see :mod:`torch_denkf.modules.process_noise`.
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
+            reading is in the tensordict, under ``observation_key``.
+        observation: observes ensembles, writes ``("forecast", "observation")``.
+        noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+        initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
+            :class:`~torch_denkf.modules.GaussianAround`.
+        stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
+        inflation: factor on the belief's standard deviations, where anything is observed.
+        angles: components of the observation that are angles in radians.
+        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.
+        control_keys: see :class:`Filter`.
+        init_key: see :class:`Filter`.
+        update_at_reset: see :class:`Filter`.
+
+    Reference:
+        Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import ConstantNoise, GaussianAround, Select, UnicycleNoise, UnicycleTransition
+        >>> q = ConstantNoise([0.5, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        >>> ekf = EKF(
+        ...     UnicycleTransition(torch.zeros_like, dt=0.1),
+        ...     UnicycleNoise(q, dt=0.1),
+        ...     None,
+        ...     Select([3, 4]),
+        ...     ConstantNoise([0.3, 0.05], in_key="reading"),
+        ...     initial=GaussianAround([0.0, 0.0, 0.0, 1.0, 0.1]),
+        ...     observation_key="reading",
+        ... )
+        >>> drive = TensorDict({"reading": torch.tensor([10.0, 0.0]).expand(9, 2), "state": torch.zeros(9, 5)}, [9])
+        >>> ekf.sequence(drive)["belief", "mean"][-1, 0] > 6.0  # m in 8 steps, from a wrong speed
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        transition: TensorDictModuleBase,
+        process_noise: TensorDictModuleBase,
+        sensor: TensorDictModuleBase | None,
+        observation: TensorDictModuleBase,
+        noise: TensorDictModuleBase,
+        *,
+        initial: TensorDictModuleBase,
+        stop_jacobian_gradient: bool = False,
+        inflation: float = 1.0,
+        angles: Sequence[int] = (),
+        observation_key: NestedKey = ("sensor", "ensemble"),
+        observed_key: NestedKey = "observed",
+        control_keys: Sequence[NestedKey] = ("action",),
+        init_key: NestedKey = "is_init",
+        update_at_reset: bool = False,
+    ):
+        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
+        modules.update(
+            noise=noise,
+            transition=EKFTransition(transition, process_noise, stop_jacobian_gradient=stop_jacobian_gradient),
+            analysis=EKFAnalysis(
+                observation,
+                inflation=inflation,
+                angles=angles,
+                observation_key=observation_key,
+                noise_variance_key=noise.out_keys[0],
+                observed_key=observed_key,
+            ),
+        )
+        super().__init__(
+            modules, initial=initial, control_keys=control_keys, init_key=init_key, update_at_reset=update_at_reset
+        )

@@ -1,0 +1,259 @@
+"""The unscented transform: a Gaussian as 2 S + 1 points, which go through any function without its Jacobian.
+
+Source: Julier & Uhlmann 2004, "Unscented filtering and nonlinear estimation", Proc. IEEE 92; Wan & van der Merwe 2000
+for alpha, beta and kappa; Särkkä 2013, section 5.5.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, _whiten
+from torch_denkf.functional.linalg import cholesky
+
+
+class UnscentedWeights(NamedTuple):
+    """Weights of 2 S + 1 sigma points, ``[2 S + 1]`` each.
+
+    Attributes:
+        mean: they add up to one.
+        cov: of the squared deviations.
+    """
+
+    mean: Tensor
+    cov: Tensor
+
+
+def unscented_weights(
+    dim: int,
+    *,
+    alpha: float = 1.0,
+    beta: float = 0.0,
+    kappa: float = 0.5,
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
+) -> UnscentedWeights:
+    r"""Weights of the sigma points of a Gaussian (Särkkä 2013, eq. 5.77), with :math:`c = \alpha^2 (S + \kappa)`.
+
+    Moments up to the third are exact for any values. With ``alpha=1, kappa=2-S, beta=1`` the covariance of a sum of
+    squares is exact, too. With ``alpha=1, beta=0`` (default) all weights are positive where ``kappa`` is, and
+    covariances then stay positive; ``kappa=0`` is the cubature filter.
+
+    Args:
+        dim: S.
+        alpha: spread of the points.
+        beta: extra weight of the central point in the covariance.
+        kappa: secondary spread.
+        dtype: of the weights.
+        device: of the weights.
+
+    Raises:
+        ValueError: if c is not positive.
+
+    Examples:
+        >>> unscented_weights(2, kappa=1.0).mean
+        tensor([0.3333, 0.1667, 0.1667, 0.1667, 0.1667])
+    """
+    spread = _spread(dim, alpha, kappa)
+    mean = torch.full((2 * dim + 1,), 0.5 / spread, dtype=dtype, device=device)
+    cov = mean.clone()
+    mean[0] = (spread - dim) / spread
+    cov[0] = (spread - dim) / spread + 1 - alpha**2 + beta
+    return UnscentedWeights(mean, cov)
+
+
+def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float = 0.5) -> Tensor:
+    r"""The mean, and :math:`m \pm \sqrt{c}` times the columns of a root of P (Särkkä 2013, eq. 5.74).
+
+    The covariance may be singular: dimensions without variance stay where they are, exactly, and fully correlated
+    ones are told apart by 10 S times the machine precision of their correlation. Variances are kept to rounding.
+    Gradients are finite; a dimension without any variance passes none on to its row of ``cov``.
+
+    Args:
+        mean: m, ``[*B, S]``.
+        cov: P, symmetric, positive semi-definite, ``[*B, S, S]``.
+        alpha: see :func:`unscented_weights`.
+        kappa: likewise.
+
+    Returns:
+        The points, ``[*B, 2 S + 1, S]``, the mean first; NaN where P has a clearly negative eigenvalue.
+
+    Raises:
+        ValueError: if shapes do not fit, or c is not positive.
+
+    Examples:
+        >>> sigma_points(torch.zeros(1), 4 * torch.eye(1), kappa=0.0).flatten()
+        tensor([ 0.,  2., -2.])
+    """
+    _check_moments(mean, cov)
+    columns = math.sqrt(_spread(mean.shape[-1], alpha, kappa)) * _root(cov).mT
+    center = mean.unsqueeze(-2)
+    return torch.cat([center, center + columns, center - columns], -2)
+
+
+def unscented_moments(
+    points: Tensor, weights: UnscentedWeights, *, angles: Sequence[int] = ()
+) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of sigma points after a function (Särkkä 2013, eq. 5.75).
+
+    Args:
+        points: ``[*B, 2 S + 1, N]``.
+        weights: see :func:`unscented_weights`.
+        angles: components that are angles in radians: they are averaged on the side of the central point.
+
+    Returns:
+        The mean ``[*B, N]`` and the covariance ``[*B, N, N]``.
+
+    Raises:
+        ValueError: if there are not as many points as weights.
+
+    Examples:
+        >>> points = sigma_points(torch.zeros(1), torch.eye(1))
+        >>> mean, cov = unscented_moments(points**2, unscented_weights(1, kappa=0.5))
+        >>> mean.round(decimals=4)  # E x^2
+        tensor([1.])
+    """
+    mean, deviations = _deviations(points, weights, angles)
+    return mean, _weighted_gram(deviations, weights.cov, deviations)
+
+
+def unscented_update(
+    points: Tensor,
+    predicted: Tensor,
+    observation: Tensor,
+    noise: Tensor,
+    weights: UnscentedWeights,
+    *,
+    observed: Tensor | None = None,
+    angles: Sequence[int] = (),
+) -> GaussianUpdate:
+    r"""Condition a Gaussian on an observation, by its sigma points (Särkkä 2013, eqs. 5.86 and 5.87).
+
+    The covariance is :math:`\sum_i w_i (\delta x_i - K \delta y_i)(\cdot)^T + K R K^T`, Joseph's form in points: where
+    no weight is negative, round-off leaves it positive.
+
+    Args:
+        points: sigma points of the prior, ``[*B, 2 S + 1, S]``.
+        predicted: what each of them would observe, ``[*B, 2 S + 1, O]``.
+        observation: y, ``[*B, O]``.
+        noise: R, variances ``[*B, O]`` or covariances ``[*B, O, O]``.
+        weights: see :func:`unscented_weights`.
+        observed: mask ``[*B, 1]`` or ``[*B, O]``, see :func:`torch_denkf.functional.kalman_update`.
+        angles: components of the observation that are angles in radians.
+
+    Returns:
+        A :class:`torch_denkf.functional.GaussianUpdate`.
+
+    Raises:
+        ValueError: if shapes do not fit.
+
+    Examples:
+        >>> points = sigma_points(torch.zeros(1), torch.eye(1))
+        >>> one = torch.ones(1)
+        >>> update = unscented_update(points, points, 2 * one, one, unscented_weights(1))
+        >>> update.mean, update.cov
+        (tensor([1.0000]), tensor([[0.5000]]))
+    """
+    expected, deviations = _deviations(predicted, weights, angles)
+    check_ensemble("points", points)
+    batch, dim = expected.shape[:-1], expected.shape[-1]
+    check_shape("points", points, (*batch, len(weights.mean), points.shape[-1]), "[*B, 2 S + 1, S]")
+    check_shape("observation", observation, (*batch, dim), "[*B, O]")
+    if noise.ndim == expected.ndim:
+        check_shape("noise", noise, (*batch, dim), "variances [*B, O]")
+        noise = noise.diag_embed()
+    else:
+        check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
+    innovation, count = wrap_angles(observation - expected, angles), dim
+    if observed is not None:
+        width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
+        check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
+        observed = observed.expand(observation.shape)
+        identity = torch.eye(dim, dtype=points.dtype, device=points.device)
+        innovation = torch.where(observed, innovation, 0)
+        deviations = torch.where(observed.unsqueeze(-2), deviations, 0)
+        noise = torch.where(observed.unsqueeze(-1) & observed.unsqueeze(-2), noise, identity)
+        count = observed.sum(-1, keepdim=True, dtype=points.dtype)
+    mean = points[..., 0, :]
+    anomalies = points - mean.unsqueeze(-2)
+    factor = cholesky(_weighted_gram(deviations, weights.cov, deviations) + noise)
+    cross = deviations.mT @ (weights.cov.unsqueeze(-1) * anomalies)
+    gain = torch.cholesky_solve(cross, factor).mT
+    nis, log_det = _whiten(innovation, factor)
+    remaining = anomalies - deviations @ gain.mT
+    cov = _weighted_gram(remaining, weights.cov, remaining) + gain @ noise @ gain.mT
+    mean = mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1)
+    log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
+    return GaussianUpdate(mean, (cov + cov.mT) / 2, innovation, nis, log_likelihood)
+
+
+def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
+    """Wraps some components of differences to [-pi, pi).
+
+    Args:
+        difference: ``[*, N]``.
+        angles: the components that are angles in radians.
+
+    Returns:
+        ``[*, N]``.
+
+    Examples:
+        >>> wrap_angles(torch.tensor([6.0, 6.0]), [1])
+        tensor([ 6.0000, -0.2832])
+    """
+    if not angles:
+        return difference
+    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+    is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
+    is_angle[list(angles)] = True
+    return torch.where(is_angle, wrapped, difference)
+
+
+def _spread(dim: int, alpha: float, kappa: float) -> float:
+    spread = alpha**2 * (dim + kappa)
+    if not spread > 0:
+        raise ValueError(
+            f"sigma points need alpha^2 (S + kappa) > 0; got alpha={alpha}, kappa={kappa} and S={dim}. Use kappa >= 0."
+        )
+    return spread
+
+
+def _root(cov: Tensor) -> Tensor:
+    """A root A of ``cov``, A Aᵀ = P: the Cholesky factor of the correlations, with the standard deviations put back.
+
+    The correlations' ridge is relative, so that metres and milliradians are treated alike, and as large as round-off
+    makes the eigenvalues of a Gram matrix negative. The scaling is a constant to the gradient: any scaling gives a
+    root of the same matrix.
+    """
+    dim = cov.shape[-1]
+    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
+    inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
+    ridge = 10 * dim * torch.finfo(cov.dtype).eps
+    diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
+    correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
+    return std.unsqueeze(-1) * cholesky(correlation)
+
+
+def _deviations(points: Tensor, weights: UnscentedWeights, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Weighted mean ``[*B, N]`` and deviations from it ``[*B, 2 S + 1, N]``; differences first, for the digits."""
+    check_ensemble("points", points)
+    if points.shape[-2] != len(weights.mean):
+        raise ValueError(
+            f"there are {points.shape[-2]} points in shape {list(points.shape)} and {len(weights.mean)} weights; "
+            "points are [*B, 2 S + 1, N], and the weights are those of S dimensions"
+        )
+    center = points[..., :1, :]
+    deviations = wrap_angles(points - center, angles)
+    shift = weights.mean @ deviations
+    return center.squeeze(-2) + shift, deviations - shift.unsqueeze(-2)
+
+
+def _weighted_gram(left: Tensor, weights: Tensor, right: Tensor) -> Tensor:
+    gram = left.mT @ (weights.unsqueeze(-1) * right)
+    return (gram + gram.mT) / 2

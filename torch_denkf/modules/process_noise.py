@@ -1,0 +1,216 @@
+r"""Noise with a full covariance: Q of a transition, or R of a sensor, through a Cholesky head.
+
+A filter with a covariance adds to its forecast what a *process noise* module writes under ``("forecast", "noise")``:
+variances ``[*B, S]`` (:class:`~torch_denkf.modules.ConstantNoise` or :class:`~torch_denkf.modules.DiagonalNoise` with
+``in_key=("belief", "mean"), out_key=("forecast", "noise")``) or a covariance ``[*B, S, S]`` (the modules of this file).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torch.nn import functional as F
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.stochastic import StochasticMLP
+
+__all__ = ["CholeskyNoise", "MappedNoise", "UnicycleNoise"]
+
+_BELIEF_MEAN, _FORECAST_NOISE = ("belief", "mean"), ("forecast", "noise")
+
+
+class CholeskyNoise(SubModel):
+    r"""A learned covariance, constant or read off an entry: :math:`D L L^T D + C`, ``diag(r^2)`` before training.
+
+    :math:`D^2 = r^2 - c` and :math:`C` are diagonal, with the floor c; :math:`L` is lower triangular with a positive
+    diagonal, the identity before training.
+
+    Args:
+        dim: N, the size of the covariance.
+        r: standard deviation before training, a number or one for each dimension, in the units of the state (or of
+            the observation).
+        constant: the same covariance everywhere (then ``in_key`` gives its dtype alone), or one that depends on it.
+        floor: smallest variance c; 1 % of :math:`r^2` by default.
+        num_cells: hidden layers of the network, if not ``constant``.
+        in_features: size of the input; N by default.
+        loc: mean of the input ``[in_features]``; zero by default.
+        scale: standard deviation of the input ``[in_features]``; one by default. An infinite one hides that feature
+            from the network: the position of a vehicle, say.
+        in_key: ``[*B, in_features]``, or learned observations ``[*B, E, in_features]``, whose mean is used.
+        out_key: covariance ``[*B, N, N]``; ``("sensor", "noise")`` for R.
+
+    Raises:
+        ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
+
+    Reference:
+        Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,
+        arXiv:1605.07148, section 4, for R.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = CholeskyNoise(2, r=[0.1, 1.0])
+        >>> noise(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"]
+        tensor([[0.0100, 0.0000],
+                [0.0000, 1.0000]], grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        *,
+        r: float | Sequence[float] | torch.Tensor = 0.1,
+        constant: bool = True,
+        floor: float | Sequence[float] | torch.Tensor | None = None,
+        num_cells: Sequence[int] = (16, 16),
+        in_features: int | None = None,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        in_key: NestedKey = _BELIEF_MEAN,
+        out_key: NestedKey = _FORECAST_NOISE,
+    ):
+        in_features, size = dim if in_features is None else in_features, dim * (dim + 1) // 2
+        network = (
+            nn.Identity() if constant else StochasticMLP(in_features, size, num_cells, layer="none", output_gain=0.0)
+        )
+        super().__init__(network, [in_key], [out_key])
+        dtype = torch.get_default_dtype()
+        variance = torch.as_tensor(r, dtype=dtype).expand(dim) ** 2
+        floor = 0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(dim)
+        if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
+            raise ValueError(
+                f"CholeskyNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
+                f"floor = {floor.tolist()}."
+            )
+        self.dim, self.constant = dim, constant
+        if constant:
+            self.raw = nn.Parameter(torch.zeros(size, dtype=dtype))
+        self.register_buffer("std", (variance - floor).sqrt())
+        self.register_buffer("floor", floor.clone())
+        self.register_buffer("loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype))
+        self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
+        self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the covariance."""
+        features = self.read(tensordict, self.in_keys[0])
+        if self.constant:
+            dtype = features.dtype if features.is_floating_point() else self.raw.dtype
+            raw = self.raw.to(dtype).expand(*tensordict.batch_size, -1)
+        else:
+            features = features.mean(-2) if features.ndim > tensordict.ndim + 1 else features
+            raw = self.module((features - self.loc) / self.scale)
+        row, column = self.rows
+        # softplus grows like its input, so that a large output of a network does not blow the covariance up.
+        positive = F.softplus(raw + 0.5413248546129181)  # log(e - 1): softplus of it is 1
+        entries = torch.where(row == column, positive, raw) * self.std.to(raw.dtype)[row]
+        factor = raw.new_zeros(*raw.shape[:-1], self.dim**2).index_copy(-1, row * self.dim + column, entries)
+        factor = factor.unflatten(-1, (self.dim, self.dim))
+        return tensordict.set(self.out_keys[0], factor @ factor.mT + self.floor.to(raw.dtype).diag_embed())
+
+
+class _MappedNoise(SubModel):
+    """Runs another noise module and writes G Q G^T in its place, in the same entry."""
+
+    def __init__(self, noise: TensorDictModuleBase, in_keys: Sequence[NestedKey]):
+        out_key = unravel_key(noise.out_keys[0])
+        super().__init__(noise, dict.fromkeys([*map(unravel_key, noise.in_keys), *in_keys]), [out_key])
+
+    def _write(self, tensordict: TensorDictBase, matrix: torch.Tensor) -> TensorDictBase:
+        noise = self.read(self.module(tensordict.copy()), self.out_keys[0])
+        variances = noise.ndim == tensordict.ndim + 1
+        matrix = matrix.to(noise.dtype)
+        if noise.shape[-1] != matrix.shape[-1]:
+            raise ValueError(
+                f"{type(self).__name__} maps noise of {matrix.shape[-1]} dimensions to {matrix.shape[-2]}; "
+                f"{type(self.module).__name__} writes {list(noise.shape)}."
+            )
+        scaled = matrix * noise.unsqueeze(-2) if variances else matrix @ noise
+        return tensordict.set(self.out_keys[0], scaled @ matrix.mT)
+
+
+class MappedNoise(_MappedNoise):
+    r"""Noise that enters through a known matrix: :math:`G Q G^T`, e.g. some dimensions of the state alone.
+
+    Args:
+        noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]``; its keys are kept.
+        matrix: G, ``[S, N]``; columns of the identity say which dimensions are noisy.
+
+    Raises:
+        ValueError: if the noise does not have N dimensions.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> second = MappedNoise(CholeskyNoise(1, r=2.0, in_features=2), torch.eye(2)[:, 1:])
+        >>> second(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"]
+        tensor([[0., 0.],
+                [0., 4.]], grad_fn=...)
+    """
+
+    def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
+        super().__init__(noise, [])
+        self.register_buffer("matrix", torch.as_tensor(matrix, dtype=torch.get_default_dtype()))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the covariance."""
+        return self._write(tensordict, self.matrix)
+
+
+class UnicycleNoise(_MappedNoise):
+    r"""Noise of the velocities of a vehicle, which moves its pose in the same step.
+
+    :class:`~torch_denkf.modules.UnicycleTransition` moves the pose with the *new* velocities, and an ensemble's noise
+    is in those. A covariance that is added to the velocities *after* the motion would leave the pose of that step
+    uncorrelated with them, and an innovation of the velocities would not correct it. Here
+    :math:`Q = G Q_v G^T` with :math:`G = \partial (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
+
+    Args:
+        noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and
+            (rad/s)^2; its keys are kept. In a filter it may read ``("belief", "mean")``.
+        dt: time step in seconds.
+        belief_key: mean at t-1, ``[*B, S]``, starting with [x, y, theta, v, theta_dot]; further dimensions, such as
+            clones, get no noise.
+        forecast_key: mean of the forecast, ``[*B, S]``; the filter puts it there.
+
+    Raises:
+        ValueError: if the noise does not have two dimensions.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = UnicycleNoise(CholeskyNoise(2, r=[0.5, 0.1], in_features=5), dt=0.1)
+        >>> mean = torch.tensor([0.0, 0.0, 0.0, 10.0, 0.0])
+        >>> td = TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}})
+        >>> noise(td)["forecast", "noise"][0, 3]  # covariance of x and v: dt times the variance of v
+        tensor(0.0250, grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        noise: TensorDictModuleBase,
+        dt: float,
+        *,
+        belief_key: NestedKey = _BELIEF_MEAN,
+        forecast_key: NestedKey = ("forecast", "mean"),
+    ):
+        super().__init__(noise, [belief_key, forecast_key])
+        self.belief_key, self.forecast_key, self.dt = belief_key, forecast_key, dt
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the covariance."""
+        heading = self.read(tensordict, self.belief_key)[..., 2]
+        forecast = self.read(tensordict, self.forecast_key)
+        speed, dt = forecast[..., 3], self.dt
+        heading = heading + 0.5 * dt * forecast[..., 4]
+        cos, sin, zero = heading.cos(), heading.sin(), torch.zeros_like(heading)
+        rows = [
+            torch.stack([dt * cos, -0.5 * dt**2 * speed * sin], -1),
+            torch.stack([dt * sin, 0.5 * dt**2 * speed * cos], -1),
+            torch.stack([zero, zero + dt], -1),
+            torch.stack([zero + 1, zero], -1),
+            torch.stack([zero, zero + 1], -1),
+        ]
+        pad = forecast.shape[-1] - len(rows)
+        return self._write(tensordict, F.pad(torch.stack(rows, -2), (0, 0, 0, pad)))

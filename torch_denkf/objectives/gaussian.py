@@ -1,0 +1,190 @@
+"""The training objective of filters with a mean and a covariance, on sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+
+from torch_denkf.filters import Filter
+from torch_denkf.functional import crps_ensemble, crps_gaussian, gaussian_log_prob
+from torch_denkf.objectives._sequence import SequenceLoss
+
+__all__ = ["GaussianLoss"]
+
+
+class GaussianLoss(SequenceLoss):
+    r"""Scores a filter with a mean and a covariance on sequences ``[*B, T]`` against the true states.
+
+    The counterpart of :class:`~torch_denkf.objectives.DEnKFLoss`, whose fair CRPS estimates from members what is a
+    closed form here; filters trained with the two have the same objective.
+
+    ========================  =====================================================================================
+    ``loss_state``            score of the belief against the true state
+    ``loss_transition``       score of the forecast against the true state
+    ``loss_sensor``           fair CRPS of the sensor's samples against the true observation; squared error of their
+                              mean with ``score="mse"``, where there is one sample, or where it writes one reading
+    ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
+    ========================  =====================================================================================
+
+    Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Only
+    elements that were stepped to count for state, transition and nll. The sensor counts where it observed.
+
+    Args:
+        filter: the filter to train, e.g. :class:`~torch_denkf.filters.EKF`.
+        score: of the Gaussian: ``"crps"`` in each dimension, averaged; ``"nll"``, the negative log-density of all
+            dimensions together, in nats; ``"mse"`` of the mean.
+        state: weight of ``loss_state``.
+        transition: weight of ``loss_transition``.
+        sensor: weight of ``loss_sensor``.
+        nll: weight of ``loss_nll``.
+        dims: state dimensions that count; all of the truth's by default. The belief may have more dimensions than the
+            truth, which must then come first.
+        state_scale: ``[len(dims)]``, or ``[S]`` without ``dims``: errors of the state are divided by it. A dimension
+            with infinite scale does not count.
+        observation_scale: ``[O]``, likewise, for the sensor.
+        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        detach_every: truncated back-propagation: steps after which the belief is detached.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+
+    Raises:
+        ValueError: on an unknown score, or a scale of another length than ``dims``.
+        KeyError: if an entry that a term needs is missing.
+
+    Reference:
+        Gneiting, Raftery, Westveld, Goldman, "Calibrated probabilistic forecasting using ensemble model output
+        statistics and minimum CRPS estimation", Mon. Weather Rev. 133, 2005, for the CRPS of a Gaussian.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> loss = GaussianLoss(KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one), sensor=0.0)
+        >>> loss(TensorDict({"observation": torch.zeros(8, 1), "state": torch.zeros(8, 1)}, [8]))["loss_state"]
+        tensor(0.1849)
+    """
+
+    @dataclass
+    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
+        """The entries that the loss reads.
+
+        Attributes:
+            state: true state ``[*B, T, S]``.
+            target_observation: true observation ``[*B, T, O]``; where it is missing and the filter's observation
+                model has no parameters, it is that model's observation of the true state.
+            observed: mask ``[*B, T, 1]`` or ``[*B, T, O]``.
+            belief: prefix of ``mean`` and ``cov`` of the belief.
+            forecast: prefix of ``mean`` and ``cov`` of the forecast.
+            sensor: the sensor's samples ``[*B, T, E, O]`` or readings ``[*B, T, O]``.
+            log_likelihood: of the innovation.
+        """
+
+        target_observation: NestedKey = "target_observation"
+        belief: str = "belief"
+        forecast: str = "forecast"
+        sensor: NestedKey = ("sensor", "ensemble")
+
+    default_keys = _AcceptedKeys
+    SUPERVISED = ("state", "transition", "sensor")
+    TERMS = ("state", "transition", "sensor", "nll")
+
+    def __init__(
+        self,
+        filter: Filter,
+        *,
+        score: Literal["crps", "nll", "mse"] = "crps",
+        state: float = 1.0,
+        transition: float = 1.0,
+        sensor: float = 1.0,
+        nll: float = 0.0,
+        dims: Sequence[int] | None = None,
+        state_scale: Sequence[float] | torch.Tensor | None = None,
+        observation_scale: Sequence[float] | torch.Tensor | None = None,
+        angles: Sequence[int] = (),
+        detach_every: int | None = None,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ):
+        if score not in ("crps", "nll", "mse"):
+            raise ValueError(f'score is "crps", "nll" or "mse"; got {score!r}.')
+        if dims is not None and state_scale is not None and len(state_scale) != len(dims):
+            raise ValueError(f"state_scale has one entry for each of dims={list(dims)}; got {len(state_scale)}.")
+        if dims is not None:
+            # As everything else, angles are counted in the state; errors are of the chosen dimensions alone.
+            angles = [position for position, dim in enumerate(dims) if dim in angles]
+        super().__init__(
+            filter,
+            dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True)),
+            state_scale=state_scale,
+            angles=angles,
+            detach_every=detach_every,
+            reduction=reduction,
+        )
+        self.score = score
+        self.register_scale("observation_scale", observation_scale)
+        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
+        # Chosen here, once: a boolean index in forward would wait for the device.
+        counting = None if self.state_scale is None else self.state_scale.isfinite().nonzero().flatten()
+        self.register_buffer("counting", counting, persistent=False)
+
+    # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
+
+    def _state(self, tensordict, out):
+        return self._score(out, self.tensor_keys.belief, self._true_state(tensordict)), None
+
+    def _transition(self, tensordict, out):
+        return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
+
+    def _sensor(self, tensordict, out):
+        observed = tensordict.get(self.tensor_keys.observed, None)
+        samples, target = self._entry(out, self.tensor_keys.sensor), self._true_observation(tensordict)
+        if samples.ndim == target.ndim:
+            samples = samples.unsqueeze(-2)
+        errors = samples - target.unsqueeze(-2)
+        errors = errors if self.observation_scale is None else errors / self.observation_scale
+        mask = torch.ones_like(target[..., 0], dtype=torch.bool) if observed is None else observed.all(-1)
+        if self.score == "mse" or samples.shape[-2] == 1:
+            return errors.mean(-2).square().mean(-1), mask
+        return crps_ensemble(errors, torch.zeros_like(errors[..., 0, :])).mean(-1), mask
+
+    # ------------------------------------------------------------------------------------------------------ helpers
+
+    def _score(self, out: TensorDictBase, prefix: str, target: torch.Tensor) -> torch.Tensor:
+        size = target.shape[-1]
+        mean = self._entry(out, (prefix, "mean"))[..., :size]
+        cov = self._entry(out, (prefix, "cov"))[..., :size, :size]
+        if self.dims is not None:
+            mean, target = mean.index_select(-1, self.dims), target.index_select(-1, self.dims)
+            cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
+        errors = self._state_error(mean, target)
+        if self.counting is not None:
+            errors = errors.index_select(-1, self.counting)
+            scale = self.state_scale[self.counting]
+            cov = cov.index_select(-1, self.counting).index_select(-2, self.counting)
+            cov = cov / scale.unsqueeze(-1) / scale
+        if self.score == "mse":
+            return errors.square().mean(-1)
+        zero = torch.zeros_like(errors)
+        if self.score == "nll":
+            nats = -gaussian_log_prob(errors, zero, cov)
+            # The density of the state in its own units, so that the scale only conditions the arithmetic.
+            return nats if self.counting is None else nats + scale.log().sum()
+        # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
+        variance = cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
+        return crps_gaussian(zero, variance, errors).mean(-1)
+
+    def _true_observation(self, tensordict: TensorDictBase) -> torch.Tensor:
+        key = self.tensor_keys.target_observation
+        target = tensordict.get(key, None)
+        if target is not None:
+            return target
+        models = [part for part in self.filter.module.modules() if hasattr(part, "observe")]
+        if not models or any(True for _ in models[0].parameters()):
+            raise KeyError(
+                f"loss_sensor needs the true observation in {key!r}, because the filter has no known observation "
+                "model with an observe() method. Add the entry, rename it with set_keys(target_observation=...), or "
+                "set the weight sensor=0."
+            )
+        return models[0].observe(self._true_state(tensordict))
