@@ -234,8 +234,6 @@ def test_gradient_of_transport():
     particles, log_weights = (value.requires_grad_() for value in problem((2,), size=4))
 
     def moved(x, w):
-        # The scale takes no gradient; that of particles with a standard deviation of one is constant.
-        x = x / ensemble_var(x).sqrt().unsqueeze(-2)
         return transport_resample(x, w.log_softmax(-1), epsilon=0.3, iterations=10)[0]
 
     assert torch.autograd.gradcheck(moved, (particles, log_weights))

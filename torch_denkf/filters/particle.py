@@ -195,7 +195,7 @@ class PFM(ParticleFilter):
         ValueError: if neither ``noise`` nor ``learned_likelihood`` is given.
 
     Reference:
-        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 4.
+        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313.
 
     Example:
         >>> import torch

@@ -37,7 +37,7 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
     """Hard resampling, through which no gradient flows, neither to the weights nor to the particles.
 
     As in the first differentiable particle filter, whose gradient ends at the step (Jonschkowski et al. 2018,
-    arXiv:1805.11122, section IV-D).
+    arXiv:1805.11122).
 
     Args:
         particles: X, ``[*B, E, S]``.
@@ -68,7 +68,7 @@ def soft_resample(
 
     Particles are picked with probability :math:`q^i = (1 - \alpha) w^i + \alpha / E` and get the importance weight
     :math:`w^i / q^i`, normalised, a differentiable function of :math:`w^i` (Karkus, Hsu & Lee 2018, "Particle filter
-    networks", arXiv:1805.08975, eq. 5; their :math:`\alpha` is ours from 1).
+    networks", arXiv:1805.08975; their :math:`\alpha` is one minus ours).
 
     Args:
         particles: X, ``[*B, E, S]``.

@@ -23,15 +23,15 @@ def transport_resample(
         P = \arg\min \sum_{ij} P_{ij} C_{ij} + \epsilon\, \mathrm{KL}(P \,\|\, 1/E \otimes w)
 
     with rows of P summing to 1/E and columns to :math:`w^j` (Corenflos, Thornton, Deligiannidis & Doucet 2021,
-    "Differentiable particle filtering via entropy-regularized optimal transport", arXiv:2102.07850, eqs. 8 to 12).
+    "Differentiable particle filtering via entropy-regularized optimal transport", arXiv:2102.07850).
     There is no randomness in it, and it is differentiable in particles and weights, through Sinkhorn's iterations in
     the log domain with a regularisation that comes down to :math:`\epsilon` (Schmitzer 2019, "Stabilized sparse
     scaling algorithms for entropy regularized transport problems"). The backward pass keeps a few matrices
     ``[*B, E, E]`` for each of them.
 
     The cost is :math:`C_{ij} = \|(x^i - x^j) / \sigma\|^2 / 2` with the particles' own standard deviation
-    :math:`\sigma` of each dimension, so that units do not matter; no gradient flows through :math:`\sigma`, which only
-    sets how much is regularised. The weighted mean is kept to rounding, also where the iterations have not converged.
+    :math:`\sigma` of each dimension, so that units do not matter. The weighted mean is kept to rounding, also where the
+    iterations have not converged.
     The spread shrinks: the standard deviation of a Gaussian in independent dimensions, between particles that are k
     times as wide as their weighted distribution, to a share :math:`\sqrt{1 + c^2} - c`, :math:`c = k \epsilon / 2`, of
     itself (0.95 for :math:`\epsilon = 0.05` and k = 2). It is a bias that more particles do not remove.
@@ -61,10 +61,9 @@ def transport_resample(
     size = particles.shape[-2]
     mean = weighted_mean(particles, log_weights).unsqueeze(-2)
     anomalies = particles - mean
-    with torch.no_grad():
-        # Not the weighted one: where a single particle has all the weight, it would be zero, and Sinkhorn would stall.
-        variance = particles.var(-2, keepdim=True)
-        scale = torch.where(variance > 0, variance, 1).sqrt() * math.sqrt(2)
+    # Not the weighted one: where a single particle has all the weight, it would be zero, and Sinkhorn would stall.
+    variance = particles.var(-2, keepdim=True)
+    scale = torch.where(variance > 0, 2 * variance, 1).sqrt()
     scaled = anomalies / scale
     # ||a - b||^2 from its three parts: no [E, E, S] tensor.
     square = scaled.square().sum(-1)

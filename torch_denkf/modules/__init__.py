@@ -10,10 +10,11 @@ from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
+from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
-from torch_denkf.modules.particles import NoisyTransition, ParticleAnalysis, ResampledTransition, WithWeights
+from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic

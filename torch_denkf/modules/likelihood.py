@@ -110,8 +110,8 @@ class LearnedLikelihood(SubModel):
         KeyError: if an entry is missing.
 
     Reference:
-        Jonschkowski, Rastogi & Brock, "Differentiable particle filters", 2018, arXiv:1805.11122, section IV-C;
-        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 4. There the
+        Jonschkowski, Rastogi & Brock, "Differentiable particle filters", 2018, arXiv:1805.11122;
+        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313. There the
         particle's state goes into the network; its predicted observation is all of it that a reading can tell.
 
     Example:
