@@ -26,8 +26,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))  # the parts of this example, wherever it is started from
 
-from kitti_study.filters import FILTERS
 from kitti_study.fold import Part, with_disturbances
+from kitti_study.recipes import FILTERS
 from kitti_study.sensors import SENSORS
 from kitti_study.streams import find_streams, prepare, spans
 from kitti_study.study import Study, describe, evaluate_and_draw, make_jobs, prepare_jobs, read_rows, run_jobs

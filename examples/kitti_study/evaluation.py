@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from kitti_study.filters import REACH, Recipe
 from kitti_study.fold import VELOCITIES, Part
 from kitti_study.readings import all_frames, lose_frames, read_spans
+from kitti_study.recipes import REACH, Recipe
 from kitti_study.streams import CONDITIONS, DISTURBANCES, Stream
 from kitti_study.training import run_filter
 from torch_denkf.filters import Filter

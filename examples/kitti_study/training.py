@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from kitti_study.filters import FILTERS, Recipe
 from kitti_study.fold import VELOCITIES, Fold, FrameSampler, Statistics
 from kitti_study.readings import ReadingSampler, all_frames, lose_frames, read_spans
+from kitti_study.recipes import FILTERS, Recipe
 from kitti_study.sensors import SENSORS, SensorLoss, SensorOfFold
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian
@@ -28,7 +28,7 @@ INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4)
 class Budget:
     """Updates of each stage; steps of the filter's windows."""
 
-    sensor: int = 1500
+    sensor: int = 3000
     fine_tuning: int = 300  # of a sensor that comes trained on rendered drives
     filter: int = 300
     end_to_end: int = 40

@@ -11,9 +11,9 @@ from tensordict import TensorDict
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
-from kitti_study.filters import FILTERS
 from kitti_study.fold import Fold, Part, Statistics, with_disturbances
 from kitti_study.readings import ReadingSampler, all_frames, lose_frames, take_spans
+from kitti_study.recipes import FILTERS
 from kitti_study.sensors import SENSORS
 from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from kitti_study.study import make_fold, read_rows

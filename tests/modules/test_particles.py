@@ -365,3 +365,16 @@ def test_missing_entries_name_themselves(key):
     td = TensorDict({"forecast": belief()["belief"].set("log_likelihood", torch.zeros(E))})
     with pytest.raises(KeyError, match=f"ParticleAnalysis reads .*{key[1]}"):
         ParticleAnalysis()(td.exclude(key))
+
+
+def test_a_tempered_likelihood_is_that_of_more_noise(float64):
+    # N(y; h, R)^(1/4) is proportional to N(y; h, 4R).
+    particles, predicted = torch.randn(3, 50, 2), torch.randn(3, 50, 2)
+    td = TensorDict({"forecast": {"ensemble": particles, "observation": predicted}, "y": torch.randn(3, 2)}, [3])
+    td["forecast", "log_weight"] = torch.randn(3, 50).log_softmax(-1)
+    weights = []
+    for variance, tempering in ((0.5, 0.25), (2.0, 1.0)):
+        td["sensor", "noise"] = torch.full((3, 2), variance)
+        out = ParticleAnalysis(tempering=tempering)(GaussianLikelihood(sensor_key="y")(td.copy()))
+        weights.append(out["belief", "log_weight"])
+    torch.testing.assert_close(*weights, rtol=0, atol=1e-12)

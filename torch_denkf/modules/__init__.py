@@ -6,6 +6,7 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.calibration import MemberGain
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
@@ -42,6 +43,7 @@ __all__ = [
     "ImageSensor",
     "VectorSensor",
     "FlowSensor",
+    "MemberGain",
     "convolutional_trunk",
     "GaussianPrior",
     "AroundState",

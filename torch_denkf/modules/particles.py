@@ -181,6 +181,7 @@ class ParticleAnalysis(SubModel):
     errors. Where nothing is observed the weights stay, exactly.
 
     Args:
+        tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
         log_likelihood_key: :math:`\log p(y | x^i)`, ``[*B, E]``, see :mod:`torch_denkf.modules.likelihood`.
@@ -206,6 +207,7 @@ class ParticleAnalysis(SubModel):
     def __init__(
         self,
         *,
+        tempering: float = 1.0,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         log_weight_key: NestedKey = ("forecast", "log_weight"),
         log_likelihood_key: NestedKey = ("forecast", "log_likelihood"),
@@ -218,11 +220,12 @@ class ParticleAnalysis(SubModel):
             [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
             + [(info_key, name) for name in ("ess", "log_likelihood")],
         )
+        self.tempering = tempering
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""
         particles, prior, log_likelihood = (self.read(tensordict, key) for key in self.in_keys)
-        joint = prior + log_likelihood
+        joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
         # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
         seen = (log_likelihood != 0).any(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Filters by name. One of your own: a :class:`Recipe` with ``@register`` in a file of this folder's ``recipes``."""
+"""How to compose, train and tune a filter; the registry."""
 
 from __future__ import annotations
 
@@ -6,30 +6,22 @@ from collections import OrderedDict
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from kitti_study.fold import VELOCITIES, Statistics
-from kitti_study.sensors import SAMPLES
-from kitti_study.streams import LONGEST
 from torch_denkf.filters import Filter
 from torch_denkf.modules import (
-    AroundState,
     DiagonalNoise,
-    EnsembleAnalysis,
     FlowSensor,
-    LearnedObservation,
-    PairObservation,
     StochasticMLP,
     SubModel,
-    UnicycleMotion,
     UnicycleTransition,
-    WithHistory,
 )
-from torch_denkf.objectives import DEnKFLoss
 
 REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
+CALIBRATED = ("sensor", "calibrated")
 FILTERS: dict[str, type[Recipe]] = {}
 
 
@@ -109,35 +101,3 @@ class SensorCurve(nn.Module):
         """Predicts (v, theta_dot) ``[*, 2]``."""
         v, theta_dot = state[..., VELOCITIES].split(1, -1)
         return torch.cat([v + self.scale * self.correction((v - self.loc) / self.scale), theta_dot], -1)
-
-
-@register
-class DEnKF(Recipe):
-    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
-
-    def modules(self):
-        # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
-        if self.pairs:
-            observation = PairObservation([REACH / self.facts.dt, torch.inf])
-            keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
-        else:
-            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
-            keys = {}
-        motion = UnicycleMotion(self.facts.dt, history_key=("belief", "history") if self.pairs else None)
-        return OrderedDict(
-            noise=self.noise(),
-            # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
-            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
-            observation=observation,
-            analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
-        )
-
-    def initial(self, std, state_key):
-        around = AroundState(std, ensemble_size=SAMPLES, state_key=state_key)
-        return WithHistory(around, LONGEST - 1) if self.pairs else around
-
-    def loss(self, model):
-        return DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)
-
-    def set_inflation(self, model, factor):
-        next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor

@@ -1,0 +1,69 @@
+"""The differentiable ensemble Kalman filter."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from tensordict.nn import TensorDictSequential
+
+from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.sensors import SAMPLES
+from kitti_study.streams import LONGEST
+from torch_denkf.modules import (
+    AroundState,
+    EnsembleAnalysis,
+    LearnedObservation,
+    MemberGain,
+    PairObservation,
+    StochasticMLP,
+    UnicycleMotion,
+    WithHistory,
+)
+from torch_denkf.objectives import DEnKFLoss
+
+CALIBRATED = ("sensor", "calibrated")
+
+
+@register
+class DEnKF(Recipe):
+    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
+
+    def modules(self):
+        # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
+        if self.pairs:
+            observation = PairObservation([REACH / self.facts.dt, torch.inf])
+            keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
+        else:
+            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
+            keys = {}
+        motion = UnicycleMotion(self.facts.dt, history_key=("belief", "history") if self.pairs else None)
+        return OrderedDict(
+            noise=self.noise(),
+            # Most of the sensor's error stays for a whole drive.
+            gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, out_key=CALIBRATED),
+            # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
+            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
+            observation=observation,
+            analysis=TensorDictSequential(
+                EnsembleAnalysis("sensor", sensor_key=CALIBRATED, belief_key="analysis", **keys), motion
+            ),
+        )
+
+    def initial(self, std, state_key):
+        around = AroundState(std, ensemble_size=SAMPLES, state_key=state_key)
+        return WithHistory(around, LONGEST - 1) if self.pairs else around
+
+    def loss(self, model):
+        return DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)
+
+    def set_inflation(self, model, factor):
+        next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor
+
+
+@register
+class ADEnKF(DEnKF):
+    """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
+
+    def loss(self, model):
+        return DEnKFLoss(model, state=0.0, transition=0.0, sensor=0.0, nll=1.0, detach_every=8)

@@ -1,0 +1,83 @@
+"""The baselines that carry mean and covariance: dEKF, dUKF and Backprop-KF."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+
+from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.streams import LONGEST
+from torch_denkf.modules import (
+    CholeskyNoise,
+    ClonedPrior,
+    ClonedTransition,
+    DiagonalNoise,
+    EKFAnalysis,
+    EKFTransition,
+    GaussianAround,
+    LearnedObservation,
+    PairObservation,
+    SubModel,
+    UKFAnalysis,
+    UKFTransition,
+    UnicycleNoise,
+)
+from torch_denkf.objectives import GaussianLoss
+
+
+class _Gaussian(Recipe):
+    """Known motion of the pose; its correlation with the velocities carries the corrections."""
+
+    Transition, Analysis = EKFTransition, EKFAnalysis
+
+    def modules(self):
+        motion, keys = self.transition(torch.zeros_like), {}
+        if self.pairs:
+            motion, keys = ClonedTransition(motion), {"observed_key": ("forecast", "observed")}
+            observation = PairObservation([REACH / self.facts.dt, torch.inf], history_key=None)
+        else:
+            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
+        return OrderedDict(
+            noise=self.noise(),
+            transition=self.Transition(motion, UnicycleNoise(self.process_noise(), self.facts.dt)),
+            analysis=self.Analysis(observation, **keys),
+        )
+
+    def process_noise(self) -> SubModel:
+        """Q of (v, theta_dot), from their mean; the rest of the state must not count, so its scale is infinite."""
+        size = 5 + 2 * (LONGEST - 1) * self.pairs
+        loc, scale = torch.zeros(size), torch.full((size,), torch.inf)
+        loc[3:5], scale[3:5] = self.facts.loc, self.facts.scale
+        keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
+        return DiagonalNoise(2, r=self.facts.unit, in_features=size, loc=loc, scale=scale, **keys)
+
+    def initial(self, std, state_key):
+        around = GaussianAround(std, state_key=state_key)
+        return ClonedPrior(around, LONGEST - 1) if self.pairs else around
+
+    def loss(self, model):
+        return GaussianLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
+
+    def set_inflation(self, model, factor):
+        next(module for module in model.modules() if isinstance(module, self.Analysis)).inflation = factor
+
+
+@register
+class DEKF(_Gaussian):
+    """Differentiable extended Kalman filter (Kloss et al. 2021), Jacobians through the known motion."""
+
+
+@register
+class DUKF(_Gaussian):
+    """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
+
+    Transition, Analysis = UKFTransition, UKFAnalysis
+
+
+@register
+class BKF(_Gaussian):
+    """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant; the pose's motion is linearised."""
+
+    def process_noise(self):
+        return CholeskyNoise(2, r=self.facts.unit, in_key=("belief", "mean"), out_key=("forecast", "noise"))

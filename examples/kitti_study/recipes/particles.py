@@ -1,0 +1,123 @@
+"""The baselines that carry weighted particles: DPF, dPF-M and dPF-M-lrn."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import nn
+
+from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.streams import LONGEST
+from torch_denkf.modules import (
+    AroundState,
+    ClonedPrior,
+    ClonedTransition,
+    DiagonalNoise,
+    GaussianLikelihood,
+    LearnedLikelihood,
+    LearnedObservation,
+    NoisyTransition,
+    PairObservation,
+    ParticleAnalysis,
+    ResampledTransition,
+    SubModel,
+    WithWeights,
+)
+from torch_denkf.objectives import MixtureLoss
+
+PARTICLES = 100  # as both papers train with
+
+
+class Reading(SubModel):
+    """What a learned likelihood looks at: the sensor's encoding, and its reading, standardised."""
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor):
+        super().__init__(nn.Identity(), [("sensor", "ensemble"), ("sensor", "encoding")], [("sensor", "reading")])
+        self.register_buffer("loc", loc)
+        self.register_buffer("scale", scale)
+
+    def forward(self, tensordict):
+        """Writes ``("sensor", "reading")`` ``[*B, F + 2]``."""
+        samples, encoding = (self.read(tensordict, key) for key in self.in_keys)
+        reading = (samples.mean(-2) - self.loc) / self.scale
+        return tensordict.set(self.out_keys[0], torch.cat([encoding, reading], -1))
+
+
+class _Particles(Recipe):
+    """Particles move by the known motion with learned noise of their velocities."""
+
+    resampling, learned = "soft", None
+
+    def modules(self):
+        facts, keys = self.facts, {}
+        motion = NoisyTransition(
+            self.transition(torch.zeros_like),
+            # Of the mean velocities alone: an infinite scale hides the pose.
+            DiagonalNoise(
+                2,
+                r=facts.unit,
+                in_features=5,
+                loc=torch.cat([torch.zeros(3), facts.loc]),
+                scale=torch.cat([torch.full((3,), torch.inf), facts.scale]),
+                in_key=("belief", "mean"),
+                out_key=("forecast", "noise"),
+            ),
+            [3, 4],
+            before=True,
+            ensemble_size=PARTICLES,
+        )
+        if self.pairs:
+            motion, keys = ClonedTransition(motion), {"observed_key": ("forecast", "observed")}
+            observation = PairObservation([REACH / facts.dt, torch.inf], history_key=None)
+        else:
+            observation = LearnedObservation(SensorCurve(facts.loc, facts.scale))
+        modules = OrderedDict()
+        if self.learned:
+            modules["reading"] = Reading(facts.loc, facts.scale)
+            likelihood = LearnedLikelihood(
+                self.encoding + 2,
+                2,
+                bound=self.learned,
+                loc=facts.loc,
+                scale=facts.scale,
+                encoding_key=("sensor", "reading"),
+                **keys,
+            )
+        else:
+            modules["noise"] = self.noise()
+            likelihood = GaussianLikelihood(**keys)
+        modules["transition"] = ResampledTransition(motion, self.resampling)
+        modules["observation"] = observation
+        modules["likelihood"] = likelihood
+        modules["analysis"] = ParticleAnalysis()
+        return modules
+
+    def initial(self, std, state_key):
+        around = AroundState(std, ensemble_size=PARTICLES, state_key=state_key)
+        return WithWeights(ClonedPrior(around, LONGEST - 1) if self.pairs else around)
+
+    def loss(self, model):
+        return MixtureLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
+
+    def set_inflation(self, model, factor):
+        next(module for module in model.modules() if isinstance(module, ParticleAnalysis)).tempering = factor**-2
+
+
+@register
+class DPF(_Particles):
+    """Jonschkowski et al. 2018: learned likelihood, hard resampling in every step."""
+
+    resampling, learned, needs_training = "systematic", "scaled", True
+
+
+@register
+class DPF_M(_Particles):
+    """Kloss et al. 2021: Gaussian likelihood, soft resampling."""
+
+
+@register
+class DPF_M_LRN(_Particles):
+    """Kloss et al. 2021 with a learned likelihood."""
+
+    learned, needs_training = "clipped", True

@@ -1,0 +1,41 @@
+"""A sensor's lasting error. Oracle: quantiles of the normal distribution, and a filter over many steps."""
+
+import pytest
+import torch
+from scipy.stats import norm
+from tensordict import TensorDict
+
+from torch_denkf.modules import MemberGain
+
+
+def test_factors_are_lognormal_quantiles_that_stay_with_their_members(float64):
+    gain = MemberGain([0.1, 0.3], ensemble_size=50, in_key="y")
+    samples = torch.rand(7, 50, 2) + 1
+    out = gain(TensorDict({"y": samples}, [7]))["y"]
+    factor = (out / samples).log()
+    torch.testing.assert_close(factor, factor[:1].expand_as(factor), rtol=0, atol=1e-12)  # the same at all times
+    for dim, std in enumerate((0.1, 0.3)):
+        quantiles = torch.as_tensor(norm.ppf((torch.arange(50) + 0.5).numpy() / 50))
+        expected = std * quantiles / quantiles.square().mean().sqrt()
+        torch.testing.assert_close(factor[0, :, dim].sort().values, expected, rtol=0, atol=1e-12)
+        assert float(factor[0, :, dim].square().mean().sqrt()) == pytest.approx(std)
+    # Dimensions are shuffled apart: of 50 pairs, a correlation is 0 +- 0.14.
+    assert abs(float(torch.corrcoef(factor[0].T)[0, 1])) < 0.42
+
+
+def test_gradients_and_other_keys(float64):
+    samples = torch.randn(3, 4, 2, requires_grad=True)
+
+    def run(samples, log_std):
+        gain = MemberGain([0.1, 0.2], ensemble_size=4, out_key=("a", "b"))
+        td = TensorDict({("sensor", "ensemble"): samples}, [3])
+        return torch.func.functional_call(gain, {"log_std": log_std}, (td,))["a", "b"]
+
+    assert torch.autograd.gradcheck(run, (samples, torch.randn(2, requires_grad=True)))
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="positive standard deviation"):
+        MemberGain([0.1, 0.0])
+    with pytest.raises(ValueError, match=r"made for samples \[\*B, 32, 1\]"):
+        MemberGain([0.1])(TensorDict({("sensor", "ensemble"): torch.zeros(8, 1)}))
