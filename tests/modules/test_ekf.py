@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
+from tests.filters.factories import NoisyLinear
 from torch_denkf.functional import kalman_update
 from torch_denkf.modules import (
     ClonedTransition,
@@ -130,9 +131,7 @@ def test_jacobians_without_a_graph(float64, mode):
 @pytest.mark.parametrize("layer", [nn.Dropout(), FlipoutLinear(3, 3)])
 def test_random_layers_are_refused(Transition, layer):
     random = LearnedTransition(nn.Sequential(nn.Linear(3, 3), layer))
-    with pytest.raises(
-        ValueError, match=r"deterministic model; LearnedTransition holds random layers \(\['module.1'\]"
-    ):
+    with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition holds random parts \(\['module.1'\]"):
         Transition(random, constant_noise(3))
 
 
@@ -145,10 +144,15 @@ def test_random_observation_models_are_refused_or_made_deterministic(Analysis):
     assert module(td.copy())["belief", "mean"].equal(module(td.copy())["belief", "mean"])
 
 
-def test_other_randomness_in_a_transition_is_an_error():
-    module = EKFTransition(LearnedTransition(lambda x: x + torch.randn_like(x)), constant_noise(3))
-    with pytest.raises(RuntimeError, match="randomness"):
-        module(belief(2, dim=3))
+@pytest.mark.parametrize("Transition", TRANSITIONS)
+def test_sub_models_that_draw_their_own_noise_are_refused(Transition):
+    matrix, state = torch.eye(3), torch.get_rng_state()
+    noisy = NoisyLinear(matrix, matrix)
+    with pytest.raises(ValueError, match=r"NoisyLinear holds random parts \(\['NoisyLinear'\]"):
+        Transition(noisy, constant_noise(3))
+    assert noisy.ensemble_size is None
+    assert torch.get_rng_state().equal(state)
+    Transition(NoisyLinear(matrix), constant_noise(3))
 
 
 # ------------------------------------------------------------------------------------------------------ analysis
@@ -259,7 +263,16 @@ def test_a_sequence_of_modules_observes(float64):
     assert_is_update(out, update)
 
 
-def test_missing_entries_are_named():
+def test_an_observation_that_ignores_the_state_corrects_nothing(float64):
+    td = forecast(2)
+    out = EKFAnalysis(LearnedObservation(lambda x: torch.ones_like(x[..., :2])))(td.copy())
+    torch.testing.assert_close(out["belief", "mean"], td["forecast", "mean"], rtol=0, atol=0)
+    torch.testing.assert_close(out["info", "innovation"], td["sensor", "ensemble"].mean(-2) - 1, rtol=0, atol=1e-14)
+
+
+def test_errors_say_what_is_wrong():
+    with pytest.raises(ValueError, match="of 3 states gives 1 numbers; 2 are due"):
+        EKFAnalysis(Select([0]))(forecast(2))
     with pytest.raises(KeyError, match=r"EKFAnalysis reads \('sensor', 'noise'\)"):
         EKFAnalysis(Select([0]))(forecast(2).exclude(("sensor", "noise")))
     with pytest.raises(KeyError, match=r"EKFTransition reads \('belief', 'cov'\)"):

@@ -50,9 +50,8 @@ class GaussianTransition(SubModel):
         raise NotImplementedError
 
     def _move(self, tensordict: TensorDictBase, states: torch.Tensor) -> torch.Tensor:
-        """The transition of an ensemble ``[*B, E, S]``; ``tensordict`` is left as it is."""
-        out = self.module(tensordict.copy().set(self.ensemble_key, states))
-        return self.read(out, self.forecast_ensemble_key)
+        """The transition of an ensemble ``[*B, E, S]``; writes into ``tensordict``."""
+        return self.read(self.module(tensordict.set(self.ensemble_key, states)), self.forecast_ensemble_key)
 
 
 class GaussianAnalysis(SubModel):
@@ -97,8 +96,8 @@ class GaussianAnalysis(SubModel):
         raise NotImplementedError
 
     def _observe(self, tensordict: TensorDictBase, states: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask that holds after the model ran."""
-        out = self.module(tensordict.copy().set(self.ensemble_key, states))
+        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran; writes."""
+        out = self.module(tensordict.set(self.ensemble_key, states))
         return self.read(out, self.predicted_key), out.get(self.optional_keys[0], None)
 
 
@@ -139,14 +138,35 @@ def refuse_random_layers(module: nn.Module, owner: str) -> None:
     """Raises where a module would stay random although its stochastic networks run their deterministic forward.
 
     Raises:
-        ValueError: if there are dropout or flipout layers outside a :class:`StochasticMLP`.
+        ValueError: if there are dropout or flipout layers outside a :class:`StochasticMLP`, or sub-models that draw
+            noise without one.
     """
-    inside = {layer for part in module.modules() if isinstance(part, StochasticMLP) for layer in part.modules()}
+    networks = [part for part in module.modules() if isinstance(part, StochasticMLP)]
+    inside = {layer for network in networks for layer in network.modules()}
     kinds = (nn.modules.dropout._DropoutNd, FlipoutLinear)
-    random = [name for name, part in module.named_modules() if isinstance(part, kinds) and part not in inside]
+    random = [
+        name or type(part).__name__
+        for name, part in module.named_modules()
+        if (isinstance(part, kinds) and part not in inside) or (isinstance(part, SubModel) and _draws(part, networks))
+    ]
     if random:
         raise ValueError(
-            f"{owner} needs a deterministic model; {type(module).__name__} holds random layers ({random}). Put them "
-            "into a StochasticMLP, whose mean network is then used, or take them out: the noise of this filter is in "
-            "its covariances."
+            f"{owner} needs a deterministic model; {type(module).__name__} holds random parts ({random}). Put random "
+            "layers into a StochasticMLP, whose mean network is then used, or take them out: the noise of this filter "
+            "is in its covariances."
         )
+
+
+def _draws(part: SubModel, networks: list[StochasticMLP]) -> bool:
+    """Whether a sub-model, asked for the noise of one member, draws any that is not a network's."""
+    if part.noise_key is None or part.module in networks:
+        return False
+    size = getattr(part, "ensemble_size", 1)
+    if size is None:
+        part.ensemble_size = 1
+    try:
+        with torch.random.fork_rng(devices=[]):
+            return part.draw_noise(()) is not None
+    finally:
+        if size is None:
+            part.ensemble_size = None

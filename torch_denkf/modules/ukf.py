@@ -54,7 +54,8 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         forecast_ensemble_key: what it writes.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
+            draws its own noise.
 
     Example:
         >>> from tensordict import TensorDict
@@ -91,7 +92,7 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
 
     def _forecast(self, tensordict, mean, cov):
         points, weights = self._points(mean, cov)
-        return unscented_moments(self._move(tensordict, points), weights)
+        return unscented_moments(self._move(tensordict.copy(), points), weights)
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
@@ -152,6 +153,6 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
 
     def _update(self, tensordict, mean, cov, observation, noise):
         points, weights = self._points(mean, cov)
-        predicted, observed = self._observe(tensordict, points)
+        predicted, observed = self._observe(tensordict.copy(), points)
         update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=self.angles)
         return update, observed
