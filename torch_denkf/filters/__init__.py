@@ -5,7 +5,6 @@ from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
 from torch_denkf.filters.kalman import KalmanFilter
-from torch_denkf.filters.ukf import UKF
 from torch_denkf.filters.particle import DPF, PFM, ParticleFilter
 from torch_denkf.filters.ukf import UKF
 
