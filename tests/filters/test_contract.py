@@ -1,0 +1,167 @@
+"""What every filter promises, whatever its belief: one table of filters, one list of promises.
+
+The oracles are the filter's own: another way to compute the same, which must agree. That the numbers are right is
+shown in each filter's own file, against a Kalman filter. Compiled steps: test_ekf.py, test_particle.py, test_base.py.
+"""
+
+import pickle
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
+from torchrl.modules import set_recurrent_mode
+
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import linear_filter
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.filters import ParticleFilter
+from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
+from torch_denkf.transforms import DEnKFTransform
+
+
+def particles(scheme):
+    F, Q, H, R = linear_system()
+    return ParticleFilter(
+        NoisyLinear(F, torch.linalg.cholesky(Q), 16),
+        None,
+        LinearObservation(H),
+        GaussianLikelihood(sensor_key="observation"),
+        noise=ConstantNoise(R.sqrt(), in_key="observation"),
+        initial=GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=16),
+        resampling=scheme,
+    )
+
+
+FILTERS = {
+    "DEnKF etkf": linear_denkf,
+    "DEnKF perturbed": lambda: linear_denkf("perturbed", noisy=True),
+    "DEnKF sakov": lambda: linear_denkf("sakov", noisy=True),
+    "Kalman": linear_kalman,
+    "EKF": lambda: linear_filter("EKF"),
+    "UKF": lambda: linear_filter("UKF"),
+    "Backprop KF": lambda: linear_filter("BackpropKF"),
+    "particles, systematic": lambda: particles("systematic"),
+    "particles, soft": lambda: particles("soft"),
+    "particles, transport": lambda: particles("transport"),
+}
+FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF"}  # of their own
+every_filter = pytest.mark.parametrize("name", FILTERS)
+
+
+def assert_same(first, second, keys, atol=0.0):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def readings(*batch, width=1):
+    """Readings, masks, and starts that differ between rows."""
+    frames = TensorDict({"observation": torch.randn(*batch, 2)}, batch)
+    frames["observed"] = torch.rand(*batch, width) < 0.7
+    frames["is_init"] = torch.rand(*batch, 1) < 0.2
+    frames["is_init"][..., 0, :] = True
+    return frames
+
+
+def filtered(name, **kwargs):
+    env = TransformedEnv(base_env(seed=0, **kwargs), DEnKFTransform(FILTERS[name]()))
+    return TransformedEnv(env, InitTracker())
+
+
+@every_filter
+@pytest.mark.parametrize("batch", [[], [3]])
+def test_specs(name, batch):
+    check_env_specs(filtered(name, batch_size=batch, max_steps=4))
+
+
+@every_filter
+def test_rows_that_reset_start_anew_and_the_others_go_on(name):
+    env = filtered(name, batch_size=[2], max_steps=[3, 5])
+    rollout = env.rollout(12, break_when_any_done=False)
+    done = rollout["next", "done"].squeeze(-1)[:, :-1]
+    for key in FILTERS[name]().belief_keys:
+        now, then = rollout[key][:, 1:], rollout["next", key][:, :-1]
+        assert now[~done].equal(then[~done]), key
+        if key[-1] != "log_weight":  # of equal weights the last step's may be, too
+            assert not now[done].equal(then[done]), key
+
+
+@every_filter
+@pytest.mark.parametrize("width", [1, 2])
+def test_steps_are_the_sequence(float64, name, width):
+    filter, frames = FILTERS[name](), readings(3, 9, width=width)
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    row, rows = filter.initialise(frames[:, 0].copy()), []
+    for t in range(9):
+        row = frames[:, t].copy().update(row.select(*filter.carry_keys))
+        row = filter(row)  # a start starts anew
+        rows.append(row)
+    assert_same(torch.stack(rows, 1), expected, filter.belief_keys, atol=1e-10)
+    with set_recurrent_mode(True):
+        assert_same(filter(frames.copy()), expected, filter.belief_keys)
+
+
+@every_filter
+@pytest.mark.parametrize("width", [1, 2])
+def test_what_is_not_observed_may_be_anything(float64, name, width):
+    filter, frames = FILTERS[name](), readings(3, 9, width=width)
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    frames["observation"] = torch.where(frames["observed"], frames["observation"], torch.nan).requires_grad_()
+    leaf = frames["observation"]
+    broken = filter.sequence(frames.copy())
+    assert_same(broken, expected, filter.belief_keys)
+    broken["belief", "mean"].sum().backward()
+    assert leaf.grad.isfinite().all()
+
+
+@every_filter
+def test_unobserved_doubt_grows_and_a_reading_shrinks_it(float64, name):
+    filter = FILTERS[name]()
+    torch.manual_seed(1)
+    frames = TensorDict({"observation": torch.zeros(200, 6, 2)}, [200, 6])
+    frames["observed"] = torch.tensor([True] * 3 + [False] * 2 + [True]).reshape(1, 6, 1).expand(200, 6, 1)
+    spread = filter.sequence(frames)["belief", "var"].sum(-1).mean(0)
+    if name == "DEnKF etkf":  # without process noise its members come together
+        assert spread[5] < spread[4]
+        return
+    assert spread[2] < spread[3] < spread[4] > spread[5]
+
+
+@every_filter
+@pytest.mark.parametrize("copy", [lambda f: pickle.loads(pickle.dumps(f)), deepcopy])
+def test_copies_compute_the_same(name, copy):
+    filter, frames = FILTERS[name](), readings(2, 5)
+    filter.draw_noise(frames)
+    assert_same(copy(filter).sequence(frames.copy()), filter.sequence(frames.copy()), filter.belief_keys)
+
+
+@every_filter
+def test_seeds_decide_and_nothing_is_kept_between_rollouts(name):
+    env = filtered(name, batch_size=[2], max_steps=5)
+    rollouts = []
+    for _ in range(2):
+        env.set_seed(3)
+        torch.manual_seed(3)
+        rollouts.append(env.rollout(8, break_when_any_done=False))
+    assert_same(*rollouts, FILTERS[name]().belief_keys)
+
+
+@every_filter
+def test_the_primer_carries_the_belief_of_a_policy(float64, name):
+    filter = FILTERS[name]()
+    torch.manual_seed(0)
+    env = TransformedEnv(base_env(seed=0, batch_size=[2], max_steps=4), InitTracker())
+    env.append_transform(filter.make_tensordict_primer())
+    zeros = torch.zeros(env.action_spec.shape)
+    policy = TensorDictSequential(filter, TensorDictModule(lambda mean: zeros, [("belief", "mean")], ["action"]))
+    rollout = env.rollout(6, policy=policy, break_when_any_done=False)
+    if FILTERS_WITHOUT_NOISE.isdisjoint({name}):
+        assert rollout["belief", "mean"].isfinite().all()
+        return
+    frames = rollout.select("observation", "observed", "is_init", "action")
+    assert rollout["is_init"].sum() == 4, "each row starts anew once"
+    assert_same(filter.sequence(frames), rollout, filter.belief_keys, atol=1e-10)
