@@ -36,7 +36,8 @@ def pair_filter(size, scheme="perturbed", reach=None, change=None):
         PairObservation(reach),
         ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
         TensorDictSequential(
-            EnsembleAnalysis(scheme, belief_key="analysis", **keys), UnicycleMotion(DT, history_key=("belief", "history"))
+            EnsembleAnalysis(scheme, belief_key="analysis", **keys),
+            UnicycleMotion(DT, history_key=("belief", "history")),
         ),
         initial=WithHistory(AroundState(START, ensemble_size=size), lags=2),
     )
@@ -113,7 +114,11 @@ def test_an_exact_reading_over_a_gap_leaves_no_doubt_about_the_way(float64):
     frames = frames_of(torch.tensor([[0.0, 0.0], [0.0, 0.0], [10.0, 0.9]]), [0, 0, 2])
     frames["y"][-1] = torch.tensor([10.0, 0.9])
     exact = DEnKF(
-        filter["transition"], None, filter["observation"], ConstantNoise([1e-6, 1e-6], in_key="y"), filter["analysis"],
+        filter["transition"],
+        None,
+        filter["observation"],
+        ConstantNoise([1e-6, 1e-6], in_key="y"),
+        filter["analysis"],
         initial=filter.initial,
     )
     torch.manual_seed(1)

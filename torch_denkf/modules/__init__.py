@@ -10,6 +10,7 @@ from torch_denkf.modules.calibration import MemberGain
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
@@ -44,6 +45,8 @@ __all__ = [
     "VectorSensor",
     "FlowSensor",
     "MemberGain",
+    "KeypointTrunk",
+    "SpatialSoftArgmax",
     "convolutional_trunk",
     "GaussianPrior",
     "AroundState",

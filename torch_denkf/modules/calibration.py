@@ -18,8 +18,8 @@ class MemberGain(SubModel):
 
     A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn anew for each
     frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
-    error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E members,
-    always the same, so that each member keeps its calibration and the ensemble its doubt. Put it behind the sensor.
+    error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
+    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the sensor.
 
     Args:
         std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,

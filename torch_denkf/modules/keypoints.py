@@ -1,0 +1,95 @@
+"""An image trunk for arms: where things are in the picture, and what it looks like as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+__all__ = ["KeypointTrunk", "SpatialSoftArgmax"]
+
+
+class SpatialSoftArgmax(nn.Module):
+    """Where each channel is large: the mean place under the softmax of its values.
+
+    Args:
+        channels: C.
+
+    Shape:
+        ``[N, C, H, W]`` to ``[N, 2C]``: columns, then rows, from -1 (left, top) to 1 (right, bottom).
+
+    Reference:
+        Levine, Finn, Darrell, Abbeel, "End-to-end training of deep visuomotor policies", JMLR 17, 2016, section 5.
+
+    Example:
+        >>> image = torch.zeros(1, 1, 3, 3)
+        >>> image[0, 0, 0, 2] = 100.0  # the upper right corner
+        >>> SpatialSoftArgmax(1)(image)
+        tensor([[ 1., -1.]], grad_fn=...)
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.log_sharpness = nn.Parameter(torch.zeros(channels, 1))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Mean places."""
+        height, width = features.shape[-2:]
+        place = (features.flatten(-2) * self.log_sharpness.exp()).softmax(-1).unflatten(-1, (height, width))
+        columns, rows = (torch.linspace(-1, 1, n, device=place.device, dtype=place.dtype) for n in (width, height))
+        return torch.cat([place.sum(-2) @ columns, place.sum(-1) @ rows], -1)
+
+
+class KeypointTrunk(nn.Module):
+    """Convolutions that also see their place in the picture, read out as places and as averages.
+
+    A flat layer over all pixels, as Table I has it, must learn each place by itself. Joint angles follow from where
+    the links are, so that this trunk needs fewer demonstrations.
+
+    Args:
+        in_channels: C of the images.
+        channels: of the convolutions, of stride 2 each; group normalisation and ReLU behind each.
+        keypoints: channels whose places are read.
+        features: width of the output.
+        pooled: the last map is averaged over a grid of so many rows and columns beside the keypoints.
+
+    Shape:
+        ``[N, C, H, W]`` to ``[N, features]``, for any H and W from ``2 ** (len(channels) - 1)`` on.
+
+    Example:
+        >>> trunk = KeypointTrunk(3)
+        >>> trunk(torch.zeros(2, 3, 112, 112)).shape
+        torch.Size([2, 128])
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        channels: Sequence[int] = (24, 32, 48, 64, 96),
+        keypoints: int = 32,
+        features: int = 128,
+        pooled: int = 4,
+    ):
+        super().__init__()
+        widths = [in_channels + 2, *channels]
+        blocks = [
+            nn.Sequential(
+                nn.Conv2d(before, after, 5 if first else 3, 2, 2 if first else 1), nn.GroupNorm(8, after), nn.ReLU()
+            )
+            for first, before, after in zip([True] + [False] * len(channels), widths, widths[1:], strict=False)
+        ]
+        # Places are read where the map is still fine: one block before the last.
+        self.stem, self.last = nn.Sequential(*blocks[:-1]), blocks[-1]
+        self.places = nn.Sequential(nn.Conv2d(widths[-2], keypoints, 1), SpatialSoftArgmax(keypoints))
+        self.pool = nn.Sequential(nn.AdaptiveAvgPool2d(pooled), nn.Flatten())
+        self.mix = nn.Sequential(nn.Linear(2 * keypoints + widths[-1] * pooled**2, features), nn.ReLU())
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Features of images."""
+        height, width = images.shape[-2:]
+        rows = torch.linspace(-1, 1, height, device=images.device, dtype=images.dtype)
+        columns = torch.linspace(-1, 1, width, device=images.device, dtype=images.dtype)
+        grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy")).expand(len(images), -1, -1, -1)
+        fine = self.stem(torch.cat([images, grid], 1))
+        return self.mix(torch.cat([self.places(fine), self.pool(self.last(fine))], -1))
