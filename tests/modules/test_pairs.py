@@ -192,3 +192,38 @@ def test_a_history_begins_with_the_present(float64):
     assert isinstance(start, SubModel)
     for lag in range(2):
         assert out["history"][:, :, lag].equal(out["ensemble"][..., 3:])
+
+
+def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):
+    transition = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
+    with torch.no_grad():
+        transition.raw_trend.copy_(torch.tensor([0.0, -torch.log(torch.tensor(3.0))]))  # a half and a quarter
+    state = torch.tensor([[0.0, 0.0, 0.0, 6.0, 0.4], [0.0, 0.0, 0.0, 7.0, 0.1]])
+    history = torch.tensor([[[6.0, 0.4], [8.0, 0.0]], [[7.0, 0.1], [7.0, 0.1]]])
+    out = transition(TensorDict({"belief": {"ensemble": state, "history": history}}))["forecast", "ensemble"]
+    torch.testing.assert_close(out[:, 3:], torch.tensor([[5.0, 0.5], [7.0, 0.1]]), rtol=0, atol=1e-12)
+    torch.testing.assert_close(out[0, 0], 5.0 * DT * torch.tensor(0.5 * DT / 2).cos(), rtol=0, atol=1e-12)
+
+
+def test_with_a_trend_a_braking_car_is_followed_without_lag(float64):
+    """Readings without noise of a speed that falls by 0.5 m/s a step, weighed as if they were noisy."""
+    errors = []
+    for trend in (None, ("belief", "history")):
+        filter = pair_filter(64, "etkf")
+        transition = UnicycleTransition(Walk(), DT, history_key=trend)
+        if trend:
+            with torch.no_grad():
+                transition.raw_trend.fill_(5.0)  # nearly all of it
+        filter = DEnKF(
+            transition, None, filter["observation"], filter["noise"], filter["analysis"], initial=filter.initial
+        )
+        speed = 20.0 - 0.5 * torch.arange(30.0)
+        frames = frames_of(torch.stack([speed, torch.zeros(30)], -1), [0] + [1] * 29)
+        frames["state"] = torch.stack([torch.tensor([0.0, 0.0, 0.0, float(v), 0.0]) for v in speed])
+        torch.manual_seed(0)
+        belief = filter.sequence(frames)["belief", "mean"][:, 3]
+        errors.append(float((belief - speed)[10:].mean().detach()))
+    forecast = Q[0] / 2 + (Q[0] ** 2 / 4 + Q[0] * R[0]) ** 0.5  # the steady variance
+    gain = forecast / (forecast + R[0])
+    assert errors[0] == pytest.approx(0.5 * (1 - gain) / gain, abs=0.04)  # 0.23; 64 members, 20 steps
+    assert abs(errors[1]) < 0.04

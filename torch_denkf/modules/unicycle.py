@@ -35,6 +35,9 @@ class UnicycleTransition(StochasticTransition):
         scale: standard deviation of (v, theta_dot), in m/s and rad/s.
         drift: False takes the ensemble's mean change away: the velocities walk at random, with learned steps, and a
             network trained on few drives cannot make them return to those drives' usual ones where nothing is observed.
+        history_key: velocities of past steps ``[*B, E, L, 2]``, see :class:`torch_denkf.modules.WithHistory`, L at
+            least 2. With them the velocities go on changing as they last did, by a learned share :math:`\rho` of that
+            (Gardner's damped trend): a random walk lags behind a car that brakes.
         ensemble_size: see :class:`LearnedTransition`.
         in_key: ensemble ``[*B, E, 5]`` of [x m, y m, theta rad, v m/s, theta_dot rad/s].
         out_key: forecast ensemble ``[*B, E, 5]``.
@@ -59,13 +62,16 @@ class UnicycleTransition(StochasticTransition):
         loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
         scale: Sequence[float] | torch.Tensor = (1.0, 1.0),
         drift: bool = True,
+        history_key: NestedKey | None = None,
         ensemble_size: int | None = None,
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
         noise_key: NestedKey = ("noise", "transition"),
     ):
-        super().__init__(velocity, [in_key], [out_key], ensemble_size, noise_key)
+        in_keys = [in_key] if history_key is None else [in_key, history_key]
+        super().__init__(velocity, in_keys, [out_key], ensemble_size, noise_key)
         self.dt, self.drift = dt, drift
+        self.raw_trend = None if history_key is None else nn.Parameter(torch.full((2,), -2.0))
         self.register_buffer("loc", torch.as_tensor(loc, dtype=torch.get_default_dtype()))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.get_default_dtype()))
 
@@ -81,7 +87,11 @@ class UnicycleTransition(StochasticTransition):
         change = self._run((velocity - self.loc) / self.scale, tensordict)
         if not self.drift:
             change = change - change.mean(-2, keepdim=True)
-        velocity = velocity + self.scale * change
+        change = self.scale * change
+        if self.raw_trend is not None:
+            history = self.read(tensordict, self.in_keys[1])
+            change = change + self.raw_trend.sigmoid() * (history[..., 0, :] - history[..., 1, :])
+        velocity = velocity + change
         tensordict.set(self.out_keys[0], torch.cat([_move(pose, velocity, self.dt), velocity], -1))
         return tensordict
 
@@ -136,7 +146,8 @@ class UnicycleMotion(SubModel):
         if self.history_key is not None:
             history = self.read(tensordict, self.history_key)
             past = within_pair(tensordict.get(self.optional_keys[0], None), history)
-            corrected = torch.where(past, analysis[..., 5:].unflatten(-1, (-1, 2)), history)
+            analysed = analysis[..., 5:].unflatten(-1, (-1, 2))
+            corrected = torch.where(past, analysed, history)
             moved = pose
             for step in history.unbind(-2):  # back to where the history begins
                 moved = _move(moved, step, -self.dt)
@@ -144,7 +155,7 @@ class UnicycleMotion(SubModel):
                 moved = _move(moved, step, self.dt)
             # Where the pair is of neighbours nothing moves, not even by rounding.
             pose = torch.where(past.flatten(-2).any(-1, keepdim=True), moved, pose)
-            tensordict.set(self.out_keys[-1], torch.cat([velocity.unsqueeze(-2), corrected[..., :-1, :]], -2))
+            tensordict.set(self.out_keys[-1], torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2))
         ensemble = torch.cat([_move(pose, velocity, self.dt), velocity], -1)
         values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
         for key, value in zip(self.out_keys, values, strict=False):

@@ -67,10 +67,10 @@ class Recipe:
         """R, from what the sensor saw."""
         return DiagonalNoise(2, r=self.facts.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
 
-    def transition(self, network: nn.Module) -> SubModel:
+    def transition(self, network: nn.Module, **kwargs) -> SubModel:
         """Known motion of the pose; the velocities walk at random."""
         facts = self.facts
-        return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, drift=False)
+        return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, drift=False, **kwargs)
 
     @property
     def state_scale(self) -> Tensor:

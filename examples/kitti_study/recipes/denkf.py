@@ -43,7 +43,10 @@ class DEnKF(Recipe):
             # Most of the sensor's error stays for a whole drive.
             gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, out_key=CALIBRATED),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
-            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
+            transition=self.transition(
+                StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
+                history_key=("belief", "history") if self.pairs else None,
+            ),
             observation=observation,
             analysis=TensorDictSequential(
                 EnsembleAnalysis("sensor", sensor_key=CALIBRATED, belief_key="analysis", **keys), motion
