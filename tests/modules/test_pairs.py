@@ -5,15 +5,19 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.modules import (
     AroundState,
+    ClonedPrior,
+    ClonedTransition,
     ConstantNoise,
     EnsembleAnalysis,
+    GaussianAround,
     PairObservation,
     Select,
     SubModel,
     UnicycleMotion,
+    UnicycleNoise,
     UnicycleTransition,
     WithHistory,
 )
@@ -227,3 +231,39 @@ def test_with_a_trend_a_braking_car_is_followed_without_lag(float64):
     gain = forecast / (forecast + R[0])
     assert errors[0] == pytest.approx(0.5 * (1 - gain) / gain, abs=0.04)  # 0.23; 64 members, 20 steps
     assert abs(errors[1]) < 0.04
+
+
+def test_an_ekf_with_clones_is_the_kalman_filter_with_clones(float64):
+    """Without turning all is linear: the EKF on the cloned state must be exact, the trend included."""
+    steps = [0, 1, 0, 2, 1, 0, 0, 3, 1]
+    y = torch.randn(9, 2) + torch.tensor(steps).unsqueeze(-1) * torch.tensor([4.0, 0.0])
+    y[:, 1] = 0.0
+    motion = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
+    share = float(motion.raw_trend[0].sigmoid())
+    noise = ConstantNoise([Q[0] ** 0.5, 1e-9], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    ekf = EKF(
+        ClonedTransition(motion),
+        UnicycleNoise(noise, DT),
+        None,
+        PairObservation(history_key=None),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        initial=ClonedPrior(GaussianAround([0.0, 0.0, 0.0, 0.6, 0.0]), 2),
+        observation_key="y",
+        observed_key=("forecast", "observed"),
+    )
+    frames = frames_of(y, steps)
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.0]).expand(9, 5)
+    out = ekf.sequence(frames)["belief"]
+    mean, cov = torch.tensor([4.0, 4.0, 4.0, 0.0]), torch.zeros(4, 4)
+    cov[:3, :3] = 0.36
+    shift = torch.tensor([[1 + share, -share, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [DT * (1 + share), -DT * share, 0, 1]])
+    enters = torch.tensor([1.0, 0.0, 0.0, DT])
+    for t in range(1, 9):
+        mean, cov = shift @ mean, shift @ cov @ shift.T + Q[0] * enters[:, None] * enters
+        if steps[t]:
+            h = torch.tensor([float(lag < steps[t]) for lag in range(3)] + [0.0])
+            gain = cov @ h / (h @ cov @ h + R[0])
+            mean, cov = mean + gain * (y[t, 0] - h @ mean), cov - gain[:, None] * (h @ cov)
+        dims = [3, 5, 7, 0]
+        torch.testing.assert_close(out["mean"][t, dims], mean, rtol=0, atol=1e-8)
+        torch.testing.assert_close(out["cov"][t][dims][:, dims], cov, rtol=0, atol=1e-8)

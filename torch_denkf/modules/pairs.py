@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
@@ -181,6 +181,7 @@ class ClonedTransition(SubModel):
     Args:
         transition: forecasts ensembles ``[*B, E, 5]``, see :class:`torch_denkf.modules.UnicycleTransition`; its keys
             are kept.
+        history_key: where ``transition`` reads the velocities of the past steps, if it does, the present ones first.
 
     Example:
         >>> from tensordict import TensorDict
@@ -191,13 +192,18 @@ class ClonedTransition(SubModel):
         [[1.0, 0.0, 0.0, 10.0, 0.0, 10.0, 0.0, 9.0, 0.0]]
     """
 
-    def __init__(self, transition: SubModel):
-        super().__init__(transition, transition.in_keys, transition.out_keys)
+    def __init__(self, transition: SubModel, *, history_key: NestedKey = ("belief", "history")):
+        self_made = unravel_key(history_key)
+        in_keys = [key for key in transition.in_keys if unravel_key(key) != self_made]
+        super().__init__(transition, in_keys, transition.out_keys)
+        self.history_key = self_made
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble."""
         state = self.read(tensordict, self.in_keys[0])
-        forecast = self.module(tensordict.copy().set(self.in_keys[0], state[..., :5])).get(self.out_keys[0])
+        work = tensordict.copy().set(self.in_keys[0], state[..., :5])
+        work.set(self.history_key, state[..., 3:].unflatten(-1, (-1, 2)))
+        forecast = self.module(work).get(self.out_keys[0])
         return tensordict.set(self.out_keys[0], torch.cat([forecast, state[..., 3:-2]], -1))
 
 

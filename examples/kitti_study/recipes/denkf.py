@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 from tensordict.nn import TensorDictSequential
 
-from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
 from kitti_study.sensors import SAMPLES
 from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
@@ -37,7 +37,7 @@ class DEnKF(Recipe):
         else:
             observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
             keys = {}
-        motion = UnicycleMotion(self.facts.dt, history_key=("belief", "history") if self.pairs else None)
+        motion = UnicycleMotion(self.facts.dt, history_key=HISTORY if self.pairs else None)
         return OrderedDict(
             noise=self.noise(),
             # Most of the sensor's error stays for a whole drive.
@@ -45,7 +45,7 @@ class DEnKF(Recipe):
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
             transition=self.transition(
                 StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
-                history_key=("belief", "history") if self.pairs else None,
+                history_key=HISTORY if self.pairs else None,
             ),
             observation=observation,
             analysis=TensorDictSequential(

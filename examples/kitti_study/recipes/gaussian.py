@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import torch
 
-from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
 from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
     CholeskyNoise,
@@ -32,7 +32,7 @@ class _Gaussian(Recipe):
     Transition, Analysis = EKFTransition, EKFAnalysis
 
     def modules(self):
-        motion, keys = self.transition(torch.zeros_like), {}
+        motion, keys = self.transition(torch.zeros_like, history_key=HISTORY if self.pairs else None), {}
         if self.pairs:
             motion, keys = ClonedTransition(motion), {"observed_key": ("forecast", "observed")}
             observation = PairObservation([REACH / self.facts.dt, torch.inf], history_key=None)

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 from torch import nn
 
-from kitti_study.recipes._base import REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
 from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
     AroundState,
@@ -52,7 +52,7 @@ class _Particles(Recipe):
     def modules(self):
         facts, keys = self.facts, {}
         motion = NoisyTransition(
-            self.transition(torch.zeros_like),
+            self.transition(torch.zeros_like, history_key=HISTORY if self.pairs else None),
             # Of the mean velocities alone: an infinite scale hides the pose.
             DiagonalNoise(
                 2,
