@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from tensordict import TensorDict
@@ -29,6 +31,7 @@ from torch_denkf.metrics import (
     state_errors,
 )
 
+MASKS = 8  # draws of the missing frames, over which the errors are averaged
 WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
 _NAMES = ("filter", "sensor", "drive", "condition", "window", "seed")
 _ERRORS = ("translation_m_per_m", "rotation_deg_per_m", "coverage90", "coverage90_v", "coverage90_theta_dot")
@@ -63,15 +66,17 @@ def evaluate(
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
-    readings = {"clean": all_frames(clean), "missing": lose_frames(clean, seed=stream.seed())}
+    readings = {"clean": [all_frames(clean)]}
+    readings["missing"] = [lose_frames(clean, seed=stream.seed() + number) for number in range(MASKS)]
     for condition in DISTURBANCES:
         part = Part(replace(stream, condition=condition))
-        readings[condition] = all_frames(read_spans(model["sensor"], part, cache, kind))
-    conditions = [condition for condition in CONDITIONS if condition in readings]
-    out = run_filter(recipe, model, [readings[condition] for condition in conditions])
-    table, costs = [], cost(recipe, model, readings["clean"])
-    for number, condition in enumerate(conditions):
-        reading, belief, truth = readings[condition], out[number], clean["state"].double()
+        readings[condition] = [all_frames(read_spans(model["sensor"], part, cache, kind))]
+    pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
+    out = run_filter(recipe, model, [reading for _, reading in pairs])
+    costs, rows, beliefs = cost(recipe, model, pairs[0][1]), defaultdict(list), {}
+    for (condition, reading), belief in zip(pairs, out, strict=True):
+        beliefs.setdefault(condition, belief)
+        truth = clean["state"].double()
         common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
         common["blind"] = 1 - float(reading["observed"][1:].float().mean())
         estimates = {filter_name: belief["belief", "mean"][:, :5].double()}
@@ -80,8 +85,16 @@ def evaluate(
             estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
         for name, states in estimates.items():
             scores = {**calibration(belief, truth), **costs} if name == filter_name else {}
-            table += [{**common, **scores, "filter": name, **row} for row in errors(states, truth)]
-    return table, {condition: out[number] for number, condition in enumerate(conditions)}
+            for row in errors(states, truth):
+                rows[condition, name, row["window"]].append({**common, **scores, "filter": name, **row})
+    return [_mean(group) for group in rows.values()], beliefs
+
+
+def _mean(rows: list[dict]) -> dict:
+    """One row of several that differ in their numbers alone: which frames are missing is chance."""
+    return {
+        key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
+    }
 
 
 @torch.no_grad()

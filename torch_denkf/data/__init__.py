@@ -8,9 +8,11 @@ from torch_denkf.data.kitti_replay import KITTIOdometryExperienceReplay
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
 from torch_denkf.data.mirror import mirror_drive
 from torch_denkf.data.motion import with_motion
+from torch_denkf.data.ur5_replay import UR5ExperienceReplay
 
 __all__ = [
     "KITTIOdometryExperienceReplay",
+    "UR5ExperienceReplay",
     "bridge_gaps",
     "drive_frames",
     "frames_at",
