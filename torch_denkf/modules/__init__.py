@@ -18,6 +18,7 @@ from torch_denkf.modules.observation import LearnedObservation, LinearObservatio
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise
+from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
@@ -69,4 +70,8 @@ __all__ = [
     "NoisyTransition",
     "ResampledTransition",
     "ParticleAnalysis",
+    "WithMemory",
+    "LSTMTransition",
+    "LSTMUpdate",
+    "UnicyclePose",
 ]

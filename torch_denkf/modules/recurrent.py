@@ -1,0 +1,296 @@
+r"""A recurrent network in a filter's place: it remembers what it likes, and says what it believes as a Gaussian.
+
+The baseline without any model: no motion, no noise, no gain, only a memory that is trained. It keeps the keys of the
+filters with a mean and a covariance, so that objectives, metrics and environments treat it as one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torch.nn import functional as F
+from torchrl.modules import LSTMCell
+
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.unicycle import _move
+
+__all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
+
+_MEMORY = ("hidden", "cell")
+_MOMENTS = ("mean", "cov")
+
+
+class WithMemory(SubModel):
+    """An initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
+
+    Args:
+        initial: the initial belief with a mean: :class:`MomentPrior`, :class:`GaussianAround`.
+        hidden_size: H.
+        num_layers: L.
+        belief_key: prefix of what is written: that of ``initial``, and ``hidden`` and ``cell`` ``[*B, L, H]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> start = WithMemory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)
+        >>> start(TensorDict({}, [3]))["belief", "hidden"].shape
+        torch.Size([3, 1, 8])
+    """
+
+    def __init__(
+        self, initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_key: str = "belief"
+    ):
+        out_keys = [(belief_key, name) for name in _MEMORY]
+        super().__init__(initial, initial.in_keys, [*initial.out_keys, *out_keys])
+        self.belief_key, self.memory_shape = belief_key, (num_layers, hidden_size)
+        for name in ("state_dim", "observation_dim"):  # what the primer asks for
+            if getattr(initial, name, None) is not None:
+                setattr(self, name, getattr(initial, name))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and its memory."""
+        tensordict = self.module(tensordict)
+        mean = self.read(tensordict, (self.belief_key, "mean"))
+        for key in self.out_keys[-2:]:
+            tensordict.set(key, mean.new_zeros(*tensordict.batch_size, *self.memory_shape))
+        return tensordict
+
+
+class LSTMTransition(SubModel):
+    """Hands memory, mean and covariance of the last belief on: an LSTM has no forecast before it sees its input.
+
+    Args:
+        belief_key: prefix of ``hidden``, ``cell``, ``mean`` and ``cov`` of the last belief.
+        forecast_key: prefix of the same, unchanged.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> td = WithMemory(MomentPrior(torch.ones(2), torch.eye(2)), hidden_size=8)(TensorDict({}))
+        >>> LSTMTransition()(td)["forecast", "mean"]
+        tensor([1., 1.])
+    """
+
+    def __init__(self, *, belief_key: str = "belief", forecast_key: str = "forecast"):
+        names = (*_MEMORY, *_MOMENTS)
+        in_keys, out_keys = ([(key, name) for name in names] for key in (belief_key, forecast_key))
+        super().__init__(nn.Identity(), in_keys, out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the forecast."""
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            tensordict.set(out_key, self.read(tensordict, key))
+        return tensordict
+
+
+class LSTMUpdate(SubModel):
+    r"""Remembers the frame, and believes :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
+
+    The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for
+    each component of the reading (or one for the frame) that is 1 where it was observed, and what ``extra_keys`` name.
+    What was not observed is zero. U starts at zero, so that the belief's standard deviation is ``scale`` at first.
+
+    Args:
+        state_dim: S, the number of outputs.
+        features: size of the encoding, with ``encoding_key``.
+        observation_dim: O, size of the reading, with ``observation_key``.
+        extra_features: size of all entries of ``extra_keys`` together.
+        hidden_size: H.
+        num_layers: L, of cells, each of which reads the hidden state of the one before.
+        loc: mean of each output ``[S]``, in the state's units; zero by default.
+        scale: standard deviation of each output ``[S]``; one by default.
+        floor: smallest variance c, in units of ``scale`` squared.
+        observation_loc: mean of each component of the reading ``[O]``; zero by default.
+        observation_scale: its standard deviation ``[O]``; one by default.
+        encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
+        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; ``None`` for
+            none.
+        extra_keys: further inputs ``[*B, n]``, which are not masked, e.g. ``"steps"`` or ``"action"``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; what it hides may be NaN. The encoding counts as
+            observed where any component is.
+        forecast_key: prefix of ``hidden`` and ``cell`` of the last step.
+        memory_key: prefix of ``hidden`` and ``cell`` ``[*B, L, H]``, written.
+        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``, written.
+
+    Raises:
+        ValueError: if there is nothing to read, or an input has another size than was said.
+        KeyError: if an entry is missing.
+
+    Reference:
+        Hochreiter & Schmidhuber 1997; as a baseline of differentiable filters: Haarnoja et al. 2016, arXiv:1605.07148,
+        and Kloss, Martius & Bohg 2021, arXiv:2012.14313.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> td = TensorDict({("sensor", "encoding"): torch.randn(3, 16)}, [3])
+        >>> td = LSTMTransition()(WithMemory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)(td))
+        >>> LSTMUpdate(2, features=16, hidden_size=8)(td)["belief", "mean"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        *,
+        features: int = 0,
+        observation_dim: int = 0,
+        extra_features: int = 0,
+        hidden_size: int = 128,
+        num_layers: int = 1,
+        loc: Sequence[float] | torch.Tensor | None = None,
+        scale: Sequence[float] | torch.Tensor | None = None,
+        floor: float = 1e-4,
+        observation_loc: Sequence[float] | torch.Tensor | None = None,
+        observation_scale: Sequence[float] | torch.Tensor | None = None,
+        encoding_key: NestedKey | None = ("sensor", "encoding"),
+        observation_key: NestedKey | None = None,
+        extra_keys: Sequence[NestedKey] = (),
+        observed_key: NestedKey = "observed",
+        forecast_key: str = "forecast",
+        memory_key: str = "belief",
+        belief_key: str = "belief",
+    ):
+        for key, size, name in (
+            (encoding_key, features, "features"),
+            (observation_key, observation_dim, "observation_dim"),
+            (tuple(extra_keys) or None, extra_features, "extra_features"),
+        ):
+            if (key is None) != (size == 0):
+                raise ValueError(f"{name}={size} is the size of what {key!r} holds; give both, or 0 and no key.")
+        if encoding_key is None and observation_key is None:
+            raise ValueError("An LSTM needs something to read: give encoding_key and features, or observation_key.")
+        in_size = features + observation_dim + (observation_dim or 1) + extra_features
+        cells = [LSTMCell(hidden_size if layer else in_size, hidden_size) for layer in range(num_layers)]
+        heads = {"mean": nn.Linear(hidden_size, state_dim), "var": nn.Linear(hidden_size, state_dim)}
+        nn.init.zeros_(heads["var"].weight)
+        nn.init.constant_(heads["var"].bias, torch.tensor(1.0).expm1().log().item())  # softplus of it is 1
+        inputs = [key for key in (encoding_key, observation_key) if key is not None]
+        super().__init__(
+            nn.ModuleDict({"cells": nn.ModuleList(cells), **heads}),
+            [(forecast_key, name) for name in _MEMORY] + [*inputs, *extra_keys],
+            [(memory_key, name) for name in _MEMORY] + [(belief_key, name) for name in (*_MOMENTS, "var")],
+            optional_keys=[observed_key],
+        )
+        self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
+        self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
+        self.floor, self.observation_dim = floor, observation_dim or None
+        dtype = torch.get_default_dtype()
+        for name, value, size, default in (
+            ("loc", loc, state_dim, 0.0),
+            ("scale", scale, state_dim, 1.0),
+            ("observation_loc", observation_loc, observation_dim, 0.0),
+            ("observation_scale", observation_scale, observation_dim, 1.0),
+        ):
+            value = torch.as_tensor(default if value is None else value, dtype=dtype)
+            self.register_buffer(name, value.expand(size).clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the memory and the belief."""
+        hidden, cell = (self.read(tensordict, key) for key in self.in_keys[:2])
+        batch_size, features = hidden.shape[:-2], self._features(tensordict)
+        # A cell takes one batch dimension; the tensordict may have none or many.
+        output = features.reshape(-1, self.in_size)
+        states = [part.reshape(-1, self.num_layers, self.hidden_size).unbind(-2) for part in (hidden, cell)]
+        memory = []
+        for layer, *state in zip(self.module["cells"], *states, strict=True):
+            memory.append(layer(output, tuple(state)))
+            output = memory[-1][0]
+        for key, parts in zip(self.out_keys[:2], zip(*memory, strict=True), strict=True):
+            tensordict.set(key, torch.stack(parts, -2).reshape(*batch_size, self.num_layers, self.hidden_size))
+        output = output.reshape(*batch_size, self.hidden_size)
+        mean = self.loc + self.scale * self.module["mean"](output)
+        variance = self.scale.square() * (F.softplus(self.module["var"](output)) + self.floor)
+        for key, value in zip(self.out_keys[2:], (mean, variance.diag_embed(), variance), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _features(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """What the LSTM reads, ``[*B, in_size]``."""
+        observed = tensordict.get(self.optional_keys[0], None)
+        dtype, parts = self.loc.dtype, []
+        if self.encoding_key is not None:
+            encoding = self.read(tensordict, self.encoding_key)
+            parts.append(encoding if observed is None else torch.where(observed.any(-1, keepdim=True), encoding, 0.0))
+        if self.observation_key is not None:
+            reading = self.read(tensordict, self.observation_key)
+            reading = reading.mean(-2) if reading.ndim > tensordict.ndim + 1 else reading
+            reading = (reading - self.observation_loc) / self.observation_scale
+            parts.append(reading if observed is None else torch.where(observed, reading, 0.0))
+            flag = torch.ones_like(reading) if observed is None else observed.expand_as(reading)
+        else:
+            flag = torch.ones_like(parts[0][..., :1]) if observed is None else observed.any(-1, keepdim=True)
+        parts += [flag, *(self.read(tensordict, key) for key in self.extra_keys)]
+        features = torch.cat([part.to(dtype) for part in parts], -1)
+        if features.shape[-1] != self.in_size:
+            sizes = [part.shape[-1] for part in parts]
+            raise ValueError(
+                f"LSTMUpdate was built for {self.in_size} inputs, flags included, and reads {sizes} (encoding, "
+                "reading, flags, extra inputs, as far as there are any). Correct features=, observation_dim= or "
+                "extra_features=."
+            )
+        return features
+
+
+class UnicyclePose(SubModel):
+    r"""A vehicle's pose from estimated velocities: the known motion is not left for a network to learn.
+
+    .. math::
+        p_t = f(p_{t-1}, u_t), \qquad
+        P_t = F P_{t-1} F^T + G \Sigma_t G^T, \qquad
+        \mathrm{Cov}(p_t, u_t) = G \Sigma_t
+
+    with the motion f of :class:`UnicycleTransition`, its Jacobians F and G, and velocities :math:`u_t \sim N(\mu_t,
+    \Sigma_t)`. To first order, and as if errors of the velocities at different times were independent: where they are
+    not (a biased network), the pose is less certain than this says.
+
+    Args:
+        dt: time step in seconds.
+        velocity_key: prefix of ``mean`` ``[*B, 2]`` and ``cov`` ``[*B, 2, 2]`` of (v m/s, theta_dot rad/s) at t.
+        forecast_key: prefix of ``mean`` ``[*B, 5]`` and ``cov`` of [x m, y m, theta rad, v, theta_dot] at t-1, as
+            :class:`LSTMTransition` hands them on.
+        belief_key: prefix of ``mean``, ``cov`` and ``var`` at t, written.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({
+        ...     "forecast": {"mean": torch.zeros(5), "cov": torch.zeros(5, 5)},
+        ...     "velocity": {"mean": torch.tensor([10.0, 0.0]), "cov": torch.eye(2)},
+        ... })
+        >>> td = UnicyclePose(0.1)(td)
+        >>> td["belief", "mean"].tolist(), td["belief", "var"].tolist()
+        ([1.0, 0.0, 0.0, 10.0, 0.0], [0.01..., 0.0025..., 0.01..., 1.0, 1.0])
+    """
+
+    def __init__(
+        self, dt: float, *, velocity_key: str = "velocity", forecast_key: str = "forecast", belief_key: str = "belief"
+    ):
+        in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS]
+        super().__init__(nn.Identity(), in_keys, [(belief_key, name) for name in (*_MOMENTS, "var")])
+        self.dt = dt
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief."""
+        mean, cov, velocity, velocity_cov = (self.read(tensordict, key) for key in self.in_keys)
+        pose, dt = mean[..., :3], self.dt
+        heading = pose[..., 2] + 0.5 * dt * velocity[..., 1]
+        cos, sin, way = heading.cos(), heading.sin(), dt * velocity[..., 0]
+        zero, one = torch.zeros_like(way), torch.ones_like(way)
+        by_pose = _matrix([[one, zero, -way * sin], [zero, one, way * cos], [zero, zero, one]])
+        by_velocity = _matrix([[dt * cos, -0.5 * dt * way * sin], [dt * sin, 0.5 * dt * way * cos], [zero, dt * one]])
+        cross = by_velocity @ velocity_cov
+        pose_cov = by_pose @ cov[..., :3, :3] @ by_pose.mT + cross @ by_velocity.mT
+        cov = torch.cat([torch.cat([pose_cov, cross], -1), torch.cat([cross.mT, velocity_cov], -1)], -2)
+        values = (torch.cat([_move(pose, velocity, dt), velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1))
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+def _matrix(rows: Sequence[Sequence[torch.Tensor]]) -> torch.Tensor:
+    """A matrix ``[*B, M, N]`` from entries ``[*B]``."""
+    return torch.stack([torch.stack(list(row), -1) for row in rows], -2)
