@@ -26,7 +26,20 @@ setup(
         "numpy",
     ],
     extras_require={
+        # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
+        "lerobot": ["pyarrow>=15", "av>=14"],
         "examples": ["tqdm", "matplotlib", "tensorboard"],
-        "test": ["evo", "pytest", "pytest-xdist", "ruff", "import-linter", "build", "wheel", "pre-commit"],
+        "test": [
+            "evo",
+            "pyarrow>=15",
+            "av>=14",
+            "pytest",
+            "pytest-xdist",
+            "ruff",
+            "import-linter",
+            "build",
+            "wheel",
+            "pre-commit",
+        ],
     },
 )

@@ -1,0 +1,97 @@
+"""Frames of a video by the time at which they are shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+EXTRA = "pip install 'torch_denkf[lerobot]'"
+
+
+def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Decode a video once and pair its frames with the times that are asked for.
+
+    By time and not by count: a damaged frame, which decoders leave out without a word, must not shift those after it.
+
+    Args:
+        file: the video.
+        times: s after the video's first frame, ``[n]``, in any order.
+        tolerance: s by which a frame may be off.
+
+    Yields:
+        Indices into ``times``, and the frame for them, RGB uint8 ``[H, W, 3]``. An index comes again if a later frame
+        is nearer; one without any frame within the tolerance never comes.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ValueError: if no frame of the file can be decoded.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"no video {file}; download the data set completely, or pass another camera")
+    order = np.argsort(times, kind="stable")
+    ordered, off = times[order], np.full(len(times), np.inf)
+    any_decoded = False
+    for time, frame in _decoded(file):
+        any_decoded = True
+        if time > ordered[-1] + tolerance:
+            break
+        first, last = np.searchsorted(ordered, [time - tolerance, time + tolerance])
+        near = order[first:last]
+        near = near[np.abs(times[near] - time) < off[near]]
+        if len(near):
+            off[near] = np.abs(times[near] - time)
+            yield near, frame
+    if not any_decoded:
+        raise ValueError(
+            f"no frame of {file} can be decoded: it is damaged (download it anew), or in a codec that OpenCV here "
+            f"lacks, such as AV1 ({EXTRA} brings PyAV, which has it)"
+        )
+
+
+def _decoded(file: Path) -> Iterator[tuple[float, np.ndarray]]:
+    """All frames that can be decoded, in the order in which they are shown."""
+    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    try:
+        # OpenCV's wheels leave AV1, LeRobot's default, to the hardware.
+        if _codec(capture) == "av01":
+            try:
+                import av
+            except ImportError:
+                pass
+            else:
+                yield from _by_pyav(av, file)
+                return
+        yield from _by_opencv(capture)
+    finally:
+        capture.release()
+
+
+def _codec(capture: cv2.VideoCapture) -> str:
+    return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True).decode("latin1").lower()
+
+
+def _by_opencv(capture: cv2.VideoCapture) -> Iterator[tuple[float, np.ndarray]]:
+    # A failed read is the end, or a damaged frame in the middle: then further reads go on behind it.
+    for _ in range(max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))):
+        there, frame = capture.read()
+        if there:
+            yield capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, frame[..., ::-1]
+
+
+def _by_pyav(av, file: Path) -> Iterator[tuple[float, np.ndarray]]:
+    try:
+        container = av.open(str(file))
+    except av.FFmpegError:
+        return
+    with container:
+        stream = container.streams.video[0]
+        start = float((stream.start_time or 0) * stream.time_base)
+        for packet in container.demux(stream):
+            try:
+                for frame in packet.decode():
+                    yield frame.time - start, frame.to_ndarray(format="rgb24")
+            except av.FFmpegError:  # a damaged packet: the next ones may be whole
+                continue
