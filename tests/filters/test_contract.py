@@ -17,7 +17,7 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import ParticleFilter
+from torch_denkf.filters import LSTMFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
 from torch_denkf.transforms import DEnKFTransform
 
@@ -35,6 +35,11 @@ def particles(scheme):
     )
 
 
+def lstm():
+    torch.manual_seed(0)
+    return LSTMFilter(None, state_dim=2, hidden_size=8, observation_dim=2, observation_key="observation")
+
+
 FILTERS = {
     "DEnKF etkf": linear_denkf,
     "DEnKF perturbed": lambda: linear_denkf("perturbed", noisy=True),
@@ -46,8 +51,9 @@ FILTERS = {
     "particles, systematic": lambda: particles("systematic"),
     "particles, soft": lambda: particles("soft"),
     "particles, transport": lambda: particles("transport"),
+    "LSTM": lambda: lstm(),
 }
-FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF"}  # of their own
+FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}  # of their own
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
@@ -125,6 +131,8 @@ def test_unobserved_doubt_grows_and_a_reading_shrinks_it(float64, name):
     frames = TensorDict({"observation": torch.zeros(200, 6, 2)}, [200, 6])
     frames["observed"] = torch.tensor([True] * 3 + [False] * 2 + [True]).reshape(1, 6, 1).expand(200, 6, 1)
     spread = filter.sequence(frames)["belief", "var"].sum(-1).mean(0)
+    if name == "LSTM":  # that it must learn
+        return
     if name == "DEnKF etkf":  # without process noise its members come together
         assert spread[5] < spread[4]
         return

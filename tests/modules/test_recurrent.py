@@ -151,3 +151,14 @@ def test_pose_moves_as_the_unicycle_and_its_covariance_by_jacobians(float64, bat
     torch.testing.assert_close(out["mean"], move(state), rtol=0, atol=1e-13)
     torch.testing.assert_close(out["cov"], J @ joint @ J.mT, rtol=1e-12, atol=1e-12)
     assert out["var"].equal(out["cov"].diagonal(dim1=-2, dim2=-1))
+
+
+def test_inflation_widens_the_belief_and_leaves_its_mean():
+    torch.manual_seed(0)
+    update = LSTMUpdate(2, features=3, hidden_size=4, encoding_key="x", scale=[2.0, 0.5])
+    td = TensorDict({"x": torch.randn(5, 3), "forecast": {k: torch.randn(5, 1, 4) for k in ("hidden", "cell")}}, [5])
+    plain = update(td.copy())["belief"]
+    update.inflation = 1.5
+    wide = update(td.copy())["belief"]
+    torch.testing.assert_close(wide["var"], 2.25 * plain["var"])
+    assert wide["mean"].equal(plain["mean"])

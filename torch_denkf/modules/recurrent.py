@@ -104,6 +104,7 @@ class LSTMUpdate(SubModel):
         loc: mean of each output ``[S]``, in the state's units; zero by default.
         scale: standard deviation of each output ``[S]``; one by default.
         floor: smallest variance c, in units of ``scale`` squared.
+        inflation: factor on the belief's standard deviations; 1 for none.
         observation_loc: mean of each component of the reading ``[O]``; zero by default.
         observation_scale: its standard deviation ``[O]``; one by default.
         encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
@@ -145,6 +146,7 @@ class LSTMUpdate(SubModel):
         loc: Sequence[float] | torch.Tensor | None = None,
         scale: Sequence[float] | torch.Tensor | None = None,
         floor: float = 1e-4,
+        inflation: float = 1.0,
         observation_loc: Sequence[float] | torch.Tensor | None = None,
         observation_scale: Sequence[float] | torch.Tensor | None = None,
         encoding_key: NestedKey | None = ("sensor", "encoding"),
@@ -178,7 +180,7 @@ class LSTMUpdate(SubModel):
         )
         self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
-        self.floor, self.observation_dim = floor, observation_dim or None
+        self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
         dtype = torch.get_default_dtype()
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
@@ -204,7 +206,7 @@ class LSTMUpdate(SubModel):
             tensordict.set(key, torch.stack(parts, -2).reshape(*batch_size, self.num_layers, self.hidden_size))
         output = output.reshape(*batch_size, self.hidden_size)
         mean = self.loc + self.scale * self.module["mean"](output)
-        variance = self.scale.square() * (F.softplus(self.module["var"](output)) + self.floor)
+        variance = (self.inflation * self.scale).square() * (F.softplus(self.module["var"](output)) + self.floor)
         for key, value in zip(self.out_keys[2:], (mean, variance.diag_embed(), variance), strict=True):
             tensordict.set(key, value)
         return tensordict
