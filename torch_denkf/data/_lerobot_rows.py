@@ -55,10 +55,10 @@ def recording_from_rows(
         state_key: numbers of the state, ``[N, S]`` or ``[N]``; a list of keys puts them one behind the other.
         action_key: likewise; None for none, as are rows without an ``"action"``.
         episode_key: a number for each row, the same in all rows of an episode and in no others.
-        size: (H, W) to scale the images to. None keeps them as they are: uint8 images are then not copied, and stay
-            memory-mapped if they are.
+        size: (H, W) to scale the images to. None keeps their size: uint8 images of a tensordict are then not copied,
+            and stay memory-mapped if they are.
         names: of the state's numbers.
-        folder: holds the scaled images in a file that goes with the recording; None keeps them in memory.
+        folder: holds copied images in a file that goes with the recording; None keeps them in memory.
 
     Returns:
         What :class:`torch_denkf.data.LeRobotExperienceReplay` takes instead of a folder. Times count from 0 in each
@@ -128,8 +128,12 @@ def recording_from_rows(
 def _get(rows: TensorDictBase, key: NestedKey) -> Tensor | TensorDictBase:
     value = rows.get(key, None)
     if value is None:
-        raise KeyError(f"the rows lack {key!r}; they have {sorted(map(str, rows.keys(True, True)))}")
+        raise KeyError(f"the rows lack {_text(key)}; they have {', '.join(sorted(map(_text, rows.keys(True, True))))}")
     return value
+
+
+def _text(key: NestedKey) -> str:
+    return key if isinstance(key, str) else "/".join(key)
 
 
 def _numbers(rows: TensorDictBase, keys: NestedKey | list[NestedKey]) -> Tensor:
@@ -138,22 +142,22 @@ def _numbers(rows: TensorDictBase, keys: NestedKey | list[NestedKey]) -> Tensor:
         value = _get(rows, key)
         if not isinstance(value, Tensor) or value.ndim > 2:
             found = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "several entries: pass a list"
-            raise ValueError(f"{key!r} must be numbers [N, n], it has {found}")
+            raise ValueError(f"{_text(key)} must be numbers [N, n], it has {found}")
         parts.append(value.reshape(len(rows), -1).float())
     return torch.cat(parts, -1)
 
 
 def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
     value = _get(rows, key)
-    if isinstance(value, TensorDictBase):
+    if isinstance(value, TensorDictBase) and len(list(value.keys())):  # texts are tensordicts, too, of no keys
         cameras = list(value.keys())
         if len(cameras) != 1:
-            raise KeyError(f"{key!r} has the cameras {cameras}; pass pixels_key= of one of them")
+            raise KeyError(f"{_text(key)} has the cameras {', '.join(cameras)}; pass pixels_key= of one of them")
         value = value.get(cameras[0])
     if not isinstance(value, Tensor):
         raise TypeError(
-            f"{key!r} holds {type(value).__name__}, not images; decode them first, or pass the data set's folder to "
-            "LeRobotExperienceReplay"
+            f"{_text(key)} holds {type(value).__name__}, not images; decode them first, or pass the data set's "
+            "folder to LeRobotExperienceReplay"
         )
     if value.ndim == 4 and (value.dtype == torch.uint8 or value.dtype.is_floating_point):
         if value.shape[1] == 3:
@@ -161,7 +165,7 @@ def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
         if value.shape[-1] == 3:
             return value.permute(0, 3, 1, 2)
     raise ValueError(
-        f"{key!r} must be [N, 3, H, W] or [N, H, W, 3], uint8 or floating, got {value.dtype} {tuple(value.shape)}"
+        f"{_text(key)} must be [N, 3, H, W] or [N, H, W, 3], uint8 or floating, got {value.dtype} {tuple(value.shape)}"
     )
 
 
@@ -170,6 +174,6 @@ def _count_from_start(episode: Tensor, key: NestedKey) -> Tensor:
     names, lengths = torch.unique_consecutive(episode, return_counts=True)
     if len(names.unique()) < len(names):
         torn = names[(names[:, None] == names).sum(1) > 1].unique().tolist()
-        raise ValueError(f"by {key!r}, the rows of these episodes are not in one piece: {torn[:10]}; sort them")
+        raise ValueError(f"by {_text(key)}, the rows of these episodes are not in one piece: {torn[:10]}; sort them")
     starts = lengths.cumsum(0) - lengths
     return (torch.arange(len(episode)) - starts.repeat_interleave(lengths)).unsqueeze(-1)

@@ -269,11 +269,13 @@ class _SampledFrames(Transform):
 
     def __init__(self, images: Tensor, begin: dict[int, int]):
         super().__init__()
-        self._images, self._begin = images, begin
+        self._images = images
+        self._numbers, order = torch.tensor(list(begin)).sort()
+        self._begins = torch.tensor(list(begin.values()))[order]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         episode, frame = tensordict["episode"].reshape(-1), tensordict["frame"].reshape(-1)
-        row = frame + torch.tensor([self._begin[number] for number in episode.tolist()], dtype=torch.long)
+        row = frame + self._begins[torch.searchsorted(self._numbers, episode)]
         pixels = self._images[row].float().div_(255)
         tensordict = tensordict.copy()  # data[:] hands out the storage itself
         return tensordict.set("pixels", pixels.reshape(*tensordict.batch_size, *pixels.shape[1:]))
