@@ -130,6 +130,36 @@ class DEnKFLoss(SequenceLoss):
         """The paper's loss: squared errors of the means of belief, forecast and sensor, equally weighted."""
         return cls(filter, **{"score": "mse", **kwargs})
 
+    @classmethod
+    def ad_enkf(cls, filter: Filter, *, detach_every: int | None = None, **kwargs) -> DEnKFLoss:
+        r"""Training without true states: the likelihood of the innovations alone, as in AD-EnKF.
+
+        .. math:: -\log p(y_{1:T}) \approx -\sum_t \log N(y_t; H \bar x_{t|t-1}, H C_{t|t-1} H^T + R)
+
+        with the mean and the sample covariance of the forecast ensemble, here as the mean over time steps and
+        sequences. Whatever has a gradient is learned: dynamics, process noise, observation noise. A sensor that is
+        learned as well must keep its meaning by other terms: a constant reading is the most likely one.
+
+        Args:
+            filter: the filter to train; with the analysis scheme ``"perturbed"`` it is the paper's.
+            detach_every: length of the sub-sequences between which the gradient is cut (the paper's AD-EnKF-T);
+                chaotic dynamics need it.
+            **kwargs: passed on to the constructor, e.g. the weights of further terms.
+
+        Reference:
+            Chen, Sanz-Alonso, Willett, "Autodifferentiable ensemble Kalman filters", SIAM J. Math. Data Sci. 4, 2022,
+            arXiv:2107.07687.
+
+        Example:
+            >>> from tensordict import TensorDict
+            >>> from torch_denkf.filters import DEnKF
+            >>> loss = DEnKFLoss.ad_enkf(DEnKF.paper(5, 2, ensemble_size=4), detach_every=10)
+            >>> sorted(loss(TensorDict({"pixels": torch.rand(2, 3, 6, 50, 150)}, [2, 3])).keys())
+            ['loss_nll']
+        """
+        weights = {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0}
+        return cls(filter, detach_every=detach_every, **{**weights, **kwargs})
+
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):

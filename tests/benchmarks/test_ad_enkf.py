@@ -1,0 +1,158 @@
+"""Likelihood and gradient of AD-EnKF: a Kalman filter, torch's own density and finite differences are the oracles."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import MultivariateNormal
+
+from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.modules import EnsembleAnalysis, GaussianPrior
+from torch_denkf.objectives import DEnKFLoss
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from ad_enkf import (
+    TaperedAnalysis,
+    climate_of,
+    forcing_of,
+    gaspari_cohn,
+    learn,
+    make_filter,
+    noise_of,
+    observe,
+    on_circle,
+    simulate,
+)
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "perturbed"])
+def test_a_large_ensemble_has_the_likelihood_and_the_gradient_of_the_kalman_filter(float64, scheme):
+    F, Q, H, R = linear_system()
+    mean, std, size = [1.0, -1.0], [1.0, 2.0], 40_000
+    readings = torch.randn(8, 2)
+
+    exact = F.clone().requires_grad_()
+    m, P, log_likelihood = torch.tensor(mean), torch.diag(torch.tensor(std) ** 2), 0.0
+    for reading in readings[1:]:  # the first belief is the prior
+        m, P = kalman_predict(m, P, exact, Q)
+        update = kalman_update(m, P, reading, H, R)
+        m, P, log_likelihood = update.mean, update.cov, log_likelihood + update.log_likelihood.squeeze()
+    log_likelihood.backward()
+
+    prior = GaussianPrior(mean, std, ensemble_size=size)
+    filter = linear_denkf(scheme, ensemble_size=size, noisy=True, initial=prior)
+    filter["transition"].matrix = estimate = F.clone().requires_grad_()
+    loss = DEnKFLoss.ad_enkf(filter, reduction="sum")
+    value = loss(TensorDict({"observation": readings}, [8]))["loss_nll"]
+    value.backward()
+    # Seven steps, to each of which sampling adds a relative error of sqrt(2 / 40,000) = 0.007 of S.
+    torch.testing.assert_close(-value, log_likelihood, rtol=0, atol=0.1)
+    assert (estimate.grad + exact.grad).norm() < 0.03 * exact.grad.norm()
+
+
+def test_only_the_likelihood_counts():
+    loss = DEnKFLoss.ad_enkf(linear_denkf(), detach_every=5)
+    assert (loss.weights, loss.detach_every, loss.out_keys) == ({"nll": 1.0}, 5, ["loss_nll"])
+    assert "state" not in loss.in_keys
+    assert DEnKFLoss.ad_enkf(linear_denkf(), kl=0.1).weights == {"nll": 1.0, "kl": 0.1}
+
+
+# ------------------------------------------------------------------------------------------------------ tapering
+
+
+def test_taper_is_a_correlation_with_two_smooth_joints(float64):
+    torch.testing.assert_close(gaspari_cohn(torch.tensor([0.0, 1.0, 2.0, 7.0])), torch.tensor([1, 5 / 24, 0, 0]))
+    for joint in (1.0, 2.0):
+        d = torch.tensor([joint - 1e-7, joint + 1e-7], requires_grad=True)
+        gaspari_cohn(d).sum().backward()
+        torch.testing.assert_close(*d.grad, rtol=0, atol=1e-5)
+    places = torch.arange(40)
+    distance = on_circle(places, places, 40)
+    assert distance[0, [1, 20, 39]].tolist() == [1, 20, 1]
+    assert torch.linalg.eigvalsh(gaspari_cohn(distance / 5)).amin() > 0
+
+
+def members(dims, variables=8, size=5):
+    ensemble = torch.randn(3, size, variables)
+    sensor = {"ensemble": torch.randn(3, len(dims)), "noise": torch.rand(3, len(dims)) + 0.5}
+    forecast = {"ensemble": ensemble, "observation": ensemble[..., dims]}
+    return TensorDict(
+        {"forecast": forecast, "sensor": sensor, "noise": {"analysis": torch.randn(3, size, len(dims))}}, [3]
+    )
+
+
+def test_without_a_taper_it_is_the_librarys_analysis(float64):
+    td = members([0, 2, 4, 6])
+    tapered = TaperedAnalysis([0, 2, 4, 6], 8, 1e12)(td.copy())
+    expected = EnsembleAnalysis("perturbed")(td.copy())
+    for key in EnsembleAnalysis().out_keys:
+        torch.testing.assert_close(tapered[key], expected[key], rtol=0, atol=1e-10)
+
+
+def test_tapered_update_is_its_formula(float64):
+    dims, td = [0, 2, 4, 6], members([0, 2, 4, 6])
+    out = TaperedAnalysis(dims, 8, 1.5)(td.copy())
+    forecast, y, R = td["forecast", "ensemble"], td["sensor", "ensemble"], td["sensor", "noise"]
+    gap = torch.arange(8.0).unsqueeze(-1) - torch.arange(8.0)
+    C = torch.stack([row.mT.cov() for row in forecast]) * gaspari_cohn(torch.minimum(gap % 8, -gap % 8) / 1.5)
+    S = C[:, dims][..., dims] + R.diag_embed()
+    density = MultivariateNormal(forecast.mean(1)[:, dims], S)
+    torch.testing.assert_close(out["info", "log_likelihood"].squeeze(-1), density.log_prob(y), rtol=0, atol=1e-11)
+    gain = C[..., dims] @ S.inverse()
+    mean = forecast.mean(1) + (gain @ (y - forecast.mean(1)[:, dims]).unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(out["belief", "mean"], mean, rtol=0, atol=1e-11)  # the perturbations have none
+
+
+# ------------------------------------------------------------------------------------------------------ Lorenz-96
+
+
+@pytest.mark.parametrize(("every", "radius"), [(1, None), (2, 3.0)])
+def test_gradient_is_that_of_finite_differences(float64, every, radius):
+    rng = torch.Generator().manual_seed(0)
+    record = observe(simulate(8, 6, 2, rng), every, rng)
+    filter = make_filter(8, every, 10, climate=(2.3, 3.6), radius=radius, learn_noise=True)
+    filter.draw_noise(record)  # the same noise in every evaluation
+    assert set(record["noise"].keys()) == {"initial", "motion", "analysis"}
+    loss = DEnKFLoss.ad_enkf(filter)
+    loss(record)["loss_nll"].backward()
+    forcing, log_variance, step = forcing_of(filter), filter["transition"].module["noise"].log_variance, 1e-6
+    for parameter, index in ((forcing, ()), (log_variance, (3,))):
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                parameter[index] += sign * step
+                values.append(loss(record)["loss_nll"])
+                parameter[index] -= sign * step
+        # Rounding of values of size 1e2 divided by the step, 1e-8, and the third derivative times its square.
+        expected = (values[0] - values[1]) / (2 * step)
+        torch.testing.assert_close(parameter.grad[index], expected, rtol=1e-6, atol=1e-6)
+        assert abs(expected) > 1e-3
+
+
+@pytest.mark.parametrize("start", [5.0, 11.0])
+def test_forcing_is_learned_from_observations_alone(start):
+    rng = torch.Generator().manual_seed(0)
+    record = observe(simulate(40, 400, 1, rng), 1, rng)
+    assert set(record.keys()) == {"observation"}, "no true state is anywhere in training"
+    filter = make_filter(40, 1, 30, climate=climate_of(record), radius=5.0)
+    with torch.no_grad():
+        forcing_of(filter).fill_(start)
+    path = learn(filter, record, updates=60, rng=rng, batch=4, warm_up=5, window=10, detach_every=5, rate=0.3)
+    assert path[0] == start
+    # Of four seeds the largest error was 0.19: 400 steps do not tell F better.
+    assert abs(path[-1] - 8.0) < 0.4
+    assert abs(path[10] - 8.0) < abs(start - 8.0) / 2
+
+
+def test_model_noise_is_learned_towards_the_truth():
+    rng = torch.Generator().manual_seed(0)
+    record = observe(simulate(40, 400, 1, rng), 1, rng)
+    filter = make_filter(40, 1, 30, climate=climate_of(record), radius=5.0, learn_noise=True)
+    with torch.no_grad():
+        forcing_of(filter).fill_(8.0)
+    learn(filter, record, updates=60, rng=rng, batch=4, warm_up=5, window=10, detach_every=5, rate=0.3)
+    assert 0.1 < noise_of(filter).mean() < 0.3  # 0.2 is true, 1.0 was the start; four seeds gave 0.16 to 0.18
