@@ -418,10 +418,12 @@ def test_errors():
         DEnKFLoss(filter)(frames.exclude("target_observation"))
     with pytest.raises(KeyError, match="target_observation"):
         DEnKFLoss(filter, **only("observation"))(frames.exclude("target_observation"))
-    kf = linear_kalman()
     td = TensorDict({"observation": torch.randn(4, 2), "state": torch.randn(4, 2)}, [4])
+    lstm = LSTMFilter(None, state_dim=2, observation_dim=2, observation_key="observation")
     with pytest.raises(KeyError, match="no observation model"):
-        DEnKFLoss(kf, **only("sensor"))(td)
+        DEnKFLoss(lstm, **only("sensor"))(td)
+    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing"):
+        DEnKFLoss(linear_kalman(), **only("sensor"))(td)
     with pytest.raises(KeyError, match="measurement"):
         DEnKFLoss(filter)(frames.exclude("measurement"))
     with pytest.raises(AttributeError, match="set_keys"):
