@@ -19,7 +19,7 @@ from torch_denkf.data._demo_files import COLLECTION, MANIFEST, read_demo, read_m
 from torch_denkf.data.collect_ur5 import collect_ur5_demos, main
 from torch_denkf.envs import UR5Expert, UR5TableEnv, _collect_ur5
 
-BLIND = {"frames": None, "seed": 3, "max_steps": 40}
+BLIND = {"frames": None, "seed": 3}
 DEMOS = 6
 
 
@@ -51,15 +51,30 @@ def test_demos_are_the_experts_episodes(unbroken):
     demos = demos_of(unbroken)
     assert [demo.task for demo in demos] == ["pick", "push", "put_down"] * 2
     assert len({demo.seed for demo in demos}) == DEMOS
-    for demo in demos[:3]:
+    for demo in demos:  # by an environment of its own, which has not seen the others
         env = UR5TableEnv(demo.task, from_pixels=False)
         env.set_seed(demo.seed)
         rollout = env.rollout(350, UR5Expert(env))
         assert rollout["next", "success"][-1]
         for key in ("state", "action"):
-            assert (rollout[key][:40].numpy() == getattr(demo, key)).all()
-        assert (rollout["success"][:40].squeeze(-1).numpy() == demo.success).all()
+            assert (rollout[key].numpy() == getattr(demo, key)).all()
+        assert (rollout["success"].squeeze(-1).numpy() == demo.success).all()
         assert demo.pixels.shape == (0, 3, 224, 224)
+
+
+@pytest.mark.parametrize("domain", ["sim", "real_like"])
+def test_demos_do_not_follow_from_those_before_them(domain):
+    """Seed 0, demo 4: with the fingers left where demo 1's episode ended, 600 of its states came out otherwise."""
+    options = _collect_ur5.Options((8, 8), None, domain, ("pick", "push", "put_down"), 0, 350, 0.0)
+    for number in (1, 2):
+        _collect_ur5._episode(options, number, 0)
+    later = [vars(_collect_ur5._episode(options, number, 0)) for number in (4, 5)]
+    for number, demo in zip((4, 5), later, strict=True):
+        _collect_ur5._close()
+        alone = vars(_collect_ur5._episode(options, number, 0))
+        for key, value in demo.items():
+            assert np.array_equal(value, alone[key]), key
+    _collect_ur5._close()
 
 
 @pytest.mark.parametrize("domain", ["sim", "real_like"])
@@ -100,7 +115,7 @@ def test_a_killed_run_goes_on_with_other_processes(unbroken, tmp_path):
     """SIGKILL in the middle of a run with two workers, then one process: the same bytes as one process alone."""
     root = tmp_path / "killed"
     command = [sys.executable, "-m", "torch_denkf.data.collect_ur5", "--out", str(root), "--demos", "40"]
-    command += ["--no-pixels", "--seed", "3", "--max-steps", "40", "--processes", "2"]
+    command += ["--no-pixels", "--seed", "3", "--processes", "2"]
     with subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}) as run:
         deadline = time.monotonic() + 120
         while len(read_manifest(root)) < 3:
@@ -232,7 +247,7 @@ def test_the_callers_generator_is_left_alone(tmp_path):
     ("change", "text"),
     [
         ({"seed": 4}, "seed 3 instead of 4"),
-        ({"max_steps": 41, "noise": 0.1}, "max_steps 40 instead of 41, noise 0.0 instead of 0.1"),
+        ({"max_steps": 41, "noise": 0.1}, "max_steps 350 instead of 41, noise 0.0 instead of 0.1"),
         ({"frames": 2}, "frames None instead of 2"),
         ({"tasks": ["push"]}, r"tasks \['pick', 'push', 'put_down'\] instead of \['push'\]"),
     ],
@@ -271,7 +286,7 @@ def test_options_out_of_range(tmp_path):
 
 def test_the_command(tmp_path, capsys, unbroken):
     out = tmp_path / "demos"
-    words = ["--out", str(out), "--no-pixels", "--seed", "3", "--max-steps", "40", "--processes", "1", "--demos", "2"]
+    words = ["--out", str(out), "--no-pixels", "--seed", "3", "--processes", "1", "--demos", "2"]
     assert main(words) == 0
     assert capsys.readouterr().out == f"2 demos in {out}: 2 made, 0 were there; 0 failed episodes left out\n"
     expected = content(unbroken)
