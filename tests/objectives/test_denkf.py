@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, A, E, M, S, linear_kalman, toy_denkf, toy_frames
 from tests.filters.test_kalman import joint_gaussian
+from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import Select, StochasticMLP
 from torch_denkf.objectives import DEnKFLoss
 
