@@ -21,7 +21,7 @@ from torch_denkf.envs.ur5 import STEPS, UR5TableEnv
 from torch_denkf.envs.ur5_expert import UR5Expert
 
 DOMAINS = ("sim", "real_like")
-DRAWS = 20  # episodes tried for a demo; the expert fails less than once in a hundred
+DRAWS = 20  # episodes tried for a demo; the expert seldom fails
 
 
 @dataclass(frozen=True)
