@@ -110,13 +110,16 @@ def test_seeds_are_episodes():
     assert torch.get_rng_state().equal(state), "its own generator"
 
 
-def test_an_episode_leaves_nothing_to_the_next():
-    env, fresh = blind("put_down", max_steps=20), blind("put_down", max_steps=20)
+@pytest.mark.parametrize("task", ["pick", "push", "put_down"])
+def test_an_episode_leaves_nothing_to_the_next(task):
+    env = blind(task)
     env.set_seed(1)
-    env.rollout(20, UR5Expert(env))
-    env.set_seed(2)
-    fresh.set_seed(2)
-    assert (env.rollout(20, UR5Expert(env)) == fresh.rollout(20, UR5Expert(fresh))).all()
+    env.rollout(350, UR5Expert(env))
+    for seed in (2, 3):  # to the end: differences in the last bit take their time
+        fresh = blind(task)
+        env.set_seed(seed)
+        fresh.set_seed(seed)
+        assert (env.rollout(350, UR5Expert(env)) == fresh.rollout(350, UR5Expert(fresh))).all()
 
 
 def test_variety():

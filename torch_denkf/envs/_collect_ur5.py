@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import torch
 
@@ -129,10 +128,6 @@ def _episode(options: Options, number: int, attempt: int) -> Demo | None:
     env = _envs[options, task]
     streams = np.random.SeedSequence([options.seed, number, attempt]).spawn(3)
     episode, shots, noise = (int(stream.generate_state(1, np.uint64)[0] >> np.uint64(1)) for stream in streams)
-    # The inverse kinematics start from where the last episode left the fingers: a difference in the last bit, which
-    # contacts make larger. A demo must not follow from those that this process made before.
-    for data in (env._scene.data, env._scene.scratch):
-        mujoco.mj_resetData(env._scene.model, data)
     env._set_seed(episode)  # set_seed would seed torch, too, and that is the caller's
     expert = UR5Expert(noise=options.noise, generator=torch.Generator().manual_seed(noise))
     drawn: list[int] = []

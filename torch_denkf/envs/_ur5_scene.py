@@ -101,6 +101,15 @@ class UR5Scene:
         if position is not None:
             self.model.geom_pos[self.goal_geom, :2] = position[:2]
 
+    def forget(self) -> None:
+        """Keeps nothing of the last episode, controls and warm start included.
+
+        Also where inverse kinematics are solved: they would start from where the fingers were, and end at a difference
+        in the last bit, which contacts make larger.
+        """
+        for data in (self.data, self.scratch):
+            mujoco.mj_resetData(self.model, data)
+
     def reset(self, joints: np.ndarray, position: np.ndarray, rotation: np.ndarray, settle: int = 0) -> None:
         """Starts anew, at rest, with these joints ``[7]`` and the object there (quaternion).
 
@@ -110,9 +119,7 @@ class UR5Scene:
             rotation: of the object, a quaternion w, x, y, z.
             settle: simulation steps without gravity, in which the fingers close on what is between them.
         """
-        mujoco.mj_resetData(
-            self.model, self.data
-        )  # keeps nothing of the last episode, controls and warm start included
+        self.forget()
         self.data.qpos[:] = self.pose_with(joints)
         self.data.qpos[self.object_qpos] = np.concatenate([position, rotation])
         self.target = np.concatenate([joints[:6] - self.offset, joints[6:7]])

@@ -150,6 +150,7 @@ class UR5TableEnv(EnvBase):
         streams = np.random.SeedSequence(int(self.rng.integers(2**63))).spawn(3)
         draws, self._noise, frames = (np.random.default_rng(stream) for stream in streams)
         scene = self._scene
+        scene.forget()
         self._episode = episode = self._tasks.draw_episode(scene, self.task, draws, STEPS)
         scene.shape_object(episode.kind, episode.half_size, episode.colour)
         scene.show_goal(None if self.task == "pick" else episode.goal)
