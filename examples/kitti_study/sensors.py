@@ -111,7 +111,16 @@ def train_sensor(
 
 
 def unseen_readings(
-    sensor: SubModel, fold: Fold, *, kind: str, facts: Statistics, out: Path, cache: Path, seed: int, updates: int
+    sensor: SubModel,
+    fold: Fold,
+    *,
+    kind: str,
+    facts: Statistics,
+    out: Path,
+    cache: Path,
+    seed: int,
+    updates: int,
+    lr: float = 1e-3,
 ) -> list[tuple[TensorDict, TensorDict, float]]:
     """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
 
@@ -130,7 +139,7 @@ def unseen_readings(
         folder = out / ("without-" + "-".join(half))
         held_out = [part for part in fold.tune if part.stream.drive in half]
         settings = {"kind": kind, "facts": facts, "out": folder, "cache": cache, "seed": seed, "updates": updates}
-        train_sensor(stand_in, parts, held_out, lr=1e-3, keep="last", **settings)
+        train_sensor(stand_in, parts, held_out, lr=lr, keep="last", **settings)
         readers |= dict.fromkeys(half, stand_in)
     result = []
     for part in fold.tune:
@@ -184,10 +193,10 @@ def sensor_of_fold(
     facts = statistics(fold.train, cache)
     sensor = SENSORS[kind](facts)
     common = {"kind": kind, "facts": facts, "cache": cache, "seed": seed}
-    rates = {"updates": updates}
+    rates, lr = {"updates": updates}, 2e-3
     if pretrained is not None:
         sensor.load_state_dict(pretrained.state_dict())
-        rates = {"updates": fine_tuning, "lr": 1e-3, "keep": "last"}
-    read = unseen_readings(sensor, fold, out=out, updates=fine_tuning, **common) if fold.shared else []
+        rates, lr = {"updates": fine_tuning, "lr": 1e-3, "keep": "last"}, 1e-3
+    read = unseen_readings(sensor, fold, out=out, lr=lr, updates=rates["updates"], **common) if fold.shared else []
     train_sensor(sensor, fold.train, fold.validation, out=out / "sensor", **common, **rates)
     return SensorOfFold(kind, sensor, facts, read or unseen_readings(sensor, fold, out=out, updates=0, **common))

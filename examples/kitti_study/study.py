@@ -66,8 +66,8 @@ class Study:
 def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
     """The fold that leaves ``test`` out.
 
-    Without rendered drives the three that follow the test drive, in turn, validate (one) and tune (two). With them all
-    drives train both sensor and filter, and rendered drives validate.
+    All others train both sensor and filter, see ``unseen_readings``; rendered drives validate, or, without them, the
+    drive that follows the test drive.
     """
     drives = list(dict.fromkeys(stream.drive for stream in streams))
     of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
@@ -77,17 +77,11 @@ def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_
     def parts(names: Sequence[str], weight: float = 1.0) -> list[Part]:
         return [Part(s, weight=weight / len(names) / len(of[name])) for name in names for s in of[name]]
 
+    if len(others) < 2 + (not held_out):
+        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
     if not held_out:
-        tuning = 2 if len(others) > 4 else 1
-        validation, tune, rest = others[:1], others[1 : 1 + tuning], others[1 + tuning :]
-        if not rest:
-            raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
-        sensor, tuned, checked = parts(rest), parts(tune), parts(validation)
-        return Fold(
-            test, with_spans(with_disturbances(sensor)), *map(with_disturbances, (tuned, checked)), test=of[test]
-        )
-    if len(others) < 2:
-        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; two must be left")
+        own, checked = parts(sorted(others[1:], key=lambda name: -_rows(of[name][0]))), parts(others[:1])
+        return Fold(test, with_spans(with_disturbances(own)), *map(with_disturbances, (own, checked)), test=of[test])
     own = parts(sorted(others, key=lambda name: -_rows(of[name][0])))
     rendered = [replace(part, weight=1.5 / len(train)) for part in train]
     checked = [replace(part, weight=1 / len(held_out)) for part in held_out]
