@@ -150,6 +150,7 @@ def calibration(belief: TensorDict, truth: Tensor) -> dict[str, float]:
     members = belief["belief", "ensemble"].shape[1] if equal else None
     mean, variance = (belief["belief", name][1:, VELOCITIES].double() for name in ("mean", "var"))
     truth = truth[1:, VELOCITIES]
+    variance = variance.clamp_min(1e-8)  # particles that are all the same have none, and no likelihood
     covered = interval_coverage(mean, variance, truth, level=0.9)
     covariance = torch.diag_embed(variance)
     return {
