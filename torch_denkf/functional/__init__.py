@@ -14,6 +14,7 @@ from torch_denkf.functional.random_bits import random_keep_mask, random_signs, r
 from torch_denkf.functional.resampling import effective_sample_size, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
 from torch_denkf.functional.transport import transport_resample
+from torch_denkf.functional.unicycle import unicycle_jacobians, unicycle_move
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
@@ -59,6 +60,8 @@ __all__ = [
     "soft_resample",
     "systematic_resample",
     "transport_resample",
+    "unicycle_move",
+    "unicycle_jacobians",
     "weighted_mean",
     "weighted_var",
     "crps_weighted",

@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 
+from torch_denkf.functional import unicycle_jacobians
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -200,17 +201,8 @@ class UnicycleNoise(_MappedNoise):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the covariance."""
-        heading = self.read(tensordict, self.belief_key)[..., 2]
-        forecast = self.read(tensordict, self.forecast_key)
-        speed, dt = forecast[..., 3], self.dt
-        heading = heading + 0.5 * dt * forecast[..., 4]
-        cos, sin, zero = heading.cos(), heading.sin(), torch.zeros_like(heading)
-        rows = [
-            torch.stack([dt * cos, -0.5 * dt**2 * speed * sin], -1),
-            torch.stack([dt * sin, 0.5 * dt**2 * speed * cos], -1),
-            torch.stack([zero, zero + dt], -1),
-            torch.stack([zero + 1, zero], -1),
-            torch.stack([zero, zero + 1], -1),
-        ]
-        pad = forecast.shape[-1] - len(rows)
-        return self._write(tensordict, F.pad(torch.stack(rows, -2), (0, 0, 0, pad)))
+        before, forecast = self.read(tensordict, self.belief_key), self.read(tensordict, self.forecast_key)
+        _, moved = unicycle_jacobians(before[..., :3], forecast[..., 3:5], self.dt)
+        own = torch.eye(2, dtype=moved.dtype, device=moved.device).expand(*moved.shape[:-2], 2, 2)
+        matrix = torch.cat([moved, own], -2)
+        return self._write(tensordict, F.pad(matrix, (0, 0, 0, forecast.shape[-1] - 5)))

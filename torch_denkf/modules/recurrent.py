@@ -15,8 +15,9 @@ from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
+from torch_denkf.functional import unicycle_jacobians, unicycle_move
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules.unicycle import _move
+
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
 
@@ -278,21 +279,13 @@ class UnicyclePose(SubModel):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief."""
         mean, cov, velocity, velocity_cov = (self.read(tensordict, key) for key in self.in_keys)
-        pose, dt = mean[..., :3], self.dt
-        heading = pose[..., 2] + 0.5 * dt * velocity[..., 1]
-        cos, sin, way = heading.cos(), heading.sin(), dt * velocity[..., 0]
-        zero, one = torch.zeros_like(way), torch.ones_like(way)
-        by_pose = _matrix([[one, zero, -way * sin], [zero, one, way * cos], [zero, zero, one]])
-        by_velocity = _matrix([[dt * cos, -0.5 * dt * way * sin], [dt * sin, 0.5 * dt * way * cos], [zero, dt * one]])
+        pose = mean[..., :3]
+        by_pose, by_velocity = unicycle_jacobians(pose, velocity, self.dt)
         cross = by_velocity @ velocity_cov
         pose_cov = by_pose @ cov[..., :3, :3] @ by_pose.mT + cross @ by_velocity.mT
         cov = torch.cat([torch.cat([pose_cov, cross], -1), torch.cat([cross.mT, velocity_cov], -1)], -2)
-        values = (torch.cat([_move(pose, velocity, dt), velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1))
+        moved = unicycle_move(pose, velocity, self.dt)
+        values = (torch.cat([moved, velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1))
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
         return tensordict
-
-
-def _matrix(rows: Sequence[Sequence[torch.Tensor]]) -> torch.Tensor:
-    """A matrix ``[*B, M, N]`` from entries ``[*B]``."""
-    return torch.stack([torch.stack(list(row), -1) for row in rows], -2)

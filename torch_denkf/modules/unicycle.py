@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import nn
 
-from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.pairs import within_pair
 from torch_denkf.modules.transition import StochasticTransition
@@ -92,7 +92,7 @@ class UnicycleTransition(StochasticTransition):
             history = self.read(tensordict, self.in_keys[1])
             change = change + self.raw_trend.sigmoid() * (history[..., 0, :] - history[..., 1, :])
         velocity = velocity + change
-        tensordict.set(self.out_keys[0], torch.cat([_move(pose, velocity, self.dt), velocity], -1))
+        tensordict.set(self.out_keys[0], torch.cat([unicycle_move(pose, velocity, self.dt), velocity], -1))
         return tensordict
 
 
@@ -150,22 +150,14 @@ class UnicycleMotion(SubModel):
             corrected = torch.where(past, analysed, history)
             moved = pose
             for step in history.unbind(-2):  # back to where the history begins
-                moved = _move(moved, step, -self.dt)
+                moved = unicycle_move(moved, step, -self.dt)
             for step in reversed(corrected.unbind(-2)):
-                moved = _move(moved, step, self.dt)
+                moved = unicycle_move(moved, step, self.dt)
             # Where the pair is of neighbours nothing moves, not even by rounding.
             pose = torch.where(past.flatten(-2).any(-1, keepdim=True), moved, pose)
             tensordict.set(self.out_keys[-1], torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2))
-        ensemble = torch.cat([_move(pose, velocity, self.dt), velocity], -1)
+        ensemble = torch.cat([unicycle_move(pose, velocity, self.dt), velocity], -1)
         values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
         for key, value in zip(self.out_keys, values, strict=False):
             tensordict.set(key, value)
         return tensordict
-
-
-def _move(pose: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:
-    """The pose [x, y, theta] after ``dt`` at constant ``velocity``, with the heading at mid-step; exact backwards."""
-    step = velocity * dt
-    heading = pose[..., 2] + 0.5 * step[..., 1]
-    moved = torch.stack([step[..., 0] * heading.cos(), step[..., 0] * heading.sin(), step[..., 1]], -1)
-    return pose + moved

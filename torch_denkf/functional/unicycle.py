@@ -1,0 +1,59 @@
+r"""The known motion of a vehicle on the plane: a pose moves with speed and turn rate, at the heading of mid-step."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def unicycle_move(pose: Tensor, velocity: Tensor, dt: float) -> Tensor:
+    r"""Moves poses for one step (the paper's section IV-A).
+
+    .. math::
+        x' = x + v\,\Delta t \cos(\theta + \dot\theta \Delta t / 2), \quad
+        y' = y + v\,\Delta t \sin(\theta + \dot\theta \Delta t / 2), \quad
+        \theta' = \theta + \dot\theta \Delta t
+
+    With ``-dt`` it is its own inverse, exactly but for rounding.
+
+    Args:
+        pose: (x m, y m, theta rad), ``[*, 3]``.
+        velocity: (v m/s, theta_dot rad/s), ``[*, 2]``.
+        dt: time step in s.
+
+    Returns:
+        The poses afterwards, ``[*, 3]``; theta is not wrapped.
+
+    Examples:
+        >>> unicycle_move(torch.zeros(3), torch.tensor([10.0, 0.0]), 0.1)
+        tensor([1., 0., 0.])
+    """
+    step = velocity * dt
+    heading = pose[..., 2] + 0.5 * step[..., 1]
+    moved = torch.stack([step[..., 0] * heading.cos(), step[..., 0] * heading.sin(), step[..., 1]], -1)
+    return pose + moved
+
+
+def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Jacobians of :func:`unicycle_move`.
+
+    Args:
+        pose: (x m, y m, theta rad) before the step, ``[*, 3]``.
+        velocity: (v m/s, theta_dot rad/s), ``[*, 2]``.
+        dt: time step in s.
+
+    Returns:
+        The derivatives by the pose ``[*, 3, 3]`` and by the velocity ``[*, 3, 2]``.
+
+    Examples:
+        >>> unicycle_jacobians(torch.zeros(3), torch.tensor([10.0, 0.0]), 0.1)[1]
+        tensor([[0.1000, -0.0000],
+                [0.0000, 0.0500],
+                [0.0000, 0.1000]])
+    """
+    heading = pose[..., 2] + 0.5 * dt * velocity[..., 1]
+    cos, sin, way = heading.cos(), heading.sin(), dt * velocity[..., 0]
+    zero, one = torch.zeros_like(way), torch.ones_like(way)
+    by_pose = [[one, zero, -way * sin], [zero, one, way * cos], [zero, zero, one]]
+    by_velocity = [[dt * cos, -0.5 * dt * way * sin], [dt * sin, 0.5 * dt * way * cos], [zero, dt * one]]
+    return tuple(torch.stack([torch.stack(row, -1) for row in rows], -2) for rows in (by_pose, by_velocity))
