@@ -216,6 +216,18 @@ def facts():
     return Statistics(torch.tensor([9.0, 0.0]), torch.tensor([3.0, 0.1]), torch.zeros(2), torch.ones(2), 0.1)
 
 
+def smooth_drive(count, encoding):
+    """Readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
+    velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
+    path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
+    sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)
+    samples = sums.unsqueeze(2) + 0.02 * torch.randn(count, LONGEST, 32, 2)
+    encoding = torch.zeros(count, LONGEST, encoding)
+    entries = {"observed": torch.ones(count, LONGEST, 1).bool(), "ensemble": samples, "encoding": encoding}
+    state = torch.cat([path, velocity], -1)
+    return TensorDict({"state": state, "spans": TensorDict(entries, batch_size=[count, LONGEST])}, [count])
+
+
 @pytest.mark.parametrize("name", sorted(FILTERS))
 def test_every_recipe_follows_readings_over_gaps_with_one_set_of_parameters(name):
     """Untrained filters on readings of a known truth: a drive whose speed changes, 30 % of the frames missing."""
@@ -226,19 +238,30 @@ def test_every_recipe_follows_readings_over_gaps_with_one_set_of_parameters(name
     own = {id(p) for p in model.parameters()}
     assert {id(p) for p in sensorless.parameters()} <= own
     assert any(True for _ in sensorless.parameters())
-    count = 60
-    velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
-    path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
-    state = torch.cat([path, velocity], -1)
-    sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)
-    samples = sums.unsqueeze(2) + 0.02 * torch.randn(count, LONGEST, 32, 2)
-    encoding = torch.zeros(count, LONGEST, recipe.encoding)
-    entries = {"observed": torch.ones(count, LONGEST, 1).bool(), "ensemble": samples, "encoding": encoding}
-    read = TensorDict({"state": state, "spans": TensorDict(entries, batch_size=[count, LONGEST])}, [count])
+    read = smooth_drive(60, recipe.encoding)
+    state = read["state"]
     with torch.no_grad():
         out = run_filter(recipe, model, [all_frames(read), lose_frames(read, seed=1)])
     assert out["belief", "var"][..., :5].isfinite().all()
     if recipe.needs_training:  # before it, nothing connects its readings with its state
         return
     end = (out["belief", "mean"][:, -1, :2] - state[-1, :2]).norm(dim=-1)
-    assert (end < 0.1 * 8 * 0.1 * count).all(), end  # a tenth of the way
+    assert (end < 0.1 * 8 * 0.1 * len(state)).all(), end  # a tenth of the way
+
+
+@pytest.mark.parametrize("name", ["dekf", "dukf", "bkf"])
+def test_inflation_of_the_gaussian_filters_widens_the_velocities_and_leaves_pose_and_gain_finite(name):
+    recipe = FILTERS[name](SENSORS["flow"](facts()), facts())
+    model, read = recipe.build(), smooth_drive(1500, recipe.encoding)
+    out = []
+    with torch.no_grad():
+        for factor in (1.0, 1.4):
+            recipe.set_inflation(model, factor)
+            out.append(run_filter(recipe, model, [all_frames(read)])["belief"][0])
+    plain, inflated = out
+    settled = slice(100, None)  # the first belief is the same in both
+    ratio = inflated["var"][settled, 3:5] / plain["var"][settled, 3:5]
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 1.4**2), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(inflated["mean"][settled, 3:5], plain["mean"][settled, 3:5], rtol=1e-3, atol=1e-3)
+    # The pose's spread grows with the way, not by 1.4 a step: 1.4**1500 would have left float32 behind.
+    assert (inflated["var"][-1, :3] < 2.5 * plain["var"][-1, :3]).all()

@@ -35,7 +35,8 @@ class BackpropKF(Filter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        inflation: factor on the belief's standard deviations, where anything is observed.
+        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
+            by it without bound.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         control_keys: see :class:`Filter`; the first drives the transition where ``control`` is given.

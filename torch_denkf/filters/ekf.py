@@ -32,7 +32,8 @@ class EKF(Filter):
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        inflation: factor on the belief's standard deviations, where anything is observed.
+        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
+            by it without bound.
         angles: components of the observation that are angles in radians.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.

@@ -32,7 +32,8 @@ class UKF(Filter):
         alpha: see :func:`torch_denkf.functional.unscented_weights`.
         beta: likewise.
         kappa: likewise. Covariances stay positive where no weight is negative, as by default.
-        inflation: factor on the belief's standard deviations, where anything is observed.
+        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
+            by it without bound.
         angles: components of the observation that are angles in radians.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.

@@ -84,7 +84,8 @@ class EKFAnalysis(GaussianAnalysis):
     Args:
         observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
             leaves in a copy of the tensordict.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none.
+        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
+            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
         angles: components of the observation that are angles in radians; their innovation is wrapped to [-pi, pi).
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.

@@ -164,7 +164,8 @@ class KalmanAnalysis(SubModel):
         matrix: H, ``[O, S]``.
         noise: R, variances ``[O]`` or a covariance ``[O, O]``; ``None`` to read it from ``noise_variance_key``.
         trainable: whether H is a parameter.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none.
+        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
+            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.

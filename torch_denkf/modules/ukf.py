@@ -104,7 +104,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         alpha: see :func:`torch_denkf.functional.unscented_weights`.
         beta: likewise.
         kappa: likewise.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none.
+        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
+            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
         angles: components of the observation that are angles in radians.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.

@@ -17,6 +17,7 @@ from torch_denkf.modules import (
     EKFTransition,
     GaussianAround,
     LearnedObservation,
+    MappedNoise,
     PairObservation,
     SubModel,
     UKFAnalysis,
@@ -38,9 +39,10 @@ class _Gaussian(Recipe):
             observation = PairObservation([REACH / self.facts.dt, torch.inf], history_key=None)
         else:
             observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
+        process_noise = MappedNoise(self.process_noise(), torch.eye(2))
         return OrderedDict(
-            noise=self.noise(),
-            transition=self.Transition(motion, UnicycleNoise(self.process_noise(), self.facts.dt)),
+            noise=MappedNoise(self.noise(), torch.eye(2)),
+            transition=self.Transition(motion, UnicycleNoise(process_noise, self.facts.dt)),
             analysis=self.Analysis(observation, **keys),
         )
 
@@ -60,7 +62,10 @@ class _Gaussian(Recipe):
         return GaussianLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
 
     def set_inflation(self, model, factor):
-        next(module for module in model.modules() if isinstance(module, self.Analysis)).inflation = factor
+        # In Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply the pose's
+        # variance in every step, too, which nothing observes: it would grow without bound.
+        for noise in (model["noise"], model["transition"].process_noise.module):
+            noise.matrix.copy_(factor * torch.eye(2))
 
 
 @register
