@@ -6,11 +6,15 @@ import atexit
 import os
 import sys
 import weakref
+from collections.abc import Collection, Iterable
 
 import mujoco
 import numpy as np
 
-__all__ = ["Renderer"]
+__all__ = ["GHOSTS", "PLAIN", "SCENERY", "Renderer"]
+
+PLAIN, GHOSTS, SCENERY = 0, 1, 2  # groups of geoms: all else; what ghosts are made of; what can be left out
+GHOST_COLOUR = (1.0, 0.4, 0.0, 0.08)  # the last one is the opacity
 
 _opened: weakref.WeakSet[Renderer] = weakref.WeakSet()
 
@@ -82,25 +86,54 @@ class Renderer:
             atexit.register(_close_all)
         _opened.add(self)
         self._model, self._size = model, size
-        self._scene, self._option = mujoco.MjvScene(model, maxgeom=200), mujoco.MjvOption()
+        self._scene, self._option = mujoco.MjvScene(model, maxgeom=5000), mujoco.MjvOption()
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
             self._scene.flags[flag] = False
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
         self._rect = mujoco.MjrRect(0, 0, size[1], size[0])
 
-    def draw(self, data: mujoco.MjData) -> np.ndarray:
-        """The picture ``[H, W, 3]``, uint8, of the positions in ``data`` (after ``mj_kinematics``)."""
+    def draw(
+        self,
+        data: mujoco.MjData,
+        ghosts: Iterable[mujoco.MjData] = (),
+        groups: Collection[int] = (PLAIN, GHOSTS, SCENERY),
+    ) -> np.ndarray:
+        """The picture ``[H, W, 3]``, uint8, of the positions in ``data`` (after ``mj_kinematics``).
+
+        Args:
+            data: what is drawn as it is.
+            ghosts: further positions, of which the geoms of group ``GHOSTS`` are drawn translucent. Each is done with
+                before the next is asked for, so that all may share one ``MjData``, also with ``data``.
+            groups: the geoms to draw of ``data``.
+        """
         if self._context is None:
             raise RuntimeError("the renderer is closed")
         mujoco.mj_camlight(self._model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        self._show(groups)
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, everything, self._scene)
+        for ghost in ghosts:
+            self._add_ghost(ghost)
         self._gl.make_current()  # another environment of this process may have drawn in between
         mujoco.mjr_render(self._rect, self._scene, self._context)
         picture = np.empty((*self._size, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, self._rect, self._context)
         return picture[::-1]
+
+    def _show(self, groups: Collection[int]) -> None:
+        self._option.geomgroup[:] = [group in groups for group in range(len(self._option.geomgroup))]
+
+    def _add_ghost(self, data: mujoco.MjData) -> None:
+        first = self._scene.ngeom
+        if first + self._model.ngeom > self._scene.maxgeom:
+            raise ValueError(f"the scene of {self._scene.maxgeom} shapes is full: draw fewer ghosts")
+        self._show([GHOSTS])
+        moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+        mujoco.mjv_addGeoms(self._model, data, self._option, mujoco.MjvPerturb(), moving, self._scene)
+        for shape in self._scene.geoms[first : self._scene.ngeom]:
+            shape.rgba[:], shape.transparent = GHOST_COLOUR, 1
+            shape.emission, shape.specular, shape.reflectance = 0.6, 0.0, 0.0
 
     def __del__(self):
         self.close()

@@ -204,20 +204,35 @@ class UR5TableEnv(EnvBase):
 
     # ------------------------------------------------------------------------------------------------ the pictures
 
-    def render_state(self, state: Tensor) -> Tensor:
+    def render_state(self, state: Tensor, *, ghosts: Tensor | None = None, scenery: bool = True) -> Tensor:
         """Draws the arm as a state has it, e.g. a belief's mean, with the object where it is now.
 
         The domain's textures, light, camera and lens apply, its blur, noise and delay do not.
 
         Args:
             state: ``[*N, S]``; the first seven are J1..J7 in rad, the rest is not read.
+            ghosts: ``[*N, G, S]``, e.g. an ensemble's members: G further arms, translucent and orange.
+            scenery: ``False`` leaves out object and goal, of which a belief in the arm says nothing.
 
         Returns:
             ``[*N, 3, H, W]``, as ``pixels`` are.
+
+        Raises:
+            ValueError: if the shapes of ``state`` and ``ghosts`` do not fit, or there are some hundred ghosts.
         """
+        if ghosts is None:
+            ghosts = state.new_zeros(*state.shape[:-1], 0, state.shape[-1])
+        elif ghosts.ndim != state.ndim + 1 or ghosts.shape[:-2] != state.shape[:-1] or ghosts.shape[-1] < 7:
+            raise ValueError(
+                f"ghosts are [*N, G, S] beside a state [*N, S], not {list(ghosts.shape)} beside {list(state.shape)}"
+            )
         rows = state.detach().cpu().double().reshape(-1, state.shape[-1]).numpy()
-        camera = self._open()
-        pictures = [self._tensor(camera.lens(self._draw(self._scene.pose_with(row[:7])))) for row in rows]
+        members = ghosts.detach().cpu().double().reshape(len(rows), *ghosts.shape[-2:]).numpy()
+        camera, pose_with = self._open(), self._scene.pose_with
+        pictures = [
+            self._tensor(camera.lens(self._draw(pose_with(row[:7]), [pose_with(g[:7]) for g in group], scenery)))
+            for row, group in zip(rows, members, strict=True)
+        ]
         return torch.stack(pictures).reshape(*state.shape[:-1], 3, *self.size).to(state.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -237,15 +252,23 @@ class UR5TableEnv(EnvBase):
     def _open(self):
         if self._renderer is None:
             from torch_denkf.envs._ur5_camera import Camera
-            from torch_denkf.envs._ur5_render import Renderer
+            from torch_denkf.envs._ur5_render import GHOSTS, SCENERY, Renderer
+
+            model = self._scene.model
+            model.geom_group[model.body_rootid[model.geom_bodyid] == model.body("base").id] = GHOSTS
+            model.geom_group[[self._scene.object_geom, self._scene.goal_geom]] = SCENERY
 
             self._camera = Camera(self.size, self._look.distortion, self._look.noise)
-            self._renderer = Renderer(self._scene.model, self.size)
+            self._renderer = Renderer(model, self.size)
             self.is_closed = False  # for EnvBase.__del__
         return self._camera
 
-    def _draw(self, pose: np.ndarray) -> np.ndarray:
-        return self._renderer.draw(self._scene.posed(pose))
+    def _draw(self, pose: np.ndarray, ghosts: Iterable[np.ndarray] = (), scenery: bool = True) -> np.ndarray:
+        from torch_denkf.envs._ur5_render import GHOSTS, PLAIN, SCENERY
+
+        groups = (PLAIN, GHOSTS, SCENERY) if scenery else (PLAIN, GHOSTS)
+        posed = self._scene.posed
+        return self._renderer.draw(posed(pose), (posed(ghost) for ghost in ghosts), groups)
 
     def _tensor(self, picture: np.ndarray) -> Tensor:
         planes = picture.transpose(2, 0, 1)
