@@ -330,3 +330,45 @@ def test_anomalies_of_the_square_root_sum_to_zero():
     problem = Problem(12, 4, 3)
     result = problem.analyse("etkf")
     assert ensemble_anomalies(result.ensemble).sum(0).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("scheme", ["sensor", "perturbed", "sakov"])
+def test_a_taper_of_blocks_is_one_analysis_for_each_block(scheme):
+    problem = Problem(6, 5, 3, (2,), mask="partial")
+    state, dim = torch.tensor([0, 0, 1, 1, 2]), torch.tensor([0, 0, 1])  # block 2 is observed by nothing
+    taper = ((state[:, None] == dim).double(), (dim[:, None] == dim).double())
+    tapered = problem.analyse(scheme, taper=taper)
+    torch.testing.assert_close(tapered.ensemble[..., 4], problem.forecast[..., 4], **EXACT)
+    nis = 0
+    for block in range(2):
+        rows, columns = state == block, dim == block
+        options = problem.options(scheme)
+        options["observed"] = options["observed"][..., columns]
+        if scheme == "perturbed":
+            options["perturbation"] = options["perturbation"][..., columns]
+        parts = [problem.forecast[..., rows], *(value[..., columns] for value in problem.tensors[1:])]
+        alone = analyse(*parts, **options)
+        torch.testing.assert_close(tapered.ensemble[..., rows], alone.ensemble, **EXACT)
+        nis = nis + alone.nis
+    torch.testing.assert_close(tapered.nis, nis, **EXACT)
+
+
+def test_a_taper_of_ones_changes_nothing_and_one_per_batch_is_allowed():
+    problem = Problem(4, 3, 9, (2,))  # more observations than members: the taper decides for observation space
+    ones = torch.ones(2, 3, 9, dtype=torch.float64), torch.ones(2, 9, 9, dtype=torch.float64)
+    torch.testing.assert_close(problem.analyse("sensor", taper=ones), problem.analyse("sensor"), **EXACT)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "space", "shape", "message"),
+    [
+        ("etkf", "auto", (3, 2), "not for scheme 'etkf'"),
+        ("sensor", "ensemble", (3, 2), "'ensemble'"),
+        ("sensor", "auto", (2, 3), r"state's taper must be \[\*B, 3, 2\]"),
+    ],
+)
+def test_a_taper_that_does_not_fit_is_refused(scheme, space, shape, message):
+    problem = Problem(5, 3, 2)
+    taper = torch.ones(shape, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match=message):
+        problem.analyse(scheme, taper=taper, space=space)

@@ -32,7 +32,14 @@ class Walk(torch.nn.Module):
         return torch.randn_like(velocity) * velocity.new_tensor(Q).sqrt()
 
 
-def pair_filter(size, scheme="perturbed", reach=None, change=None):
+class Straight(torch.nn.Module):
+    """Changes of the speed alone: N(0, Q)."""
+
+    def forward(self, velocity):
+        return torch.randn_like(velocity) * velocity.new_tensor([Q[0] ** 0.5, 0.0])
+
+
+def pair_filter(size, scheme="perturbed", reach=None, change=None, lags=2, start=START, **options):
     keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed"), "sensor_key": "y"}
     return DEnKF(
         UnicycleTransition(change or Walk(), DT),
@@ -41,9 +48,9 @@ def pair_filter(size, scheme="perturbed", reach=None, change=None):
         ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
         TensorDictSequential(
             EnsembleAnalysis(scheme, belief_key="analysis", **keys),
-            UnicycleMotion(DT, history_key=("belief", "history")),
+            UnicycleMotion(DT, history_key=("belief", "history"), **options),
         ),
-        initial=WithHistory(AroundState(START, ensemble_size=size), lags=2),
+        initial=WithHistory(AroundState(start, ensemble_size=size), lags=lags),
     )
 
 
@@ -183,6 +190,40 @@ def test_gradients_reach_the_past(float64):
         return td["belief", "ensemble"]
 
     assert torch.autograd.gradcheck(moved, (before, history, analysis))
+
+
+def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64):
+    """Its way is corrected by all innovations since; so is the filter's path, where the history is as long as the drive.
+
+    Without smoothing the way is the sum of filtered velocities, which lag behind: 4 m/s jumps to 6 and stays there.
+    """
+    size, steps = 40_000, [0, *[1] * 5]
+    y = torch.tensor([[6.0, 0.0]]).repeat(6, 1)
+    frames = frames_of(y, steps)
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.0]).expand(6, 5)
+    still = (0.0, 0.0, 0.0, 0.0, 0.0)  # nothing is corrected before the start
+    found = {}
+    for smooth in (False, True):
+        filter = pair_filter(size, change=Straight(), lags=5, start=still, smooth=smooth)
+        torch.manual_seed(0)
+        found[smooth] = filter.sequence(frames.copy())["belief", "ensemble"][-1]
+    mean, cov = torch.tensor([4.0, 0.0]), torch.zeros(2, 2)  # of speed and way
+    shift, noise = torch.tensor([[1.0, 0.0], [DT, 1.0]]), torch.tensor([1.0, DT])
+    for value in y[1:, 0]:
+        mean, cov = shift @ mean, shift @ cov @ shift.T + Q[0] * noise[:, None] * noise
+        gain = cov[:, 0] / (cov[0, 0] + R[0])
+        mean, cov = mean + gain * (value - mean[0]), cov - gain[:, None] * cov[0]
+    way = found[True][:, 0]
+    error = float((cov[1, 1] / size).sqrt())
+    assert abs(float(way.mean() - mean[1])) < 4 * error
+    torch.testing.assert_close(way.var(), cov[1, 1], rtol=4 * (2 / size) ** 0.5, atol=0)
+    assert float(mean[1] - found[False][:, 0].mean()) > 20 * error  # 0.13 m of 14.5 m
+    torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
+
+
+def test_smoothing_needs_a_history():
+    with pytest.raises(ValueError, match="pass its history_key"):
+        UnicycleMotion(DT, smooth=True)
 
 
 def test_history_needs_a_lag():

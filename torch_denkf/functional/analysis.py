@@ -11,6 +11,7 @@ Hunt et al. 2007 ("etkf"); Sakov & Oke 2008, Tellus A 60 ("sakov").
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -51,6 +52,7 @@ def analyse(
     observed: Tensor | None = None,
     perturbation: Tensor | None = None,
     rotation: Tensor | None = None,
+    taper: tuple[Tensor, Tensor] | None = None,
     space: Space = "auto",
 ) -> Analysis:
     """Condition a forecast ensemble on an observation.
@@ -79,6 +81,9 @@ def analyse(
             members and rescaled by sqrt(E / (E − 1)), which keeps their variance. None: drawn here.
         rotation: orthogonal matrices that keep the vector of ones, ``[*B, E, E]``, applied to the
             analysis anomalies of ``"etkf"`` (:func:`~torch_denkf.functional.random_rotation`).
+        taper: localisation: factors in [0, 1] on the sample covariances of state and predicted observation
+            ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
+            & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
             ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one.
 
@@ -87,7 +92,7 @@ def analyse(
 
     Raises:
         ValueError: for shapes that do not fit, an unknown scheme or space, ``"sensor"`` without samples,
-            or a perturbation or rotation given to a scheme that has no use for it.
+            or a perturbation, rotation or taper given to a scheme or a space that has no use for it.
 
     Examples:
         Two members at -1 and 1, seen directly with variance 2, as much as their own: half-way.
@@ -98,7 +103,7 @@ def analyse(
         >>> print(f"{result.ensemble.mean():.2f} {result.ensemble.var():.2f}")
         2.00 1.00
     """
-    _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, space)
+    _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space)
     size, dim = predicted.shape[-2:]
     has_samples = observation.ndim == forecast.ndim
 
@@ -131,8 +136,8 @@ def analyse(
     else:
         shift = mean_shift
 
-    in_observation_space = space == "observation" or (space == "auto" and dim < size)
-    solve = _observation_space if in_observation_space else _ensemble_space
+    in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
+    solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
     increment, square_root, nis, log_det = solve(normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf")
     if scheme != "etkf":
         ensemble = forecast + increment
@@ -154,7 +159,13 @@ def analyse(
 
 
 def _observation_space(
-    normalised: Tensor, anomalies: Tensor, shift: Tensor, mean_shift: Tensor, *, square_root: bool
+    normalised: Tensor,
+    anomalies: Tensor,
+    shift: Tensor,
+    mean_shift: Tensor,
+    *,
+    square_root: bool,
+    taper: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
     """Solve with I + YᵀY, O x O.
 
@@ -162,9 +173,10 @@ def _observation_space(
         The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
         ``[*B, E, S]``, if asked for; mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ and log det (I + YᵀY), ``[*B, 1]``.
     """
-    gram = normalised.mT @ normalised
+    gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
+    if taper is not None:
+        gram, cross = gram * taper[1], cross * taper[0].mT
     factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
-    cross = normalised.mT @ anomalies
     whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
     increment = shift @ torch.cholesky_solve(cross, factor)
     transformed = None
@@ -199,7 +211,7 @@ def _log_det(factor: Tensor) -> Tensor:
     return 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
 
 
-def _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, space) -> None:
+def _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space) -> None:
     check_ensemble("forecast", forecast, min_size=2)
     if predicted.ndim < 2:
         raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
@@ -228,6 +240,12 @@ def _check(forecast, predicted, observation, noise, scheme, observed, perturbati
         if scheme != "perturbed":
             raise ValueError(f"perturbation is for scheme 'perturbed', not {scheme!r}; leave it out")
         check_shape("perturbation", perturbation, (*batch, size, dim), "[*B, E, O]")
+    if taper is not None:
+        if scheme == "etkf" or space == "ensemble":
+            raise ValueError(f"taper is not for scheme 'etkf' nor for ensemble space, got {scheme!r}, {space!r}")
+        for name, value, rows in zip(("state", "observation"), taper, (forecast.shape[-1], dim), strict=True):
+            if value.shape[-2:] != (rows, dim):
+                raise ValueError(f"the {name}'s taper must be [*B, {rows}, {dim}], got {list(value.shape)}")
     if rotation is not None:
         if scheme != "etkf":
             raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")

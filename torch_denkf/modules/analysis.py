@@ -30,6 +30,9 @@ class EnsembleAnalysis(SubModel):
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
+        taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
+            ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
+            nothing about a component of the state but what E members happen to show, the factor is 0.
         ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
         observation_dim: O, likewise.
         forecast_key: forecast ensemble ``[*B, E, S]``.
@@ -62,6 +65,7 @@ class EnsembleAnalysis(SubModel):
         inflation: float = 1.0,
         relaxation: float = 0.0,
         rotate: bool = False,
+        taper: tuple[torch.Tensor, torch.Tensor] | None = None,
         ensemble_size: int | None = None,
         observation_dim: int | None = None,
         forecast_key: NestedKey = ("forecast", "ensemble"),
@@ -86,6 +90,8 @@ class EnsembleAnalysis(SubModel):
             noise_key=noise_key,
         )
         self.scheme, self.rotate = scheme, rotate
+        for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
+            self.register_buffer(name, factors, persistent=False)
         self.inflation, self.relaxation = inflation, relaxation
         self.ensemble_size, self.observation_dim = ensemble_size, observation_dim
 
@@ -117,6 +123,7 @@ class EnsembleAnalysis(SubModel):
             observed=observed,
             perturbation=noise if self.scheme == "perturbed" else None,
             rotation=noise if self.rotate else None,
+            taper=None if self.state_taper is None else (self.state_taper, self.observation_taper),
         )
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)

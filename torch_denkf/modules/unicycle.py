@@ -103,7 +103,9 @@ class UnicycleMotion(SubModel):
     spread over many metres, and a spurious correlation of :math:`1/\sqrt{E}` between them and the velocity's
     innovation makes the mean pose jump. This module takes from the analysis the velocities alone and lets the known
     motion carry each member's pose, which is localisation in the state: an innovation of the velocities at t acts on
-    the step from t-1 to t. After a :class:`PairObservation` it acts on all steps between the two frames.
+    the step from t-1 to t. After a :class:`PairObservation` it acts on all steps between the two frames; with
+    ``smooth`` on all steps of the history, whatever the sensor has read: a turn that shows late, because readings are
+    noisy, is then in the path where it was.
 
     Use with ``EnsembleAnalysis(..., belief_key="analysis")``, and not with ``update_at_reset``.
 
@@ -114,6 +116,14 @@ class UnicycleMotion(SubModel):
         belief_key: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
         history_key: velocities of the past steps ``[*B, E, L, 2]``, see :class:`WithHistory`; ``None`` for none.
         steps_key: optional, with a history: see :class:`PairObservation`.
+        smooth: correct the path by each analysis of the history, as a fixed-lag smoother does. The first L innovations
+            move the first pose along with it, by a share of the doubt about the first velocity.
+
+    Raises:
+        ValueError: if it is to smooth without a history.
+
+    Source:
+        Evensen & van Leeuwen 2000, "An ensemble Kalman smoother for nonlinear dynamics".
 
     Example:
         >>> from tensordict import TensorDict
@@ -132,12 +142,15 @@ class UnicycleMotion(SubModel):
         belief_key: str = "belief",
         history_key: NestedKey | None = None,
         steps_key: NestedKey = "steps",
+        smooth: bool = False,
     ):
+        if smooth and history_key is None:
+            raise ValueError("UnicycleMotion(smooth=True) corrects a history; pass its history_key.")
         histories = [] if history_key is None else [history_key]
         out_keys = [(belief_key, name) for name in ("ensemble", "mean", "var")] + histories
         optional_keys = [steps_key] if histories else []
         super().__init__(nn.Identity(), [before_key, analysis_key, *histories], out_keys, optional_keys=optional_keys)
-        self.dt, self.history_key = dt, history_key
+        self.dt, self.history_key, self.smooth = dt, history_key, smooth
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief."""
@@ -146,6 +159,7 @@ class UnicycleMotion(SubModel):
         if self.history_key is not None:
             history = self.read(tensordict, self.history_key)
             past = within_pair(tensordict.get(self.optional_keys[0], None), history)
+            past = torch.ones_like(past) if self.smooth else past
             analysed = analysis[..., 5:].unflatten(-1, (-1, 2))
             corrected = torch.where(past, analysed, history)
             moved = pose
