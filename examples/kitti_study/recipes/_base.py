@@ -22,7 +22,6 @@ from torch_denkf.modules import (
 REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 HISTORY = ("belief", "history")  # velocities of the past steps
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
-CALIBRATED = ("sensor", "calibrated")
 FILTERS: dict[str, type[Recipe]] = {}
 
 

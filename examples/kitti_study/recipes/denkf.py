@@ -9,7 +9,6 @@ from tensordict.nn import TensorDictSequential
 
 from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
 from kitti_study.sensors import SAMPLES
-from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
     AroundState,
     EnsembleAnalysis,
@@ -22,7 +21,7 @@ from torch_denkf.modules import (
 )
 from torch_denkf.objectives import DEnKFLoss
 
-CALIBRATED = ("sensor", "calibrated")
+LAGS = 4  # past steps that an innovation may still correct
 
 
 @register
@@ -33,29 +32,33 @@ class DEnKF(Recipe):
         # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
         if self.pairs:
             observation = PairObservation([REACH / self.facts.dt, torch.inf])
-            keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
+            # Errors of speed and of turn rate have nothing to do with each other; 32 members would see correlations.
+            own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + LAGS, 1)])
+            keys = {
+                "taper": (own, torch.eye(2)),
+                "forecast_key": ("forecast", "clone"),
+                "observed_key": ("forecast", "observed"),
+            }
         else:
             observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
             keys = {}
-        motion = UnicycleMotion(self.facts.dt, history_key=HISTORY if self.pairs else None)
+        motion = UnicycleMotion(self.facts.dt, history_key=HISTORY if self.pairs else None, smooth=self.pairs)
         return OrderedDict(
             noise=self.noise(),
-            # Most of the sensor's error stays for a whole drive.
-            gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, out_key=CALIBRATED),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
             transition=self.transition(
                 StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
                 history_key=HISTORY if self.pairs else None,
             ),
             observation=observation,
-            analysis=TensorDictSequential(
-                EnsembleAnalysis("sensor", sensor_key=CALIBRATED, belief_key="analysis", **keys), motion
-            ),
+            # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
+            gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, in_key=("forecast", "observation")),
+            analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
         )
 
     def initial(self, std, state_key):
         around = AroundState(std, ensemble_size=SAMPLES, state_key=state_key)
-        return WithHistory(around, LONGEST - 1) if self.pairs else around
+        return WithHistory(around, LAGS) if self.pairs else around
 
     def loss(self, model):
         return DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)
