@@ -226,6 +226,14 @@ def test_smoothing_needs_a_history():
         UnicycleMotion(DT, smooth=True)
 
 
+def test_a_curve_is_what_the_sensor_makes_of_the_whole_way(float64):
+    forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
+    td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
+    out = PairObservation([20.0, torch.inf], curve=lambda way: way**2)(td)["forecast"]
+    torch.testing.assert_close(out["observation"], torch.tensor([[19.0**2, 0.3**2]]))
+    assert out["observed"]  # it is the way, not what is read, that must be within reach
+
+
 def test_history_needs_a_lag():
     with pytest.raises(ValueError, match="at least 1; got 0"):
         WithHistory(AroundState([1.0] * 5), 0)

@@ -64,7 +64,7 @@ class WithHistory(SubModel):
 class PairObservation(SubModel):
     r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
 
-    .. math:: H x^i_t = \sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}
+    .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
 
     Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
     between them. The members carry their velocities of the past steps, and the analysis corrects those, too
@@ -75,6 +75,7 @@ class PairObservation(SubModel):
     Args:
         reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
             of zero: where the forecast's mean says more, the frame counts as not observed.
+        curve: h, what the sensor reads at a true sum ``[*, 2]``, for one that hedges; by default the sum itself.
         in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
         history_key: see :class:`WithHistory`; ``None`` where the past is part of the state, see
             :class:`ClonedTransition`.
@@ -101,6 +102,7 @@ class PairObservation(SubModel):
         self,
         reach: Sequence[float] | torch.Tensor | None = None,
         *,
+        curve: nn.Module | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         history_key: NestedKey | None = ("belief", "history"),
         steps_key: NestedKey = "steps",
@@ -111,7 +113,9 @@ class PairObservation(SubModel):
     ):
         out_keys = [out_key, clone_key, out_observed_key]
         in_keys = [in_key] if history_key is None else [in_key, history_key]
-        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=[steps_key, observed_key])
+        super().__init__(
+            nn.Identity() if curve is None else curve, in_keys, out_keys, optional_keys=[steps_key, observed_key]
+        )
         reach = [torch.inf, torch.inf] if reach is None else reach
         self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
         self.observation_dim = 2
@@ -121,14 +125,14 @@ class PairObservation(SubModel):
         forecast, *history = (self.read(tensordict, key) for key in self.in_keys)
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(tensordict.get(self.optional_keys[0], None), history)
-        predicted = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        readable = (predicted.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
+        readable = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
         for key in self.optional_keys:
             value = tensordict.get(key, None)
             if value is not None:
                 readable = readable & (value > 0)
         clone = torch.cat([forecast[..., :5], history.flatten(-2)], -1)
-        for key, value in zip(self.out_keys, (predicted, clone, readable), strict=True):
+        for key, value in zip(self.out_keys, (self.module(way), clone, readable), strict=True):
             tensordict.set(key, value)
         return tensordict
 

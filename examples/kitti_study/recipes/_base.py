@@ -9,11 +9,12 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from kitti_study.fold import VELOCITIES, Statistics
+from kitti_study.fold import Statistics
 from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     DiagonalNoise,
     FlowSensor,
+    PairObservation,
     StochasticMLP,
     SubModel,
     UnicycleTransition,
@@ -44,8 +45,8 @@ class Recipe:
 
     def __init__(self, sensor: SubModel, facts: Statistics):
         self.sensor, self.facts = sensor, facts
-        self.pairs = isinstance(sensor, FlowSensor)  # it reads pairs of frames with a gap between them, too
-        self.encoding = sensor.encoding_features if self.pairs else sensor.module["head"].layers[-1].in_features
+        self.flow = isinstance(sensor, FlowSensor)
+        self.encoding = sensor.encoding_features if self.flow else sensor.module["head"].layers[-1].in_features
 
     def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
         """Everything behind the sensor, by name, in order."""
@@ -67,10 +68,17 @@ class Recipe:
         """R, from what the sensor saw."""
         return DiagonalNoise(2, r=self.facts.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
 
-    def transition(self, network: nn.Module, **kwargs) -> SubModel:
-        """Known motion of the pose; the velocities walk at random."""
+    def observation(self, **kwargs) -> PairObservation:
+        """What is read of pairs of frames: metres by the flow sensor; one that was trained on grey values hedges."""
+        if self.flow:
+            return PairObservation([REACH / self.facts.dt, torch.inf], **kwargs)
+        return PairObservation(curve=SensorCurve(self.facts.loc, self.facts.scale), **kwargs)
+
+    def transition(self, network: nn.Module) -> SubModel:
+        """Known motion of the pose; the velocities walk at random, with a trend."""
         facts = self.facts
-        return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, drift=False, **kwargs)
+        keys = {"history_key": HISTORY, "drift": False}
+        return UnicycleTransition(network, dt=facts.dt, loc=facts.loc, scale=facts.scale, **keys)
 
     @property
     def state_scale(self) -> Tensor:
@@ -97,7 +105,7 @@ class SensorCurve(nn.Module):
         self.register_buffer("loc", loc[:1].clone())
         self.register_buffer("scale", scale[:1].clone())
 
-    def forward(self, state: torch.Tensor) -> torch.Tensor:
+    def forward(self, velocity: torch.Tensor) -> torch.Tensor:
         """Predicts (v, theta_dot) ``[*, 2]``."""
-        v, theta_dot = state[..., VELOCITIES].split(1, -1)
+        v, theta_dot = velocity.split(1, -1)
         return torch.cat([v + self.scale * self.correction((v - self.loc) / self.scale), theta_dot], -1)

@@ -7,14 +7,12 @@ from collections import OrderedDict
 import torch
 from tensordict.nn import TensorDictSequential
 
-from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import HISTORY, Recipe, register
 from kitti_study.sensors import SAMPLES
 from torch_denkf.modules import (
     AroundState,
     EnsembleAnalysis,
-    LearnedObservation,
     MemberGain,
-    PairObservation,
     StochasticMLP,
     UnicycleMotion,
     WithHistory,
@@ -29,36 +27,27 @@ class DEnKF(Recipe):
     """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
 
     def modules(self):
-        # The flow sensor reads metres. One that was trained on grey values hedges, and h is the curve by which it does.
-        if self.pairs:
-            observation = PairObservation([REACH / self.facts.dt, torch.inf])
-            # Errors of speed and of turn rate have nothing to do with each other; 32 members would see correlations.
-            own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + LAGS, 1)])
-            keys = {
-                "taper": (own, torch.eye(2)),
-                "forecast_key": ("forecast", "clone"),
-                "observed_key": ("forecast", "observed"),
-            }
-        else:
-            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
-            keys = {}
-        motion = UnicycleMotion(self.facts.dt, history_key=HISTORY if self.pairs else None, smooth=self.pairs)
+        # Errors of speed and of turn rate have nothing to do with each other; 32 members would see correlations.
+        own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + LAGS, 1)])
+        analysis = EnsembleAnalysis(
+            "sensor",
+            taper=(own, torch.eye(2)),
+            forecast_key=("forecast", "clone"),
+            observed_key=("forecast", "observed"),
+            belief_key="analysis",
+        )
         return OrderedDict(
             noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
-            transition=self.transition(
-                StochasticMLP(2, 2, layer="flipout", output_gain=0.1),
-                history_key=HISTORY if self.pairs else None,
-            ),
-            observation=observation,
+            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
+            observation=self.observation(),
             # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
             gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, in_key=("forecast", "observation")),
-            analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis", **keys), motion),
+            analysis=TensorDictSequential(analysis, UnicycleMotion(self.facts.dt, history_key=HISTORY, smooth=True)),
         )
 
     def initial(self, std, state_key):
-        around = AroundState(std, ensemble_size=SAMPLES, state_key=state_key)
-        return WithHistory(around, LAGS) if self.pairs else around
+        return WithHistory(AroundState(std, ensemble_size=SAMPLES, state_key=state_key), LAGS)
 
     def loss(self, model):
         return DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)

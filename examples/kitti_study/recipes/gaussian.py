@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import torch
 
-from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import Recipe, register
 from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
     CholeskyNoise,
@@ -16,9 +16,7 @@ from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
     GaussianAround,
-    LearnedObservation,
     MappedNoise,
-    PairObservation,
     SubModel,
     UKFAnalysis,
     UKFTransition,
@@ -33,30 +31,24 @@ class _Gaussian(Recipe):
     Transition, Analysis = EKFTransition, EKFAnalysis
 
     def modules(self):
-        motion, keys = self.transition(torch.zeros_like, history_key=HISTORY if self.pairs else None), {}
-        if self.pairs:
-            motion, keys = ClonedTransition(motion), {"observed_key": ("forecast", "observed")}
-            observation = PairObservation([REACH / self.facts.dt, torch.inf], history_key=None)
-        else:
-            observation = LearnedObservation(SensorCurve(self.facts.loc, self.facts.scale))
+        motion = ClonedTransition(self.transition(torch.zeros_like))
         process_noise = MappedNoise(self.process_noise(), torch.eye(2))
         return OrderedDict(
             noise=MappedNoise(self.noise(), torch.eye(2)),
             transition=self.Transition(motion, UnicycleNoise(process_noise, self.facts.dt)),
-            analysis=self.Analysis(observation, **keys),
+            analysis=self.Analysis(self.observation(history_key=None), observed_key=("forecast", "observed")),
         )
 
     def process_noise(self) -> SubModel:
         """Q of (v, theta_dot), from their mean; the rest of the state must not count, so its scale is infinite."""
-        size = 5 + 2 * (LONGEST - 1) * self.pairs
+        size = 5 + 2 * (LONGEST - 1)
         loc, scale = torch.zeros(size), torch.full((size,), torch.inf)
         loc[3:5], scale[3:5] = self.facts.loc, self.facts.scale
         keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
         return DiagonalNoise(2, r=self.facts.unit, in_features=size, loc=loc, scale=scale, **keys)
 
     def initial(self, std, state_key):
-        around = GaussianAround(std, state_key=state_key)
-        return ClonedPrior(around, LONGEST - 1) if self.pairs else around
+        return ClonedPrior(GaussianAround(std, state_key=state_key), LONGEST - 1)
 
     def loss(self, model):
         return GaussianLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 from torch import nn
 
-from kitti_study.recipes._base import HISTORY, REACH, Recipe, SensorCurve, register
+from kitti_study.recipes._base import Recipe, register
 from kitti_study.streams import LONGEST
 from torch_denkf.modules import (
     AroundState,
@@ -16,9 +16,7 @@ from torch_denkf.modules import (
     DiagonalNoise,
     GaussianLikelihood,
     LearnedLikelihood,
-    LearnedObservation,
     NoisyTransition,
-    PairObservation,
     ParticleAnalysis,
     ResampledTransition,
     SubModel,
@@ -50,9 +48,9 @@ class _Particles(Recipe):
     resampling, learned = "soft", None
 
     def modules(self):
-        facts, keys = self.facts, {}
+        facts, keys = self.facts, {"observed_key": ("forecast", "observed")}
         motion = NoisyTransition(
-            self.transition(torch.zeros_like, history_key=HISTORY if self.pairs else None),
+            self.transition(torch.zeros_like),
             # Of the mean velocities alone: an infinite scale hides the pose.
             DiagonalNoise(
                 2,
@@ -67,11 +65,6 @@ class _Particles(Recipe):
             before=True,
             ensemble_size=PARTICLES,
         )
-        if self.pairs:
-            motion, keys = ClonedTransition(motion), {"observed_key": ("forecast", "observed")}
-            observation = PairObservation([REACH / facts.dt, torch.inf], history_key=None)
-        else:
-            observation = LearnedObservation(SensorCurve(facts.loc, facts.scale))
         modules = OrderedDict()
         if self.learned:
             modules["reading"] = Reading(facts.loc, facts.scale)
@@ -87,15 +80,15 @@ class _Particles(Recipe):
         else:
             modules["noise"] = self.noise()
             likelihood = GaussianLikelihood(**keys)
-        modules["transition"] = ResampledTransition(motion, self.resampling)
-        modules["observation"] = observation
+        modules["transition"] = ResampledTransition(ClonedTransition(motion), self.resampling)
+        modules["observation"] = self.observation(history_key=None)
         modules["likelihood"] = likelihood
         modules["analysis"] = ParticleAnalysis()
         return modules
 
     def initial(self, std, state_key):
         around = AroundState(std, ensemble_size=PARTICLES, state_key=state_key)
-        return WithWeights(ClonedPrior(around, LONGEST - 1) if self.pairs else around)
+        return WithWeights(ClonedPrior(around, LONGEST - 1))
 
     def loss(self, model):
         return MixtureLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
