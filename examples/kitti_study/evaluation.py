@@ -16,7 +16,7 @@ from kitti_study.fold import VELOCITIES, Part
 from kitti_study.readings import all_frames, lose_frames, read_spans
 from kitti_study.recipes import REACH, Recipe
 from kitti_study.streams import CONDITIONS, DISTURBANCES, Stream
-from kitti_study.training import run_filter
+from kitti_study.training import run_filter, velocities
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.metrics import (
@@ -84,7 +84,7 @@ def evaluate(
         if condition == "clean":
             estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
         for name, states in estimates.items():
-            scores = {**calibration(belief, truth), **costs} if name == filter_name else {}
+            scores = {**calibration(belief), **costs} if name == filter_name else {}
             for row in errors(states, truth):
                 rows[condition, name, row["window"]].append({**common, **scores, "filter": name, **row})
     return [_mean(group) for group in rows.values()], beliefs
@@ -144,13 +144,11 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
     return table
 
 
-def calibration(belief: TensorDict, truth: Tensor) -> dict[str, float]:
+def calibration(belief: TensorDict) -> dict[str, float]:
     """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
     equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
     members = belief["belief", "ensemble"].shape[1] if equal else None
-    mean, variance = (belief["belief", name][1:, VELOCITIES].double() for name in ("mean", "var"))
-    truth = truth[1:, VELOCITIES]
-    variance = variance.clamp_min(1e-8)  # particles that are all the same have none, and no likelihood
+    mean, variance, truth = (value.double() for value in velocities(belief))
     covered = interval_coverage(mean, variance, truth, level=0.9)
     covariance = torch.diag_embed(variance)
     return {

@@ -55,13 +55,18 @@ def run_all(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> li
     return [run_filter(recipe, model, group) for group in groups.values()]
 
 
+def velocities(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+    """Means and variances of a belief's (v, theta_dot), and the truth ``[*K, N - 1, 2]``: the first row is given."""
+    values = out["belief", "mean"], out["belief", "var"], out["state"]
+    mean, variance, truth = (value[..., 1:, VELOCITIES] for value in values)
+    return mean, variance.clamp_min(1e-8), truth  # particles that are all the same have none, and no likelihood
+
+
 def filter_error(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
     """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
-    scores = []
-    for out in run_all(recipe, model, readings):
-        mean, variance = (out["belief", name][:, 1:, VELOCITIES].flatten(0, 1) for name in ("mean", "var"))
-        score = crps_gaussian(mean, variance, out["state"][:, 1:, VELOCITIES].flatten(0, 1)) / recipe.facts.unit
-        scores.append(score.unflatten(0, (len(out), -1)).mean((1, 2)))
+    scores = [
+        (crps_gaussian(*velocities(out)) / recipe.facts.unit).mean((1, 2)) for out in run_all(recipe, model, readings)
+    ]
     return {"crps": float(torch.cat(scores).mean())}
 
 
@@ -146,17 +151,16 @@ def calibrate(recipe: Recipe, model: Filter, readings: Sequence[TensorDict], lev
     distance = {}
     for inflation in INFLATIONS:
         recipe.set_inflation(model, inflation)
-        covered = torch.stack([_coverage(out, level) for out in run_all(recipe, model, readings)]).mean(0)
+        runs = run_all(recipe, model, readings)
+        covered = torch.stack([interval_coverage(*map(_rows, velocities(out)), level=level) for out in runs]).mean(0)
         distance[inflation] = float((covered - level).abs().sum())
     best = min(distance, key=distance.get)
     recipe.set_inflation(model, best)
     return best
 
 
-def _coverage(out: TensorDict, level: float) -> Tensor:
-    mean, variance, truth = out["belief", "mean"], out["belief", "var"], out["state"]
-    pairs = [value[:, 1:, VELOCITIES].flatten(0, 1) for value in (mean, variance, truth)]
-    return interval_coverage(*pairs, level=level)
+def _rows(value: Tensor) -> Tensor:
+    return value.flatten(0, -2)
 
 
 def save_settings(folder: Path, filter_name: str, kind: str, facts: Statistics, inflation: float) -> None:
