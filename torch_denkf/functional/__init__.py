@@ -4,6 +4,7 @@ from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
+from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, letkf, neighbours
 from torch_denkf.functional.moments import (
     ensemble_anomalies,
     ensemble_cov,
@@ -60,6 +61,10 @@ __all__ = [
     "soft_resample",
     "systematic_resample",
     "transport_resample",
+    "Neighbours",
+    "gaspari_cohn",
+    "letkf",
+    "neighbours",
     "unicycle_move",
     "unicycle_jacobians",
     "weighted_mean",

@@ -1,0 +1,119 @@
+"""Oracles: the published taper's values, the global transform, the Kalman update of each component by itself."""
+
+import math
+
+import pytest
+import torch
+
+from torch_denkf.functional import Neighbours, analyse, ensemble_cov, gaspari_cohn, kalman_update, letkf, neighbours
+
+EXACT = {"rtol": 1e-8, "atol": 1e-8}
+
+
+def problem(size, dim, count, batch=(), seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def randn(*shape):
+        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
+
+    forecast = 1 + randn(size, dim)
+    return forecast, forecast[..., :count] + 0.1 * randn(size, count), randn(count), 0.2 + randn(count).square()
+
+
+def everywhere(dim, count, taper=1.0):
+    index = torch.arange(count).expand(dim, count)
+    return Neighbours(index, torch.full((dim, count), taper, dtype=torch.float64))
+
+
+def test_taper_at_the_knots_and_its_curvature():
+    c = math.sqrt(10 / 3) * 3.0
+    at = torch.tensor([0.0, c / 2, c, 1.5 * c, 2 * c, 5 * c], dtype=torch.float64)
+    # eq. 4.10, the fractions written out
+    half = -1 / 128 + 1 / 32 + 5 / 64 - 5 / 12 + 1
+    beyond = 7.59375 / 12 - 5.0625 / 2 + 5 * 3.375 / 8 + 5 * 2.25 / 3 - 7.5 + 4 - 4 / 9
+    expected = torch.tensor([1.0, half, 5 / 24, beyond, 0.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(gaspari_cohn(at, 3.0), expected, rtol=0, atol=1e-12)
+    small = torch.tensor(1e-2, dtype=torch.float64)  # 1 - d^2 / (2 radius^2), as a Gaussian
+    torch.testing.assert_close(1 - gaspari_cohn(small, 3.0), small**2 / 18, rtol=2e-3, atol=0)
+
+
+def test_taper_is_a_correlation():
+    places = torch.arange(60, dtype=torch.float64)
+    matrix = gaspari_cohn((places[:, None] - places).abs(), 4.0)
+    assert torch.linalg.eigvalsh(matrix).min() > -1e-10
+
+
+def test_a_radius_must_be_positive():
+    with pytest.raises(ValueError, match="positive, got 0"):
+        gaspari_cohn(torch.ones(1), 0)
+
+
+def test_neighbours_are_those_within_reach_also_across_the_seam():
+    places = torch.arange(40.0).unsqueeze(-1)
+    found = neighbours(places, places[::2], 2.0, period=torch.tensor([40.0]), tile=7)
+    distance = (places - places[::2].T).abs()
+    taper = gaspari_cohn(torch.minimum(distance, 40 - distance), 2.0)
+    dense = torch.zeros(40, 20).scatter_add_(1, found.index, found.taper)
+    torch.testing.assert_close(dense, taper)
+    assert found.index.shape[1] == int((taper > 0).sum(1).max())
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+@pytest.mark.parametrize("sizes", [(6, 5, 3), (5, 4, 4)])
+@pytest.mark.parametrize("tile", [1, 2, 4096])
+def test_where_all_is_near_it_is_the_global_transform(batch, sizes, tile):
+    parts = problem(*sizes, batch)
+    expected = analyse(*parts, scheme="etkf").ensemble
+    torch.testing.assert_close(letkf(*parts, everywhere(sizes[1], sizes[2]), tile=tile), expected, **EXACT)
+
+
+def test_a_taper_divides_the_precision():
+    forecast, predicted, observation, noise = problem(6, 4, 2)
+    found = letkf(forecast, predicted, observation, noise, everywhere(4, 2, taper=0.25))
+    torch.testing.assert_close(
+        found, analyse(forecast, predicted, observation, 4 * noise, scheme="etkf").ensemble, **EXACT
+    )
+
+
+def test_each_component_alone_is_its_own_kalman_update():
+    """A radius below the spacing: no component learns from another's observation, whatever the samples say."""
+    forecast, _, observation, noise = problem(5, 7, 7)
+    places = torch.arange(7, dtype=torch.float64).unsqueeze(-1)
+    found = letkf(forecast, forecast, observation, noise, neighbours(places, places, 0.2))
+    variance = forecast.var(-2)
+    expected = kalman_update(forecast.mean(-2), variance.diag_embed(), observation, torch.eye(7).double(), noise)
+    torch.testing.assert_close(found.mean(-2), expected.mean, **EXACT)
+    torch.testing.assert_close(ensemble_cov(found).diagonal(), expected.cov.diagonal(), **EXACT)
+
+
+def test_what_is_not_observed_counts_nowhere():
+    forecast, predicted, observation, noise = problem(6, 5, 3)
+    mask = torch.tensor([True, False, True])
+    broken = torch.where(mask, observation, torch.nan), torch.where(mask, noise, torch.nan)
+    found = letkf(forecast, predicted, *broken, everywhere(5, 3), observed=mask)
+    expected = analyse(forecast, predicted, *broken, scheme="etkf", observed=mask).ensemble
+    torch.testing.assert_close(found, expected, **EXACT)
+    blind = letkf(forecast, predicted, *broken, everywhere(5, 3), observed=torch.tensor([False]))
+    torch.testing.assert_close(blind, forecast, **EXACT)
+
+
+def test_gradients_equal_finite_differences():
+    parts = [value.requires_grad_() for value in problem(4, 3, 2)]
+    near = everywhere(3, 2, taper=0.5)
+    assert torch.autograd.gradcheck(lambda *parts: letkf(*parts, near, tile=2), parts)
+
+
+def test_single_precision_follows_double():
+    parts = problem(8, 12, 12)
+    places = torch.arange(12.0).unsqueeze(-1)
+    near = neighbours(places, places, 2.0)
+    single = letkf(*(value.float() for value in parts), near)
+    torch.testing.assert_close(single.double(), letkf(*parts, near), rtol=2e-5, atol=2e-5)
+
+
+def test_shapes_that_do_not_fit_are_named():
+    forecast, predicted, observation, noise = problem(4, 3, 2)
+    with pytest.raises(ValueError, match=r"near\.index"):
+        letkf(forecast, predicted, observation, noise, everywhere(5, 2))
+    with pytest.raises(ValueError, match="noise"):
+        letkf(forecast, predicted, observation, noise[:1], everywhere(3, 2))

@@ -1,0 +1,170 @@
+r"""Localisation: far away, what few members show of a covariance is chance, and is tapered to zero.
+
+Two ways. Where O x O matrices fit in memory, factors on the covariances go into
+:func:`~torch_denkf.functional.analyse` as its ``taper``. Where they do not, or the ensemble is to be transformed as a
+whole, each component of the state gets an analysis of its own, from the observations near it (:func:`letkf`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf.functional.linalg import cholesky, inverse_square_root
+
+
+def gaspari_cohn(distance: Tensor, radius: float) -> Tensor:
+    r"""The taper of Gaspari & Cohn: like a Gaussian near zero, and exactly zero from :math:`2 c` on.
+
+    It is a correlation function (positive definite in up to three dimensions), so that the element-wise product of a
+    covariance matrix with it is a covariance matrix.
+
+    Args:
+        distance: non-negative, any shape, in any unit.
+        radius: standard deviation of the Gaussian with the same curvature at zero, in the same unit;
+            :math:`c = \sqrt{10/3}` radius, so that the taper ends at 3.65 radii.
+
+    Returns:
+        Factors in [0, 1], of the same shape.
+
+    Raises:
+        ValueError: if the radius is not positive.
+
+    Source:
+        Gaspari & Cohn 1999, Q. J. R. Meteorol. Soc. 125, eq. 4.10.
+
+    Examples:
+        >>> gaspari_cohn(torch.tensor([0.0, 1.0, 2.0, 4.0]), radius=1.0)
+        tensor([1.0000, 0.6354, 0.1472, 0.0000])
+    """
+    if not radius > 0:
+        raise ValueError(f"radius must be positive, got {radius}")
+    z = distance / (math.sqrt(10 / 3) * radius)
+    near = 1 + z.square() * (-5 / 3 + z * (5 / 8 + z * (1 / 2 - z / 4)))
+    # z (4 - ...) + 4 - 2/(3 z), as polynomial over z; z is kept away from 0 where the other branch is taken.
+    far_z = z.clamp(1, 2)
+    far = 4 - 2 / (3 * far_z) + far_z * (-5 + far_z * (5 / 3 + far_z * (5 / 8 + far_z * (-1 / 2 + far_z / 12))))
+    return torch.where(z < 1, near, torch.where(z < 2, far, 0.0)).clamp(0, 1)
+
+
+class Neighbours(NamedTuple):
+    """The observations near each component of a state.
+
+    Attributes:
+        index: their numbers, ``[S, L]``, int64; repeated ones fill up rows with fewer than L.
+        taper: their weights in [0, 1], ``[S, L]``; 0 for those that fill up.
+    """
+
+    index: Tensor
+    taper: Tensor
+
+
+def neighbours(
+    states: Tensor, observations: Tensor, radius: float, *, period: Tensor | None = None, tile: int = 4096
+) -> Neighbours:
+    """Finds the observations within the taper's reach of each component of a state.
+
+    Args:
+        states: places of the components, ``[S, D]``, in any unit.
+        observations: places of the observations, ``[O, D]``.
+        radius: see :func:`gaspari_cohn`, in the same unit.
+        period: ``[D]``, where a coordinate is a circle, its circumference (``inf`` where it is not).
+        tile: components to look at in one go; memory is ``tile * O``.
+
+    Returns:
+        :class:`Neighbours`, with L the largest number that any component has, at least 1.
+
+    Examples:
+        Five places on a circle, each sees its neighbours:
+
+        >>> places = torch.arange(5.0).unsqueeze(-1)
+        >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
+        [[0, 1, 4], [0, 1, 2], [1, 2, 3], [2, 3, 4], [0, 3, 4]]
+    """
+    rows = []
+    for part in states.split(tile):
+        offset = (part.unsqueeze(1) - observations).abs()
+        if period is not None:
+            offset = torch.minimum(offset, period - offset)
+        taper = gaspari_cohn(offset.square().sum(-1).sqrt(), radius)
+        count = max(int((taper > 0).sum(-1).max()), 1)
+        rows.append(taper.topk(count, dim=-1))
+    length = max(row.values.shape[-1] for row in rows)
+    pad = [(torch.nn.functional.pad(value, (0, length - value.shape[-1])) for value in row) for row in rows]
+    taper, index = (torch.cat(column) for column in zip(*pad, strict=True))
+    return Neighbours(index, taper)
+
+
+def letkf(
+    forecast: Tensor,
+    predicted: Tensor,
+    observation: Tensor,
+    noise: Tensor,
+    near: Neighbours,
+    *,
+    observed: Tensor | None = None,
+    tile: int = 4096,
+) -> Tensor:
+    r"""Local ensemble transform: an analysis for each component of the state, from the observations near it.
+
+    With :math:`Y_s = \rho_s^{1/2} R^{-1/2} HA / \sqrt{E - 1}` of the observations near component s, its members are
+    :math:`\bar x_s + A_s (w + (I + Y_s Y_s^T)^{-1/2})`, where :math:`w = (I + Y_s Y_s^T)^{-1} Y_s d` moves the mean.
+    Neighbouring components see nearly the same observations, so that the transform changes slowly in space.
+
+    Args:
+        forecast: ``[*B, E, S]`` with E >= 2, in the state's units.
+        predicted: what each member predicts, ``[*B, E, O]``, in the sensor's units.
+        observation: one value each, ``[*B, O]``.
+        noise: variances R, ``[*B, O]``, positive.
+        near: which observations count where, see :func:`neighbours`.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; what is False counts nowhere, and may be NaN.
+        tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
+
+    Returns:
+        The analysis ensemble, ``[*B, E, S]``. A component without observations stays as it is, but for rounding.
+
+    Raises:
+        ValueError: for shapes that do not fit.
+
+    Source:
+        Hunt, Kostelich & Szunyogh 2007, Physica D 230, sections 2.3 and 3 ("R-localisation").
+
+    Examples:
+        Two members at -1 and 1, the second component out of reach of the only observation:
+
+        >>> ensemble = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
+        >>> near = neighbours(torch.tensor([[0.0], [9.0]]), torch.tensor([[0.0]]), radius=1.0)
+        >>> letkf(ensemble, ensemble[:, :1], torch.tensor([4.0]), torch.tensor([2.0]), near).mean(0).round(decimals=4)
+        tensor([2., 0.])
+    """
+    check_ensemble("forecast", forecast, min_size=2)
+    batch, (size, dim), count = forecast.shape[:-2], forecast.shape[-2:], predicted.shape[-1]
+    check_shape("predicted", predicted, (*batch, size, count), "[*B, E, O]")
+    check_shape("observation", observation, (*batch, count), "[*B, O]")
+    check_shape("noise", noise, (*batch, count), "[*B, O]")
+    check_shape("near.index", near.index, (dim, near.taper.shape[-1]), "[S, L]")
+    if observed is not None:
+        predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
+        observation, noise = torch.where(observed, observation, 0), torch.where(observed, noise, 1)
+    predicted_mean = predicted.mean(-2, keepdim=True)
+    scale = (noise * (size - 1)).rsqrt().unsqueeze(-2)
+    normalised, shift = (predicted - predicted_mean) * scale, (observation.unsqueeze(-2) - predicted_mean) * scale
+    mean = forecast.mean(-2, keepdim=True)
+    anomalies = forecast - mean
+    eye = torch.eye(size, dtype=forecast.dtype, device=forecast.device)
+    moved = []
+    for index, taper, part in zip(
+        near.index.split(tile), near.taper.split(tile), anomalies.split(tile, dim=-1), strict=True
+    ):
+        root = taper.to(forecast.dtype).sqrt().unsqueeze(-2)
+        local = normalised[..., index].movedim(-3, -2) * root  # [*B, tile, E, L]
+        gram = local @ local.mT
+        local_shift = shift[..., index].movedim(-3, -2) * root  # [*B, tile, 1, L]
+        weights = torch.cholesky_solve(local @ local_shift.mT, cholesky(gram + eye))
+        transform = inverse_square_root(gram) + weights  # column i makes member i; w is the same in all
+        moved.append((part.movedim(-2, -1).unsqueeze(-2) @ transform).squeeze(-2).movedim(-1, -2))
+    return mean + torch.cat(moved, -1)
