@@ -85,13 +85,12 @@ class DEnKFLoss(SequenceLoss):
             log_likelihood: of the innovation.
         """
 
-        target_observation: NestedKey = "target_observation"
         belief: NestedKey = ("belief", "ensemble")
         forecast: NestedKey = ("forecast", "ensemble")
-        sensor: NestedKey = ("sensor", "ensemble")
 
     default_keys = _AcceptedKeys
     SUPERVISED = ("state", "transition", "sensor", "observation")
+    SCORES = ("crps", "energy", "mse")
     TERMS = ("state", "transition", "sensor", "observation", "nll", "kl")
 
     def __init__(
@@ -111,19 +110,16 @@ class DEnKFLoss(SequenceLoss):
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
-        if score not in ("crps", "energy", "mse"):
-            raise ValueError(f'score is "crps", "energy" or "mse"; got {score!r}.')
-        weights = dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True))
         super().__init__(
             filter,
-            weights,
+            dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True)),
+            score=score,
             state_scale=state_scale,
+            observation_scale=observation_scale,
             angles=angles,
             detach_every=detach_every,
             reduction=reduction,
         )
-        self.score = score
-        self.register_scale("observation_scale", observation_scale)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
@@ -163,23 +159,20 @@ class DEnKFLoss(SequenceLoss):
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):
-        return self._score(out, self.tensor_keys.belief, self._true_state(tensordict), "state"), None
+        return self._score(out, self.tensor_keys.belief, self._true_state(tensordict)), None
 
     def _transition(self, tensordict, out):
-        return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict), "state"), None
-
-    def _sensor(self, tensordict, out):
-        observed = tensordict.get(self.tensor_keys.observed, None)
-        target = self._true_observation(tensordict)
-        mask = torch.ones_like(target[..., 0], dtype=torch.bool) if observed is None else observed.all(-1)
-        return self._score(out, self.tensor_keys.sensor, target, "observation"), mask
+        return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
 
     def _observation(self, tensordict, out):
         model = self._observation_model()
-        error = model.observe(self._true_state(tensordict)) - self._entry(
-            tensordict, self.tensor_keys.target_observation
-        )
-        error = error if self.observation_scale is None else error / self.observation_scale
+        if model is None:
+            raise KeyError(
+                "loss_observation is of a model with an observe() method, and the filter has no observation model with "
+                "one. Set the weight observation=0."
+            )
+        target = self._entry(tensordict, self.tensor_keys.target_observation)
+        error = self._observation_error(model.observe(self._true_state(tensordict)), target)
         return error.square().mean(-1), torch.ones_like(error[..., 0], dtype=torch.bool)
 
     def _kl(self, tensordict, out):
@@ -189,38 +182,12 @@ class DEnKFLoss(SequenceLoss):
 
     # ------------------------------------------------------------------------------------------------------ helpers
 
-    def _score(self, out: TensorDictBase, key: NestedKey, target: torch.Tensor, kind: str) -> torch.Tensor:
-        samples, target = self._entry(out, key), target.unsqueeze(-2)
-        if kind == "state":
-            errors = self._state_error(samples, target)
-        else:
-            errors = samples - target
-            errors = errors if self.observation_scale is None else errors / self.observation_scale
-        zero = torch.zeros_like(errors[..., 0, :])
+    def _score(self, out: TensorDictBase, key: NestedKey, target: torch.Tensor) -> torch.Tensor:
+        return self._score_samples(self._state_error(self._entry(out, key), target.unsqueeze(-2)))
+
+    def _score_samples(self, errors: torch.Tensor) -> torch.Tensor:
+        """Score of members that are off by ``[*, E, N]``."""
         if self.score == "mse":
             return errors.mean(-2).square().mean(-1)
-        if self.score == "energy":
-            return energy_score(errors, zero)
-        return crps_ensemble(errors, zero).mean(-1)
-
-    def _observation_model(self):
-        models = [module for module in self.filter.update_modules if hasattr(module, "observe")]
-        if not models:
-            raise KeyError(
-                "The filter has no observation model with an observe() method; give the true observation in "
-                f"{self.tensor_keys.target_observation!r}, or set the weights sensor and observation to zero."
-            )
-        return models[0]
-
-    def _true_observation(self, tensordict: TensorDictBase) -> torch.Tensor:
-        target = tensordict.get(self.tensor_keys.target_observation, None)
-        if target is not None:
-            return target
-        model = self._observation_model()
-        if any(True for _ in model.parameters()):
-            raise KeyError(
-                f"loss_sensor needs the true observation in {self.tensor_keys.target_observation!r}, because the "
-                "observation model is learned. Add the entry, rename it with set_keys(target_observation=...), or "
-                "set the weight sensor=0."
-            )
-        return model.observe(self._true_state(tensordict))
+        zero = torch.zeros_like(errors[..., 0, :])
+        return energy_score(errors, zero) if self.score == "energy" else crps_ensemble(errors, zero).mean(-1)

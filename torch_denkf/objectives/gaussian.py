@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_ensemble, crps_gaussian, gaussian_log_prob
-from torch_denkf.objectives._sequence import SequenceLoss
+from torch_denkf.functional import crps_gaussian, gaussian_log_prob
+from torch_denkf.objectives._dimensions import DimensionsLoss
 
 __all__ = ["GaussianLoss"]
 
 
-class GaussianLoss(SequenceLoss):
+class GaussianLoss(DimensionsLoss):
     r"""Scores a filter with a mean and a covariance on sequences ``[*B, T]`` against the true states.
 
     The counterpart of :class:`~torch_denkf.objectives.DEnKFLoss`, whose fair CRPS estimates from members what is a
@@ -68,7 +68,7 @@ class GaussianLoss(SequenceLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
+    class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
         """The entries that the loss reads.
 
         Attributes:
@@ -82,13 +82,8 @@ class GaussianLoss(SequenceLoss):
             log_likelihood: of the innovation.
         """
 
-        target_observation: NestedKey = "target_observation"
-        belief: str = "belief"
-        forecast: str = "forecast"
-        sensor: NestedKey = ("sensor", "ensemble")
-
     default_keys = _AcceptedKeys
-    SUPERVISED = ("state", "transition", "sensor")
+    SCORES = ("crps", "nll", "mse")
     TERMS = ("state", "transition", "sensor", "nll")
 
     def __init__(
@@ -107,27 +102,17 @@ class GaussianLoss(SequenceLoss):
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
-        if score not in ("crps", "nll", "mse"):
-            raise ValueError(f'score is "crps", "nll" or "mse"; got {score!r}.')
-        if dims is not None and state_scale is not None and len(state_scale) != len(dims):
-            raise ValueError(f"state_scale has one entry for each of dims={list(dims)}; got {len(state_scale)}.")
-        if dims is not None:
-            # As everything else, angles are counted in the state; errors are of the chosen dimensions alone.
-            angles = [position for position, dim in enumerate(dims) if dim in angles]
         super().__init__(
             filter,
             dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True)),
+            score=score,
+            dims=dims,
             state_scale=state_scale,
+            observation_scale=observation_scale,
             angles=angles,
             detach_every=detach_every,
             reduction=reduction,
         )
-        self.score = score
-        self.register_scale("observation_scale", observation_scale)
-        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
-        # Chosen here, once: a boolean index in forward would wait for the device.
-        counting = None if self.state_scale is None else self.state_scale.isfinite().nonzero().flatten()
-        self.register_buffer("counting", counting, persistent=False)
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
@@ -137,54 +122,27 @@ class GaussianLoss(SequenceLoss):
     def _transition(self, tensordict, out):
         return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
 
-    def _sensor(self, tensordict, out):
-        observed = tensordict.get(self.tensor_keys.observed, None)
-        samples, target = self._entry(out, self.tensor_keys.sensor), self._true_observation(tensordict)
-        if samples.ndim == target.ndim:
-            samples = samples.unsqueeze(-2)
-        errors = samples - target.unsqueeze(-2)
-        errors = errors if self.observation_scale is None else errors / self.observation_scale
-        mask = torch.ones_like(target[..., 0], dtype=torch.bool) if observed is None else observed.all(-1)
-        if self.score == "mse" or samples.shape[-2] == 1:
-            return errors.mean(-2).square().mean(-1), mask
-        return crps_ensemble(errors, torch.zeros_like(errors[..., 0, :])).mean(-1), mask
-
     # ------------------------------------------------------------------------------------------------------ helpers
 
     def _score(self, out: TensorDictBase, prefix: str, target: torch.Tensor) -> torch.Tensor:
-        size = target.shape[-1]
-        mean = self._entry(out, (prefix, "mean"))[..., :size]
-        cov = self._entry(out, (prefix, "cov"))[..., :size, :size]
-        if self.dims is not None:
-            mean, target = mean.index_select(-1, self.dims), target.index_select(-1, self.dims)
-            cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
-        errors = self._state_error(mean, target)
-        if self.counting is not None:
-            errors = errors.index_select(-1, self.counting)
-            scale = self.state_scale[self.counting]
-            cov = cov.index_select(-1, self.counting).index_select(-2, self.counting)
-            cov = cov / scale.unsqueeze(-1) / scale
+        mean, cov = self._entry(out, (prefix, "mean")), self._entry(out, (prefix, "cov"))
+        errors = self._errors(mean, target)
         if self.score == "mse":
             return errors.square().mean(-1)
-        zero = torch.zeros_like(errors)
+        zero, cov = torch.zeros_like(errors), self._cov_of_errors(cov, target.shape[-1])
         if self.score == "nll":
-            nats = -gaussian_log_prob(errors, zero, cov)
             # The density of the state in its own units, so that the scale only conditions the arithmetic.
-            return nats if self.counting is None else nats + scale.log().sum()
+            return self._log_units() - gaussian_log_prob(errors, zero, cov)
         # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
         variance = cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
         return crps_gaussian(zero, variance, errors).mean(-1)
 
-    def _true_observation(self, tensordict: TensorDictBase) -> torch.Tensor:
-        key = self.tensor_keys.target_observation
-        target = tensordict.get(key, None)
-        if target is not None:
-            return target
-        models = [part for part in self.filter.module.modules() if hasattr(part, "observe")]
-        if not models or any(True for _ in models[0].parameters()):
-            raise KeyError(
-                f"loss_sensor needs the true observation in {key!r}, because the filter has no known observation "
-                "model with an observe() method. Add the entry, rename it with set_keys(target_observation=...), or "
-                "set the weight sensor=0."
-            )
-        return models[0].observe(self._true_state(tensordict))
+    def _cov_of_errors(self, cov: torch.Tensor, size: int) -> torch.Tensor:
+        cov = cov[..., :size, :size]
+        if self.dims is not None:
+            cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
+        if self.counting is not None:
+            scale = self.state_scale[self.counting]
+            cov = cov.index_select(-1, self.counting).index_select(-2, self.counting)
+            cov = cov / scale.unsqueeze(-1) / scale
+        return cov

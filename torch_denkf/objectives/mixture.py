@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_ensemble, crps_weighted, weighted_mean
-from torch_denkf.objectives._sequence import SequenceLoss
+from torch_denkf.functional import crps_weighted, weighted_mean
+from torch_denkf.objectives._dimensions import DimensionsLoss
 
 __all__ = ["MixtureLoss"]
 
 
-class MixtureLoss(SequenceLoss):
+class MixtureLoss(DimensionsLoss):
     r"""Scores a filter with weighted particles on sequences ``[*B, T]`` against the true states.
 
     The default score takes each particle for the centre of a Gaussian: :math:`-\log \sum_i w^i N(x; x^i,
@@ -83,7 +83,7 @@ class MixtureLoss(SequenceLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
+    class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
         """The entries that the loss reads.
 
         Attributes:
@@ -97,13 +97,9 @@ class MixtureLoss(SequenceLoss):
             log_likelihood: of the reading.
         """
 
-        target_observation: NestedKey = "target_observation"
-        belief: str = "belief"
-        forecast: str = "forecast"
-        sensor: NestedKey = ("sensor", "ensemble")
-
     default_keys = _AcceptedKeys
     SUPERVISED = ("state", "transition", "mean", "sensor")
+    SCORES = ("mixture", "crps")
     TERMS = ("state", "transition", "mean", "sensor", "nll")
 
     def __init__(
@@ -124,32 +120,22 @@ class MixtureLoss(SequenceLoss):
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
-        if score not in ("mixture", "crps"):
-            raise ValueError(f'score is "mixture" or "crps"; got {score!r}.')
-        if dims is not None and state_scale is not None and len(state_scale) != len(dims):
-            raise ValueError(f"state_scale has one entry for each of dims={list(dims)}; got {len(state_scale)}.")
-        if dims is not None:
-            # As everything else, angles are counted in the state; errors are of the chosen dimensions alone.
-            angles = [position for position, dim in enumerate(dims) if dim in angles]
         super().__init__(
             filter,
             dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True)),
+            score=score,
+            dims=dims,
             state_scale=state_scale,
+            observation_scale=observation_scale,
             angles=angles,
             detach_every=detach_every,
             reduction=reduction,
         )
-        self.score = score
-        self.register_scale("observation_scale", observation_scale)
         self.register_scale("component_std", component_std)
         if not (self.component_std > 0).all():
             raise ValueError(f"component_std is the width of each component, positive; got {component_std}.")
         if dims is not None and self.component_std.numel() not in (1, len(dims)):
             raise ValueError(f"component_std has one entry for each of dims={list(dims)}; got {component_std}.")
-        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
-        # Chosen here, once: a boolean index in forward would wait for the device.
-        counting = None if self.state_scale is None else self.state_scale.isfinite().nonzero().flatten()
-        self.register_buffer("counting", counting, persistent=False)
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
@@ -163,18 +149,6 @@ class MixtureLoss(SequenceLoss):
         particles, log_weights = self._particles(out, self.tensor_keys.belief)
         return self._errors(weighted_mean(particles, log_weights), self._true_state(tensordict)).square().mean(-1), None
 
-    def _sensor(self, tensordict, out):
-        observed = tensordict.get(self.tensor_keys.observed, None)
-        samples, target = self._entry(out, self.tensor_keys.sensor), self._true_observation(tensordict)
-        if samples.ndim == target.ndim:
-            samples = samples.unsqueeze(-2)
-        errors = samples - target.unsqueeze(-2)
-        errors = errors if self.observation_scale is None else errors / self.observation_scale
-        mask = torch.ones_like(target[..., 0], dtype=torch.bool) if observed is None else observed.all(-1)
-        if samples.shape[-2] == 1:
-            return errors.squeeze(-2).square().mean(-1), mask
-        return crps_ensemble(errors, torch.zeros_like(errors[..., 0, :])).mean(-1), mask
-
     # ------------------------------------------------------------------------------------------------------ helpers
 
     def _particles(self, out: TensorDictBase, prefix: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -184,38 +158,15 @@ class MixtureLoss(SequenceLoss):
             log_weights = torch.full_like(particles[..., 0], -math.log(particles.shape[-2]))
         return particles, log_weights
 
-    def _errors(self, estimate: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Scaled errors of the dimensions that count."""
-        estimate = estimate[..., : target.shape[-1]]
-        if self.dims is not None:
-            estimate, target = estimate.index_select(-1, self.dims), target.index_select(-1, self.dims)
-        errors = self._state_error(estimate, target)
-        return errors if self.counting is None else errors.index_select(-1, self.counting)
-
     def _score(self, out: TensorDictBase, prefix: str, tensordict: TensorDictBase) -> torch.Tensor:
         particles, log_weights = self._particles(out, prefix)
         errors = self._errors(particles, self._true_state(tensordict).unsqueeze(-2))
         if self.score == "crps":
             return crps_weighted(errors, log_weights, torch.zeros_like(errors[..., 0, :])).mean(-1)
-        std, units = self.component_std, 0.0
-        if self.counting is not None:
-            std = std.index_select(-1, self.counting) if std.numel() > 1 else std
-            units = self.state_scale[self.counting].log().sum()
+        std = self.component_std
+        if self.counting is not None and std.numel() > 1:
+            std = std.index_select(-1, self.counting)
         std = std.expand(errors.shape[-1])
         log_density = log_weights - 0.5 * (errors / std).square().sum(-1)
-        constant = std.log().sum() + 0.5 * math.log(2 * math.pi) * errors.shape[-1] + units
+        constant = std.log().sum() + 0.5 * math.log(2 * math.pi) * errors.shape[-1] + self._log_units()
         return constant - torch.logsumexp(log_density, -1)
-
-    def _true_observation(self, tensordict: TensorDictBase) -> torch.Tensor:
-        key = self.tensor_keys.target_observation
-        target = tensordict.get(key, None)
-        if target is not None:
-            return target
-        models = [part for part in self.filter.module.modules() if hasattr(part, "observe")]
-        if not models or any(True for _ in models[0].parameters()):
-            raise KeyError(
-                f"loss_sensor needs the true observation in {key!r}, because the filter has no known observation "
-                "model with an observe() method. Add the entry, rename it with set_keys(target_observation=...), or "
-                "set the weight sensor=0."
-            )
-        return models[0].observe(self._true_state(tensordict))

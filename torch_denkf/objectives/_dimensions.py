@@ -1,0 +1,70 @@
+"""Objectives that score some dimensions of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from torch_denkf.filters import Filter
+from torch_denkf.objectives._sequence import SequenceLoss
+
+
+class DimensionsLoss(SequenceLoss):
+    """Scores chosen dimensions of a belief that is several entries below one prefix.
+
+    Args:
+        filter: see :class:`SequenceLoss`, like ``weights`` and further arguments.
+        weights: of the terms, by name.
+        dims: state dimensions that count; all of the truth's by default. The belief may have more dimensions than the
+            truth, which must then come first.
+        state_scale: ``[len(dims)]``, or ``[S]`` without ``dims``. A dimension with infinite scale does not count.
+        angles: state dimensions that are angles in radians, counted in the state, whichever ``dims`` are chosen.
+        **kwargs: of :class:`SequenceLoss`.
+
+    Raises:
+        ValueError: on an unknown score, or a scale of another length than ``dims``.
+    """
+
+    @dataclass
+    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
+        """What all objectives read, and the prefixes of belief and forecast."""
+
+        belief: str = "belief"
+        forecast: str = "forecast"
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        filter: Filter,
+        weights: Mapping[str, float],
+        *,
+        dims: Sequence[int] | None,
+        state_scale: Sequence[float] | torch.Tensor | None,
+        angles: Sequence[int],
+        **kwargs,
+    ):
+        if dims is not None:
+            if state_scale is not None and len(state_scale) != len(dims):
+                raise ValueError(f"state_scale has one entry for each of dims={list(dims)}; got {len(state_scale)}.")
+            # As everything else, angles are counted in the state; errors are of the chosen dimensions alone.
+            angles = [position for position, dim in enumerate(dims) if dim in angles]
+        super().__init__(filter, weights, state_scale=state_scale, angles=angles, **kwargs)
+        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
+        # Chosen here, once: a boolean index in forward would wait for the device.
+        counting = None if self.state_scale is None else self.state_scale.isfinite().nonzero().flatten()
+        self.register_buffer("counting", counting, persistent=False)
+
+    def _errors(self, estimate: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Scaled errors of the dimensions that count."""
+        estimate = estimate[..., : target.shape[-1]]
+        if self.dims is not None:
+            estimate, target = estimate.index_select(-1, self.dims), target.index_select(-1, self.dims)
+        errors = self._state_error(estimate, target)
+        return errors if self.counting is None else errors.index_select(-1, self.counting)
+
+    def _log_units(self) -> torch.Tensor | float:
+        """What turns nats of the scaled state into nats of the state in its own units: the log of all scales."""
+        return 0.0 if self.counting is None else self.state_scale[self.counting].log().sum()
