@@ -1,0 +1,148 @@
+"""The collections of the study, and who trains, tunes, validates and is tested; by demo, never within one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.data.collect_ur5 import collect_ur5_demos
+
+STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
+JOINTS = 7
+
+
+@dataclass(frozen=True)
+class Collections:
+    """Demos of the study: few frames of many in the simulator, whole sequences of some in both domains.
+
+    Demo i of the first two collections is the same episode. Those that the replay's hash puts on the test side are
+    tested on; of the others, the first numbers are sequences for the filter, which the sensor never sees, so that the
+    filter learns how wrong its sensor is on new demos; all the rest are the sensor's.
+
+    Args:
+        root: folder of the collections.
+        cache: folder of their decoded pictures.
+        size: side of the pictures in pixels.
+        demos: in the simulator.
+        frames: drawn at random steps of each.
+        sequences: of the first demos, with all frames.
+        real: demos of ``real_like``, with all frames.
+        real_train: of these, on the train side.
+        steps: of a sequence.
+    """
+
+    root: Path
+    cache: Path
+    size: int = 112
+    demos: int = 2000
+    frames: int = 8
+    sequences: int = 220
+    real: int = 130
+    real_train: int = 20
+    steps: int = 350
+
+    def collect(self, processes: int = 1) -> None:
+        """Collects what is missing."""
+        common = {"size": (self.size, self.size), "processes": processes, "max_steps": self.steps}
+        collect_ur5_demos(self.root / "sim-frames", self.demos, frames=self.frames, **common)
+        collect_ur5_demos(self.root / "sim-sequences", self.sequences, **common)
+        collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
+
+    def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
+        """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
+        return UR5ExperienceReplay(self.root / name, split=split, cache=self.cache, **kwargs)
+
+
+def all_states(collections: Collections) -> Tensor:
+    """States of all demos of the simulator that the sensor may see, ``[N, T, 10]``: they need no pictures."""
+    data = collections.replay("sim-frames", "train")
+    return torch.stack([row_block(data, e)["state"] for e in data.episodes if e.demo >= collections.sequences])
+
+
+def all_actions(collections: Collections) -> Tensor:
+    """Actions of the same demos, ``[N, T, 7]``."""
+    data = collections.replay("sim-frames", "train")
+    return torch.stack([row_block(data, e)["action"] for e in data.episodes if e.demo >= collections.sequences])
+
+
+def row_block(data: UR5ExperienceReplay, episode) -> TensorDict:
+    """The rows of one demo without their pictures, ``[T]``."""
+    return data.storage[episode.start : episode.start + episode.length]
+
+
+class FramePool:
+    """Single frames with a picture, of chosen demos, in memory.
+
+    Args:
+        data: a replay with ``frames_only``.
+        chosen: numbers of the demos.
+    """
+
+    def __init__(self, data: UR5ExperienceReplay, chosen: set[int]):
+        wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
+        rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
+        if not len(rows):
+            raise ValueError(f"none of the {len(data.episodes)} demos in {data.root} is chosen; collect more")
+        parts = [data[index] for index in rows.split(512)]
+        self.pixels = torch.cat([(part["pixels"] * 255).round().to(torch.uint8) for part in parts])
+        self.state = torch.cat([part["state"] for part in parts])
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def rows(self, index: Tensor) -> TensorDict:
+        """Frames with float pixels, ``[n]``."""
+        pixels = self.pixels[index].float() / 255
+        return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
+
+    def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
+        """Random frames ``[batch]``."""
+        return self.rows(torch.randint(len(self), (batch,), generator=generator))
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Numbers of demos by what they are for."""
+
+    sensor: set[int]  # trains the sensor
+    tune: list[int]  # sequences that train the filter, unseen by the sensor
+    validation: list[int]  # sequences to choose by, unseen by both
+    test: list[int]
+
+    def __post_init__(self):
+        tested = set(self.test)
+        for name in ("sensor", "tune", "validation"):
+            leaked = tested & set(getattr(self, name))
+            if leaked:
+                raise ValueError(f"demos {sorted(leaked)} would be tested on and used as {name}")
+        if self.sensor & {*self.tune, *self.validation}:
+            raise ValueError("the filter must learn from demos that its sensor has not seen")
+
+
+def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
+    """Of a collection's demos those of one side, below ``end``: the folder may hold more than the study asks for."""
+    return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
+
+
+def sim_roles(collections: Collections) -> Roles:
+    """Roles in the simulator."""
+    frames = collections.replay("sim-frames", "train", frames_only=True)
+    sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
+    test = _numbers(collections, "sim-sequences", "test", collections.sequences)
+    held = max(len(sequences) // 7, 1)
+    sensor = {e.demo for e in frames.episodes if e.demo >= collections.sequences}
+    return Roles(sensor, sequences[:-held], sequences[-held:], test)
+
+
+def real_roles(collections: Collections) -> Roles:
+    """Roles in ``real_like``: of the few demos on the train side, two thirds train the sensor."""
+    train = _numbers(collections, "real_like-sequences", "train", collections.real)[: collections.real_train]
+    test = _numbers(collections, "real_like-sequences", "test", collections.real)
+    own = max(len(train) * 7 // 10, 1)
+    held = max((len(train) - own) // 3, 1)
+    return Roles(set(train[:own]), train[own:-held], train[-held:], test)

@@ -1,0 +1,83 @@
+"""A second look: the trunk that sees the whole picture says where the gripper is, and there one looks closely."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample
+
+from torch_denkf.modules import KeypointTrunk
+
+# Nominal calibration, m from the table's centre: only where the first looks go follows from it.
+CAMERA, TARGET, FIELD = (1.4, 0.0, 0.85), (-0.18, 0.02, 0.27), 33.0
+PATCH, REACH, RAISE = 32, 0.29, 0.1  # pixels; half a patch's side and its shift upwards, in half pictures
+
+
+def project(places: Tensor) -> Tensor:
+    """Where places ``[*, 3]`` are in the picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1."""
+    camera, target = torch.tensor(CAMERA), torch.tensor(TARGET)
+    ahead = nn.functional.normalize(target - camera, dim=0)
+    right = nn.functional.normalize(torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+    up = torch.linalg.cross(right, ahead)
+    way = places - camera
+    depth = (way @ ahead) * torch.tan(torch.tensor(FIELD / 2).deg2rad())
+    return torch.stack([way @ right / depth, -(way @ up) / depth], -1)
+
+
+class GlimpseTrunk(nn.Module):
+    """A coarse trunk, and convolutions on a patch of the full resolution around the gripper.
+
+    The gripper is a dozen pixels wide: what its opening and its turn look like is lost in maps of a sixteenth of the
+    picture's width.
+
+    Args:
+        coarse: sees the whole picture, ``[N, 3, H, W]`` to ``[N, F]``.
+        size: F.
+        features: width of the output.
+
+    Shape:
+        ``[N, 3, H, W]`` to ``[N, features]``.
+    """
+
+    def __init__(self, coarse: nn.Module, size: int = 192, features: int = 192):
+        super().__init__()
+        self.coarse = coarse
+        self.centre = nn.Linear(size, 2)
+        self.close = nn.Sequential(
+            *_block(5, 24, 1), *_block(24, 48, 2), *_block(48, 48, 1), *_block(48, 64, 2), nn.Flatten()
+        )
+        self.squeeze = nn.Sequential(nn.Linear(64 * (PATCH // 4) ** 2, 128), nn.ReLU())
+        self.mix = nn.Sequential(nn.Linear(size + 128 + 2, features), nn.ReLU())
+        side = torch.linspace(-1, 1, PATCH)
+        self.register_buffer("grid", torch.stack(torch.meshgrid(side, side, indexing="xy"), -1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Features of images."""
+        code = self.coarse(images)
+        centre = self.centre(code)
+        grid = centre[:, None, None] + REACH * self.grid - self.grid.new_tensor([0.0, RAISE])
+        patch = grid_sample(images.contiguous(), grid, align_corners=False, padding_mode="border")
+        patch = torch.cat([patch, self.grid.permute(2, 0, 1).expand(len(images), -1, -1, -1)], 1)
+        return self.mix(torch.cat([code, self.squeeze(self.close(patch)), centre], -1))
+
+    @torch.no_grad()
+    def aim(self, images: Tensor, places: Tensor) -> float:
+        """Sets the centre of the patch by least squares to where places ``[N, 3]`` project; their error in pixels."""
+        parts = [self.coarse(part) for part in images.split(128)]
+        code, goal = torch.cat(parts), project(places)
+        mean = code.mean(0)
+        design = torch.cat([code - mean, torch.ones(len(code), 1)], -1).double()
+        ridge = 1e-3 * len(code) * torch.eye(design.shape[-1], dtype=torch.double)
+        solution = torch.linalg.solve(design.mT @ design + ridge, design.mT @ goal.double()).float()
+        self.centre.weight.copy_(solution[:-1].mT)
+        self.centre.bias.copy_(solution[-1] - self.centre.weight @ mean)
+        return float((self.centre(code) - goal).abs().mean()) * images.shape[-1] / 2
+
+
+def _block(before: int, after: int, stride: int) -> tuple[nn.Module, ...]:
+    return nn.Conv2d(before, after, 3, stride, 1), nn.GroupNorm(8, after), nn.ReLU()
+
+
+def keypoint_trunk() -> KeypointTrunk:
+    """The coarse trunk of both presets."""
+    return KeypointTrunk(3, channels=(24, 32, 64, 96), keypoints=48, features=192)

@@ -1,0 +1,164 @@
+"""How to compose, train and tune a filter; the registry."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from copy import deepcopy
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torch_denkf.filters import Filter
+from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, SubModel
+from ur5_study.demos import JOINTS, STATE
+from ur5_study.motion import ERRORS, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
+from ur5_study.sensors import SAMPLES, BlackIsMissing, NearForecast, Preset, Statistics
+
+FILTERS: dict[str, type[Recipe]] = {}
+INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states
+
+
+def register(recipe: type[Recipe]) -> type[Recipe]:
+    """Makes a filter available to all commands under its class's name in lower case."""
+    FILTERS[recipe.__name__.lower()] = recipe
+    return recipe
+
+
+class Scaled(SubModel):
+    """Variances, or a covariance, times the square of a factor. It belongs to no state dict: see ``set_inflation``.
+
+    Inflating the belief itself in each step would do harm here: only the sum of a number and its bias is seen, and
+    what they differ by would grow without bound.
+    """
+
+    def __init__(self, noise: SubModel):
+        super().__init__(noise, noise.in_keys, noise.out_keys)
+        self.factor = 1.0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes what ``noise`` writes, scaled."""
+        out, key = self.module(tensordict), self.out_keys[0]
+        return out.set(key, self.factor**2 * out.get(key))
+
+
+class Recipe:
+    """How to compose, train and tune one filter. All read the same sensor and begin with the same motion, and all
+    carry the table's ten numbers in the first ten entries of their mean.
+
+    Args:
+        sensor: whose trunk stays as it is, and whose head is trained with the filter.
+        preset: what it reads of a state.
+        facts: statistics of the training demos.
+        motion: trained before; the filter gets a copy.
+        ensemble_size: members of an ensemble.
+    """
+
+    actions = False  # whether the motion reads the joints' targets
+    bias = True  # whether the state holds the sensor's slow errors
+
+    def __init__(
+        self, sensor: ImageSensor, preset: Preset, facts: Statistics, motion: ArmMotion, ensemble_size: int = SAMPLES
+    ):
+        self.sensor, self.preset, self.facts, self.motion = sensor, preset, facts, deepcopy(motion)
+        self.ensemble_size = ensemble_size
+        self.encoding = sensor.module["head"].layers[-1].in_features
+
+    def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
+        """Everything behind the sensor, by name, in order."""
+        raise NotImplementedError
+
+    def belief(self, std: Tensor, state_key: str) -> TensorDictModuleBase:
+        """The belief around a state ``[*B, S]``."""
+        raise NotImplementedError
+
+    def loss(self, model: Filter) -> nn.Module:
+        """What the training minimises, on windows with the true ``"state"`` and ``"motion"``."""
+        raise NotImplementedError
+
+    def set_inflation(self, model: Filter, factor: float) -> None:
+        """The one number that is chosen on the validation demos: a factor on all standard deviations of noise.
+
+        Of Q, R, and the sensor's samples around their mean: gains stay, and spreads grow by it.
+        """
+        for module in model.modules():
+            if isinstance(module, (Scaled, NearForecast)):
+                module.factor = factor
+
+    def noise(self) -> SubModel:
+        """R, from what the sensor saw."""
+        return Scaled(self._noise())
+
+    def _noise(self) -> SubModel:
+        return DiagonalNoise(STATE, r=ERRORS, in_features=self.encoding, in_key=("sensor", "encoding"))
+
+    @property
+    def size(self) -> int:
+        """S, of the state."""
+        return SIZE + STATE * self.bias
+
+    @property
+    def noisy(self) -> list[int]:
+        """Dimensions of the state that the process noise acts on."""
+        return [*NOISY, *range(SIZE, self.size)]
+
+    def transition(self) -> SubModel:
+        """The learned motion, with a copy of its pre-trained parameters."""
+        return transition(self.motion, self.bias)
+
+    def observation(self) -> SubModel:
+        """H of the near reading."""
+        return LearnedObservation(BiasedReading())
+
+    @property
+    def process_std(self) -> Tensor:
+        """What the motion does not know before training: half a millimetre, usual accelerations, a tenth of a bias."""
+        return torch.cat([torch.full((3,), 0.0005), self.facts.acceleration, 0.3 * ERRORS])[: len(self.noisy)]
+
+    def process_noise(self) -> SubModel:
+        """Q of place, rates and bias, from the belief's mean."""
+        return Scaled(self._process_noise())
+
+    def _process_noise(self) -> SubModel:
+        facts, blind = self.facts, self.size - SIZE
+        return DiagonalNoise(
+            len(self.noisy),
+            r=self.process_std,
+            in_features=self.size,
+            loc=torch.cat([facts.loc, torch.zeros(JOINTS + blind)]),
+            scale=torch.cat([facts.scale, facts.rate, torch.full((blind,), torch.inf)]),
+            in_key=("belief", "mean"),
+            out_key=("forecast", "noise"),
+        )
+
+    @property
+    def state_scale(self) -> Tensor:
+        """Units of the loss; rates and biases do not count."""
+        return torch.cat([ERRORS, torch.full((self.size - STATE,), torch.inf)])
+
+    @property
+    def start_std(self) -> Tensor:
+        """How wrong training windows begin, ``[17]``."""
+        return torch.cat([2 * INITIAL * self.facts.scale, 0.3 * self.facts.rate])
+
+    def _with_bias(self, std: Tensor) -> Tensor:
+        return torch.cat([std, ERRORS])[: self.size]
+
+    def initial(self) -> TensorDictModuleBase:
+        """The belief at the start of an episode: near the true state, at rest."""
+        std = torch.cat([INITIAL * self.facts.scale, torch.zeros(JOINTS)])
+        return AtRest(self.belief(self._with_bias(std), "state"), "state", self.size)
+
+    def build(self) -> Filter:
+        """The whole filter, from pictures on."""
+        parts = OrderedDict(black=BlackIsMissing(), sensor=self.sensor, **self.modules())
+        return Filter(parts, initial=self.initial())
+
+    def behind(self, model: Filter, *, training: bool = False) -> Filter:
+        """The same filter, sharing all parameters, on readings; from a wrong ``"start"`` in training."""
+        parts = OrderedDict((name, model[name]) for name in model.module if name not in ("black", "sensor"))
+        if not training:
+            return Filter(parts, initial=model.initial)
+        belief = self.belief(self._with_bias(self.start_std), "start")
+        return Filter(parts, initial=AtRest(belief, "start", self.size))

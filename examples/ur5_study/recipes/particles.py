@@ -1,0 +1,103 @@
+"""The baselines that carry weighted particles: DPF, dPF-M and dPF-M-lrn."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import Tensor, nn
+
+from torch_denkf.modules import (
+    AroundState,
+    GaussianLikelihood,
+    LearnedLikelihood,
+    NoisyTransition,
+    ParticleAnalysis,
+    ResampledTransition,
+    SubModel,
+    WithWeights,
+)
+from torch_denkf.objectives import MixtureLoss
+from ur5_study.demos import STATE
+from ur5_study.motion import ERRORS
+from ur5_study.recipes._base import Recipe, register
+from ur5_study.sensors import NEAR, NearForecast
+
+PARTICLES = 100  # as both papers train with
+
+
+class Reading(SubModel):
+    """What a learned likelihood looks at: the sensor's encoding, and its reading, standardised."""
+
+    def __init__(self, loc: Tensor, scale: Tensor):
+        super().__init__(nn.Identity(), [NEAR, ("sensor", "encoding")], [("sensor", "reading")])
+        self.register_buffer("loc", loc.clone())
+        self.register_buffer("scale", scale.clone())
+
+    def forward(self, tensordict):
+        """Writes ``("sensor", "reading")`` ``[*B, F + O]``."""
+        samples, encoding = (self.read(tensordict, key) for key in self.in_keys)
+        reading = (samples.mean(-2) - self.loc) / self.scale
+        return tensordict.set(self.out_keys[0], torch.cat([encoding, reading], -1))
+
+
+class _Particles(Recipe):
+    """Particles move by the learned motion with its learned noise."""
+
+    resampling, learned = "soft", None
+    bias = False  # a hundred particles do not fill ten dimensions more
+
+    def modules(self):
+        noisy = NoisyTransition(
+            self.transition(), self.process_noise(), self.noisy, before=True, ensemble_size=PARTICLES
+        )
+        modules = OrderedDict()
+        if not self.learned:
+            modules["noise"] = self.noise()
+        modules["transition"] = ResampledTransition(noisy, self.resampling)
+        modules["near"] = NearForecast(self.preset)
+        if self.learned:
+            loc, scale = self.facts.loc, self.facts.scale
+            modules["reading"] = Reading(loc, scale)
+            likelihood = LearnedLikelihood(
+                self.encoding + STATE,
+                STATE,
+                bound=self.learned,
+                loc=loc,
+                scale=scale,
+                encoding_key=("sensor", "reading"),
+            )
+        else:
+            likelihood = GaussianLikelihood(sensor_key=NEAR)
+        modules["observation"] = self.observation()
+        modules["likelihood"] = likelihood
+        modules["analysis"] = ParticleAnalysis()
+        return modules
+
+    def belief(self, std, state_key):
+        return WithWeights(AroundState(std, ensemble_size=PARTICLES, state_key=state_key))
+
+    def loss(self, model):
+        return MixtureLoss(model, sensor=0.0, dims=range(STATE), state_scale=ERRORS)
+
+    def set_inflation(self, model, factor):
+        model["analysis"].tempering = factor**-2
+
+
+@register
+class DPF(_Particles):
+    """Jonschkowski et al. 2018: learned likelihood, hard resampling in every step."""
+
+    resampling, learned = "systematic", "scaled"
+
+
+@register
+class DPF_M(_Particles):
+    """Kloss et al. 2021: Gaussian likelihood, soft resampling."""
+
+
+@register
+class DPF_M_LRN(_Particles):
+    """Kloss et al. 2021 with a learned likelihood."""
+
+    learned = "clipped"
