@@ -168,7 +168,7 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
     monkeypatch.setattr(_demo_cache, "read_demo", count)
     first = UR5ExperienceReplay(folder, split="all", cache=cache)
     assert len(decoded) == 1 + 4  # the first one also tells the size
-    stored = first._pixels._stored
+    stored = first._frames._stored
     assert type(stored).__name__ == "MemoryMappedTensor"
     decoded.clear()
     for split in ("all", "train"):

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 from torch_denkf.data._demo_files import TASKS, Entry
+from torch_denkf.data._replay import episode_flags
 
 
 @dataclass(frozen=True)
@@ -56,17 +57,15 @@ def episode_rows(
     if frames_only:
         keep = keep & (rows["frame"].squeeze(-1) >= 0)
     episode = (take.cumsum(0) - 1)[number[keep]]
-    never = torch.zeros(len(episode), 1, dtype=torch.bool)
-    first, last = never.clone(), never.clone()
+    first = torch.zeros(len(episode), 1, dtype=torch.bool)
+    last = first.clone()
     changes = episode.diff() != 0
     first[1:, 0], last[:-1, 0] = changes, changes
     first[:1] = last[-1:] = True
     if frames_only:
         first[:] = last[:] = True
-    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
-    flags = {"is_init": first, "episode": episode, **{key: never.clone() for key in done}}
     selected = {key: value[keep] for key, value in rows.items()}
-    out = TensorDict({**selected, **flags, "next": TensorDict(done, episode.shape)}, episode.shape)
+    out = TensorDict({**selected, "episode": episode, **episode_flags(first, last)}, episode.shape)
     lengths = torch.bincount(episode, minlength=int(take.sum()))
     starts = (lengths.cumsum(0) - lengths).tolist()
     demos = [entry.demo for entry, use in zip(entries, chosen, strict=True) if use]

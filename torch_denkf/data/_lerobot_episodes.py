@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf.data._replay import whole_episode
+
 _FOLD = 5  # one episode of so many is for tests
 
 
@@ -35,14 +37,8 @@ def is_for_tests(number: int) -> bool:
 
 def episode_rows(recording: TensorDictBase, begin: int, count: int) -> TensorDict:
     """What the buffer stores of an episode."""
-    never = torch.zeros(count, 1, dtype=torch.bool)
-    first, last = never.clone(), never.clone()
-    first[0], last[-1] = True, True
-    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
     numbers = recording.exclude("image")[begin : begin + count].clone()
-    return numbers.update(
-        {"is_init": first, **{key: never.clone() for key in done}, "next": TensorDict(done, batch_size=[count])}
-    )
+    return numbers.update(whole_episode(count))
 
 
 def pixel_statistics(images: Tensor, index: Tensor, chunk: int = 256) -> dict[str, Tensor]:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
-from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
 from torch_denkf.data._kitti_episodes import Episode, find_cameras, find_drives, read_drives
+from torch_denkf.data._replay import EpisodeReplay, choose_sampler, whole_episode
 from torch_denkf.data.frames import MOTION_KEYS, frames_at
 from torch_denkf.data.gaps import steps_at
 from torch_denkf.data.kitti import _choose_camera
@@ -24,7 +23,7 @@ from torch_denkf.data.mirror import mirror_drive
 __all__ = ["KITTIOdometryExperienceReplay"]
 
 
-class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
+class KITTIOdometryExperienceReplay(EpisodeReplay):
     """Drives in the layout of KITTI's odometry benchmark, as a replay buffer of their frames.
 
     Episodes, one for each drive, camera and mirror image, lie one behind the other, so that torchrl's slice samplers
@@ -102,6 +101,8 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
         torch.Size([2])
     """
 
+    episodes: tuple[Episode, ...]
+
     def __init__(
         self,
         root: str | Path,
@@ -125,16 +126,7 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
         cache: str | Path | bool | None = True,
         progress: bool = True,
     ):
-        if num_slices is not None or slice_len is not None:
-            if sampler is not None or (num_slices is not None and slice_len is not None):
-                raise ValueError("pass one of num_slices, slice_len and sampler; the sampler may cut slices itself")
-            sampler = SliceSampler(
-                num_slices=num_slices,
-                slice_len=slice_len,
-                traj_key="episode",
-                cache_values=True,
-                strict_length=strict_length,
-            )
+        sampler = choose_sampler(sampler, num_slices, slice_len, strict_length)
         self.root = Path(root).expanduser().resolve()
         sources = []
         for name in find_drives(self.root, drives):
@@ -143,43 +135,29 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
         self._drives = read_drives(
             self.root, sources, size=size, colour=colour, cache=cache, flow=flow, progress=progress
         )
-        episodes, rows = [], []
+        episodes: list[Episode] = []
+        rows = []
         for (name, camera), drive in zip(sources, self._drives, strict=True):
             for mirror in (False, True) if mirrored else (False,):
                 start = episodes[-1].start + episodes[-1].length if episodes else 0
                 rows.append(_rows(drive, len(episodes), size[1] if mirror else None))
                 episodes.append(Episode(name, camera, mirror, start, len(drive)))
-        self.episodes: tuple[Episode, ...] = tuple(episodes)
-        self._check_lengths(sampler, batch_size)
-        self._frames = _SampledFrames(self._drives, [episode.mirrored for episode in episodes])
         super().__init__(
-            storage=TensorStorage(torch.cat(rows)),
+            torch.cat(rows),
+            episodes,
+            _SampledFrames(self._drives, [episode.mirrored for episode in episodes]),
             sampler=sampler,
-            writer=ImmutableDatasetWriter() if writer is None else writer,
+            batch_size=batch_size,
+            writer=writer,
+            transform=transform,
             collate_fn=collate_fn,
             pin_memory=pin_memory,
             prefetch=prefetch,
-            batch_size=batch_size,
-            transform=self._frames,
         )
-        if transform is not None:
-            self.append_transform(transform)
 
-    def _check_lengths(self, sampler: Sampler | None, batch_size: int | None) -> None:
-        """TorchRL's samplers leave short episodes out without a word; here, that is a mistake."""
-        if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
-            return
-        length = sampler.slice_len
-        if length is None:
-            length = None if batch_size is None else batch_size // sampler.num_slices
-        if length is None:
-            return
-        short = {f"{e.drive}/{e.camera}": e.length for e in self.episodes if e.length < length}
-        if short:
-            raise ValueError(
-                f"slices have {length} rows, but these drives are shorter: {short}; leave them out with drives=..., "
-                "pass shorter slices, or strict_length=False for slices that may be shorter"
-            )
+    def _say_short(self, short: Sequence[Episode]) -> str:
+        lengths = {f"{episode.drive}/{episode.camera}": episode.length for episode in short}
+        return f"these drives are shorter: {lengths}; leave them out with drives=...,"
 
     @cached_property
     def statistics(self) -> TensorDict:
@@ -205,30 +183,12 @@ class KITTIOdometryExperienceReplay(BaseDatasetExperienceReplay):
             statistics["pixels"] = _pixel_statistics(self._drives)
         return TensorDict(statistics).float()
 
-    @property
-    def data_path(self) -> Path:
-        """The folder that holds ``sequences`` and ``poses``."""
-        return self.root
-
-    @property
-    def data_path_root(self) -> Path:
-        """The same: the data set has no splits of its own."""
-        return self.root
-
     def _is_downloaded(self) -> bool:
         return (self.root / "sequences").is_dir()
 
-    def delete(self) -> None:
-        """Refuses: the frames are not this library's to delete.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(f"the frames in {self.root} were not written by this data set; delete them by hand")
-
-    def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
-        """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
-        return super().preprocess(partial(_then, self._frames, fn), *args, **kwargs)
+    @property
+    def _not_ours(self) -> str:
+        return f"the frames in {self.root} were not written by this data set; delete them by hand"
 
 
 class _SampledFrames(Transform):
@@ -257,26 +217,16 @@ class _SampledFrames(Transform):
         return tensordict
 
 
-def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBase:
-    return fn(first(rows))
-
-
 def _rows(drive: TensorDictBase, episode: int, mirrored_width: int | None) -> TensorDict:
     """What the buffer stores of an episode."""
     count = len(drive)
     rows = drive.select("state", "time", "dt", "frame", "calibration")
     if mirrored_width is not None:
         rows = mirror_drive(rows, width=mirrored_width)
-    never = torch.zeros(count, 1, dtype=torch.bool)
-    first, last = never.clone(), never.clone()
-    first[0], last[-1] = True, True
-    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
     entries = {
         "observed": steps_at(drive, torch.arange(count)) > 0,
-        "is_init": first,
         "episode": torch.full((count,), episode),
-        **{key: never.clone() for key in done},
-        "next": TensorDict(done, [count]),
+        **whole_episode(count),
     }
     return rows.clone().update(entries)
 

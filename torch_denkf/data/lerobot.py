@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property, partial
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
-from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
 from torch_denkf.data._lerobot_episodes import RecordedEpisode, episode_rows, is_for_tests, pixel_statistics
 from torch_denkf.data._lerobot_recording import Recording, read_recording
-from torch_denkf.data.kitti_replay import _then
+from torch_denkf.data._replay import EpisodeReplay, choose_sampler
 
 __all__ = ["LeRobotExperienceReplay"]
 
 
-class LeRobotExperienceReplay(BaseDatasetExperienceReplay):
+class LeRobotExperienceReplay(EpisodeReplay):
     """Episodes of a robot's camera and joints, in LeRobot's format, as a replay buffer of their frames.
 
     TorchRL has a class of this name that decodes videos when it samples, for vision-language-action models. This one
@@ -116,6 +114,8 @@ class LeRobotExperienceReplay(BaseDatasetExperienceReplay):
         (8, torch.Size([7]))
     """
 
+    episodes: tuple[RecordedEpisode, ...]
+
     def __init__(
         self,
         root: str | Path | Recording,
@@ -140,16 +140,7 @@ class LeRobotExperienceReplay(BaseDatasetExperienceReplay):
     ):
         if split not in ("train", "test", "all"):
             raise ValueError(f"split is 'train', 'test' or 'all', got {split!r}")
-        if num_slices is not None or slice_len is not None:
-            if sampler is not None or (num_slices is not None and slice_len is not None):
-                raise ValueError("pass one of num_slices, slice_len and sampler; the sampler may cut slices itself")
-            sampler = SliceSampler(
-                num_slices=num_slices,
-                slice_len=slice_len,
-                traj_key="episode",
-                cache_values=True,
-                strict_length=strict_length,
-            )
+        sampler = choose_sampler(sampler, num_slices, slice_len, strict_length)
         if isinstance(root, Recording):
             recording = root
         else:
@@ -181,35 +172,22 @@ class LeRobotExperienceReplay(BaseDatasetExperienceReplay):
             episodes.append(RecordedEpisode(number, start, length_of[number]))
             rows.append(episode_rows(recording.rows, self._begin[number], length_of[number]))
             start += length_of[number]
-        self.episodes: tuple[RecordedEpisode, ...] = tuple(episodes)
-        self._check_lengths(sampler, batch_size)
-        self._frames = _SampledFrames(recording.rows["image"], self._begin)
         super().__init__(
-            storage=TensorStorage(torch.cat(rows)),
+            torch.cat(rows),
+            episodes,
+            _SampledFrames(recording.rows["image"], self._begin),
             sampler=sampler,
-            writer=ImmutableDatasetWriter() if writer is None else writer,
+            batch_size=batch_size,
+            writer=writer,
+            transform=transform,
             collate_fn=collate_fn,
             pin_memory=pin_memory,
             prefetch=prefetch,
-            batch_size=batch_size,
-            transform=self._frames,
         )
-        if transform is not None:
-            self.append_transform(transform)
 
-    def _check_lengths(self, sampler: Sampler | None, batch_size: int | None) -> None:
-        """TorchRL's samplers leave short episodes out without a word; here, that is a mistake."""
-        if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
-            return
-        length = sampler.slice_len
-        if length is None and batch_size is not None:
-            length = batch_size // sampler.num_slices
-        short = {e.number: e.length for e in self.episodes if length is not None and e.length < length}
-        if short:
-            raise ValueError(
-                f"slices have {length} rows, but these episodes are shorter: {short}; pass shorter slices, or "
-                "strict_length=False for slices that may be shorter"
-            )
+    def _say_short(self, short: Sequence[RecordedEpisode]) -> str:
+        lengths = {episode.number: episode.length for episode in short}
+        return f"these episodes are shorter: {lengths};"
 
     @cached_property
     def statistics(self) -> TensorDict:
@@ -238,30 +216,12 @@ class LeRobotExperienceReplay(BaseDatasetExperienceReplay):
         statistics["pixels"] = pixel_statistics(self._recording["image"], index[rows["observed"].squeeze(-1)])
         return TensorDict(statistics).float()
 
-    @property
-    def data_path(self) -> Path | None:
-        """The folder that holds ``meta`` and ``data``; None for a recording that came from elsewhere."""
-        return self.root
-
-    @property
-    def data_path_root(self) -> Path | None:
-        """The same: all splits are of one folder."""
-        return self.root
-
     def _is_downloaded(self) -> bool:
         return self.root is None or (self.root / "meta").is_dir()
 
-    def delete(self) -> None:
-        """Refuses: the recording is not this library's to delete.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(f"the recording {self.root or 'in memory'} is not this data set's; delete it by hand")
-
-    def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
-        """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
-        return super().preprocess(partial(_then, self._frames, fn), *args, **kwargs)
+    @property
+    def _not_ours(self) -> str:
+        return f"the recording {self.root or 'in memory'} is not this data set's; delete it by hand"
 
 
 class _SampledFrames(Transform):

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property, partial
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
-from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+from tensordict import TensorDict
+from torchrl.data import SliceSampler
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
@@ -18,6 +17,7 @@ from torchrl.envs.transforms import Transform
 from torch_denkf.data._demo_cache import read_demos, read_entries
 from torch_denkf.data._demo_files import MANIFEST
 from torch_denkf.data._demo_rows import SampledPixels, UR5Episode, episode_rows, split_of
+from torch_denkf.data._replay import EpisodeReplay, choose_sampler
 
 try:  # of the extra "examples"
     from tqdm import tqdm
@@ -27,7 +27,7 @@ except ImportError:
 __all__ = ["UR5ExperienceReplay"]
 
 
-class UR5ExperienceReplay(BaseDatasetExperienceReplay):
+class UR5ExperienceReplay(EpisodeReplay):
     """Demos that ``python -m torch_denkf.data.collect_ur5`` collected, as a replay buffer of their steps.
 
     Demos lie one behind the other, so that torchrl's slice samplers cut sub-sequences out of them. A sample, batch size
@@ -101,6 +101,8 @@ class UR5ExperienceReplay(BaseDatasetExperienceReplay):
         torch.Size([4, 5, 10])
     """
 
+    episodes: tuple[UR5Episode, ...]
+
     def __init__(
         self,
         root: str | Path,
@@ -123,16 +125,7 @@ class UR5ExperienceReplay(BaseDatasetExperienceReplay):
     ):
         if split not in ("train", "test", "all"):
             raise ValueError(f"split is 'train', 'test' or 'all', got {split!r}")
-        if num_slices is not None or slice_len is not None:
-            if sampler is not None or (num_slices is not None and slice_len is not None):
-                raise ValueError("pass one of num_slices, slice_len and sampler; the sampler may cut slices itself")
-            sampler = SliceSampler(
-                num_slices=num_slices,
-                slice_len=slice_len,
-                traj_key="episode",
-                cache_values=True,
-                strict_length=strict_length,
-            )
+        sampler = choose_sampler(sampler, num_slices, slice_len, strict_length)
         if frames_only and isinstance(sampler, SliceSampler):
             raise ValueError("slices are cut out of whole sequences, frames_only leaves single rows: pass one of them")
         self.root = Path(root).expanduser().resolve()
@@ -156,35 +149,21 @@ class UR5ExperienceReplay(BaseDatasetExperienceReplay):
         if frames_only and "frames" not in self._demos:
             raise ValueError(f"the demos in {self.root} have no pictures; collect them without --no-pixels")
         rows, episodes = episode_rows(self._demos["rows"], entries, chosen, frames_only)
-        self.episodes: tuple[UR5Episode, ...] = episodes
-        self._check_lengths(sampler, batch_size)
-        self._pixels = SampledPixels(self._demos.get(("frames", "pixels"), None))
         super().__init__(
-            storage=TensorStorage(rows),
+            rows,
+            episodes,
+            SampledPixels(self._demos.get(("frames", "pixels"), None)),
             sampler=sampler,
-            writer=ImmutableDatasetWriter() if writer is None else writer,
+            batch_size=batch_size,
+            writer=writer,
+            transform=transform,
             collate_fn=collate_fn,
             pin_memory=pin_memory,
             prefetch=prefetch,
-            batch_size=batch_size,
-            transform=self._pixels,
         )
-        if transform is not None:
-            self.append_transform(transform)
 
-    def _check_lengths(self, sampler: Sampler | None, batch_size: int | None) -> None:
-        """TorchRL's samplers leave short episodes out without a word; here, that is a mistake."""
-        if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
-            return
-        length = sampler.slice_len
-        if length is None:
-            length = None if batch_size is None else batch_size // sampler.num_slices
-        short = {e.demo: e.length for e in self.episodes if length is not None and e.length < length}
-        if short:
-            raise ValueError(
-                f"slices have {length} rows, but demos {list(short)[:8]} have {min(short.values())}; pass shorter "
-                "slices, or strict_length=False for slices that may be shorter"
-            )
+    def _say_short(self, short: Sequence[UR5Episode]) -> str:
+        return f"demos {[e.demo for e in short][:8]} have {min(e.length for e in short)};"
 
     @cached_property
     def statistics(self) -> TensorDict:
@@ -218,34 +197,12 @@ class UR5ExperienceReplay(BaseDatasetExperienceReplay):
             statistics["pixels"] = {"mean": mean[:, None, None] / 255, "std": std[:, None, None] / 255}
         return TensorDict(statistics).float()
 
-    @property
-    def data_path(self) -> Path:
-        """The folder of the demos."""
-        return self.root
-
-    @property
-    def data_path_root(self) -> Path:
-        """The same: splits are no folders."""
-        return self.root
-
     def _is_downloaded(self) -> bool:
         return (self.root / MANIFEST).is_file()
 
-    def delete(self) -> None:
-        """Refuses: the demos took hours to collect.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(f"the demos in {self.root} were not written by this data set; delete them by hand")
-
-    def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
-        """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
-        return super().preprocess(partial(_then, self._pixels, fn), *args, **kwargs)
-
-
-def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBase:
-    return fn(first(rows))
+    @property
+    def _not_ours(self) -> str:
+        return f"the demos in {self.root} were not written by this data set; delete them by hand"
 
 
 def _ignore(count: int) -> None:
