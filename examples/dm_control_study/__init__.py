@@ -1,0 +1,1 @@
+"""What examples/dm_control_arms.py is made of."""
