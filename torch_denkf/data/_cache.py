@@ -16,13 +16,32 @@ def _cache_directory() -> Path:
 
 
 def _cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Load a cache entry, or make it: written beside and renamed, so that an entry that exists is complete."""
+    """Load a cache entry, or read it into memory and store it."""
+    stored = _load(entry)
+    return _store(entry, read().memmap) if stored is None else stored
+
+
+def _cached_in_place(entry: Path, write: Callable[[Path], object]) -> TensorDict:
+    """Load a cache entry, or have it written into the folder that is passed, for what is too large for memory.
+
+    Raises:
+        OSError: if the cache cannot be written.
+    """
+    stored = _load(entry)
+    return _store(entry, write) if stored is None else stored
+
+
+def _load(entry: Path) -> TensorDict | None:
     if entry.is_dir():
         try:
             return TensorDict.load_memmap(entry)
         except (OSError, RuntimeError, KeyError, ValueError):  # damaged from outside: make it anew
             shutil.rmtree(entry, ignore_errors=True)
-    drive = read()
+    return None
+
+
+def _store(entry: Path, write: Callable[[Path], object]) -> TensorDict:
+    """Write an entry beside its place and rename it, so that one that exists is complete."""
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=entry.parent))
@@ -32,10 +51,10 @@ def _cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
             "TORCH_DENKF_CACHE"
         ) from error
     try:
-        drive.memmap(beside / "drive")
+        write(beside / "entry")
         if not entry.is_dir():
             try:
-                (beside / "drive").rename(entry)
+                (beside / "entry").rename(entry)
             except OSError:
                 if not entry.is_dir():  # otherwise another process was faster, with the same content
                     raise

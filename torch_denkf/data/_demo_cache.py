@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple
@@ -18,7 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data._cache import _cache_directory
+from torch_denkf.data._cache import _cache_directory, _cached_in_place
 from torch_denkf.data._demo_files import COMMAND, MANIFEST, TASKS, Demo, Entry, read_demo, read_manifest
 
 _FORMAT = 1  # part of the cache's key: raise it when what is stored changes
@@ -84,29 +82,8 @@ def read_demos(
     key = json.dumps([_FORMAT, size, [astuple(entry) for entry in entries]])  # by content, wherever the folder lies
     name = "x".join(map(str, size)) if size else "stored"
     entry = directory / f"ur5-{len(entries)}-{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    try:
-        return TensorDict.load_memmap(entry)
-    except (OSError, RuntimeError, KeyError, ValueError):  # not there, or damaged from outside
-        shutil.rmtree(entry, ignore_errors=True)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=directory))
-    except OSError as error:
-        raise OSError(
-            f"cannot write the cache at {directory} ({error}); pass cache=FOLDER or cache=None, or set "
-            "TORCH_DENKF_CACHE"
-        ) from error
-    try:
-        # Filled where it lies: whole sequences of 2,000 demos at 112 px are 26 GB.
-        _read(root, entries, size, beside / "demos", progress)
-        try:
-            os.rename(beside / "demos", entry)
-        except OSError:
-            if not entry.is_dir():  # otherwise another process was faster, with the same content
-                raise
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return TensorDict.load_memmap(entry)
+    # Filled where it lies: whole sequences of 2,000 demos at 112 px are 26 GB.
+    return _cached_in_place(entry, lambda folder: _read(root, entries, size, folder, progress))
 
 
 def _read(
