@@ -60,8 +60,11 @@ def random_keep_mask(
     """
     threshold = int(representable_rate(rate) * 256)
     size = prod(shape)
-    words = torch.empty((size + 7) // 8, dtype=torch.int64, device=device)
-    words.random_(_INT64_MIN, None, generator=generator)
+    if torch.compiler.is_exporting():  # random_() over the whole range cannot be written into a graph: one number less
+        words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, ((size + 7) // 8,), device=device)
+    else:
+        words = torch.empty((size + 7) // 8, dtype=torch.int64, device=device)
+        words.random_(_INT64_MIN, None, generator=generator)
     return (words.view(torch.uint8)[:size] >= threshold).view(tuple(shape))
 
 

@@ -1,0 +1,171 @@
+"""A packaged step against the filter itself, with the same noise, over many steps."""
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
+
+needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
+
+
+def small_filter(action=False):
+    torch.manual_seed(0)
+    return DEnKF(
+        LearnedTransition(StochasticMLP(6 if action else 3, 3, (16,)), action_key="action" if action else None),
+        None,
+        Select([0, 2]),
+        ConstantNoise([0.1, 0.2], in_key="reading"),
+        EnsembleAnalysis("perturbed", sensor_key="reading"),
+        initial=AroundState([0.1, 0.1, 0.1], ensemble_size=8),
+    )
+
+
+def frames(steps):
+    generator = torch.Generator().manual_seed(1)
+    return TensorDict(
+        {
+            "reading": torch.randn(steps, 2, generator=generator),
+            "action": torch.randn(steps, 3, generator=generator),
+            "observed": torch.rand(steps, 2, generator=generator) < 0.7,
+        },
+        [steps],
+    )
+
+
+@pytest.fixture(params=[False, pytest.param(True, marks=needs_compiler)], scope="module")
+def package(request, tmp_path_factory):
+    filter = small_filter(action=True)
+    start = TensorDict({"state": torch.zeros(3)})
+    example = filter.draw_noise(filter.initialise(start.update(frames(1)[0])))
+    path = tmp_path_factory.mktemp("package") / "step.pt2"
+    return filter, example, export_step(filter, example, path, out_keys=[("info", "nis")], compiled=request.param)
+
+
+def test_many_steps_equal_the_filters(package):
+    filter, example, path = package
+    step, data = load_step(path), frames(30)
+    eager, packaged = example.clone(), {name: example[tuple(name.split("."))] for name in load_step(path).inputs}
+    torch.manual_seed(3)
+    for row in data.unbind(0):
+        noise = filter.draw_noise(row.clone())
+        with torch.no_grad():
+            eager = filter.step(noise.copy().update(eager.select(*filter.carry_keys)))
+        new = {".".join(k) if isinstance(k, tuple) else k: v for k, v in noise.items(True, True)}
+        packaged = step({**packaged, **new})
+        # float32 over 30 steps of the same numbers, added up in another order by the compiler
+        torch.testing.assert_close(packaged["belief.ensemble"], eager["belief", "ensemble"], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(packaged["belief.mean"], eager["belief", "mean"], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(packaged["info.nis"], eager["info", "nis"], rtol=1e-3, atol=1e-4)
+
+
+def test_it_loads_and_runs_where_neither_tensordict_nor_torchrl_is_imported(package):
+    _, _, path = package
+    code = f"""
+import sys, torch
+from torch_denkf.deployment import load_step
+step = load_step({str(path)!r})
+entries = {{name: torch.zeros(shape, dtype=getattr(torch, dtype.split(".")[1]))
+           for name, (shape, dtype) in step.inputs.items()}}
+out = step(entries)
+assert out["belief.mean"].shape == (3,), out
+assert not {{"tensordict", "torchrl"}} & set(sys.modules)
+print(sorted(step.carry))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "['belief.ensemble']"
+
+
+def test_what_does_not_fit_is_named(package):
+    step = load_step(package[2])
+    good = {name: package[1][tuple(name.split("."))] for name in step.inputs}
+    with pytest.raises(KeyError, match=r"needs 'reading' \[2\]"):
+        step({name: value for name, value in good.items() if name != "reading"})
+    with pytest.raises(ValueError, match=r"'reading' must be torch.float32 \[2\], got torch.float32 \[3\]"):
+        step({**good, "reading": torch.zeros(3)})
+    with pytest.raises(ValueError, match=r"'reading' must be torch\.float32"):
+        step({**good, "reading": torch.zeros(2, dtype=torch.float64)})
+
+
+def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_path):
+    filter = small_filter()
+    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
+    step = load_step(export_step(filter, example, tmp_path / "step.pt2", compiled=False))
+    assert set(step.inputs) == {"reading", "belief.ensemble"}
+    entries = {"reading": torch.ones(2), "belief.ensemble": torch.zeros(8, 3)}
+
+    def run(seed):
+        torch.manual_seed(seed)
+        return [step(entries)["belief.ensemble"] for _ in range(2)]
+
+    first, again, other = run(0), run(0), run(1)
+    assert first[0].equal(again[0])
+    assert first[1].equal(again[1])
+    assert not first[0].equal(first[1])
+    assert not first[0].equal(other[0])
+
+
+def test_a_batch_and_a_kalman_filter(tmp_path):
+    shift, noise = torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2)
+    kf = KalmanFilter(shift, noise, torch.eye(2)[:1], torch.eye(1), mean=torch.zeros(2), cov=torch.eye(2))
+    example = TensorDict({"observation": torch.randn(5, 1)}, [5])
+    step = load_step(export_step(kf, example, tmp_path / "kf.pt2", compiled=False))
+    belief = kf.initialise(example.copy())
+    out = step(
+        {
+            "observation": example["observation"],
+            "belief.mean": belief["belief", "mean"],
+            "belief.cov": belief["belief", "cov"],
+        }
+    )
+    expected = kf.step(belief.copy())
+    torch.testing.assert_close(out["belief.mean"], expected["belief", "mean"])
+    torch.testing.assert_close(out["belief.cov"], expected["belief", "cov"])
+
+
+def test_training_mode_is_left_as_it_was(tmp_path):
+    filter = small_filter().train()
+    export_step(
+        filter, TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}), tmp_path / "a.pt2", compiled=False
+    )
+    assert filter.training
+
+
+def test_errors(tmp_path, monkeypatch):
+    filter = small_filter()
+    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
+    with pytest.raises(ValueError, match=r"ends in \.pt2"):
+        export_step(filter, example, tmp_path / "step.pt")
+    with pytest.raises(ValueError, match="does not write"):
+        export_step(filter, example, tmp_path / "step.pt2", out_keys=["nothing"], compiled=False)
+    with pytest.raises(KeyError, match="the example lacks"):
+        export_step(filter, example.exclude("reading"), tmp_path / "step.pt2", compiled=False)
+    with pytest.raises(FileNotFoundError, match="export_step"):
+        load_step(tmp_path / "none.pt2")
+    (tmp_path / "cut.pt2").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="was cut"):
+        load_step(tmp_path / "cut.pt2")
+    other = torch.export.export(torch.nn.Linear(1, 1), (torch.zeros(1),))
+    torch.export.save(other, tmp_path / "other.pt2")
+    with pytest.raises(ValueError, match="not one of export_step"):
+        load_step(tmp_path / "other.pt2")
+
+
+def test_without_a_compiler_the_error_says_what_to_do(tmp_path, monkeypatch):
+    from torch._inductor import cpp_builder
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    def none():
+        raise InvalidCxxCompiler
+
+    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
+    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
+    with pytest.raises(RuntimeError, match=r"apt install g\+\+"):
+        export_step(small_filter(), example, tmp_path / "step.pt2")

@@ -1,0 +1,143 @@
+"""Writing a filter's step into a file: torch.export, then, by default, compiled ahead of time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor, nn
+
+from torch_denkf.deployment.package import FACTS
+from torch_denkf.filters import Filter
+from torch_denkf.filters.base import submodels
+
+
+class _FlatStep(nn.Module):
+    """A filter's step on plain tensors, in a fixed order."""
+
+    def __init__(self, filter: Filter, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey], batch_size):
+        super().__init__()
+        self.filter, self.in_keys, self.out_keys, self.batch_size = filter, in_keys, out_keys, batch_size
+
+    def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """Takes one step."""
+        tensordict = TensorDict({}, batch_size=self.batch_size)
+        for key, value in zip(self.in_keys, values, strict=True):
+            tensordict.set(key, value)
+        tensordict = self.filter.step(tensordict)
+        return tuple(tensordict.get(key) for key in self.out_keys)
+
+
+def export_step(
+    filter: Filter,
+    example: TensorDictBase,
+    path: str | Path,
+    *,
+    out_keys: Sequence[NestedKey] = (),
+    compiled: bool = True,
+) -> Path:
+    """Writes one step of a filter as a package with static shapes that loads without torch_denkf's training code.
+
+    Everything random is drawn inside, from torch's generator, unless ``example`` holds the noise (see
+    :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs.
+
+    Args:
+        filter: trained; its device is the package's.
+        example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
+            ``[*B]`` with the shapes and dtypes of the real ones. Where the belief is missing, it is initialised.
+        path: ends in ``.pt2``.
+        out_keys: what to return beside the belief, e.g. ``("info", "nis")``.
+        compiled: compile ahead of time (AOTInductor; needs a C++ compiler here and the same kind of processor there).
+            Otherwise the graph is written, which torch runs on any machine, slower.
+
+    Returns:
+        ``path``; :func:`torch_denkf.deployment.load_step` reads it.
+
+    Raises:
+        KeyError: if an entry that the step reads is missing.
+        ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
+        RuntimeError: if there is no C++ compiler.
+
+    Example:
+        >>> import tempfile
+        >>> from torch_denkf.deployment import export_step, load_step
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> frame = TensorDict({"observation": torch.ones(1)})
+        >>> step = load_step(export_step(kf, frame, f"{folder.name}/kf.pt2", compiled=False))
+        >>> sorted(step.inputs), step.carry
+        (['belief.cov', 'belief.mean', 'observation'], ['belief.mean', 'belief.cov'])
+        >>> step({"observation": torch.ones(1), "belief.mean": torch.zeros(1), "belief.cov": one})["belief.mean"]
+        tensor([0.6667])
+    """
+    path = Path(path)
+    if path.suffix != ".pt2":
+        raise ValueError(f"a package ends in .pt2, got {path}")
+    if compiled:
+        _need_compiler()
+    if any(example.get(key, None) is None for key in filter.carry_keys):
+        example = filter.initialise(example.copy())
+    written = [unravel_key(key) for key in filter.out_keys]
+    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys)]))
+    unknown = [key for key in out_keys if key not in written]
+    if unknown:
+        raise ValueError(f"the filter does not write {unknown}; it writes {written}")
+    in_keys = _inputs(filter, example)
+    values = tuple(example.get(key) for key in in_keys)
+    facts = {
+        "inputs": [
+            (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)
+        ],
+        "outputs": [_name(key) for key in out_keys],
+        "carry": [_name(key) for key in filter.carry_keys],
+    }
+    was_training = filter.training
+    step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
+    try:
+        with torch.no_grad():
+            program = torch.export.export(step, values)
+    finally:
+        filter.train(was_training)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if compiled:
+        options = {"aot_inductor.metadata": {FACTS: json.dumps(facts)}}
+        torch._inductor.aoti_compile_and_package(program, package_path=str(path), inductor_configs=options)
+    else:
+        torch.export.save(program, path, extra_files={FACTS: json.dumps(facts)})
+    return path
+
+
+def _inputs(filter: Filter, example: TensorDictBase) -> list[NestedKey]:
+    """What the step reads: all that it must, and what the example has of what it may."""
+    optional = [key for part in submodels(filter.module) for key in (*part.optional_keys, part.noise_key) if key]
+    keys = [unravel_key(key) for key in filter.in_keys]
+    missing = [key for key in keys if example.get(key, None) is None]
+    if missing:
+        raise KeyError(
+            f"the step reads {missing}, which the example lacks; it holds {sorted(map(str, example.keys(True, True)))}"
+        )
+    written = {unravel_key(key) for key in filter.out_keys}
+    keys += [key for key in map(unravel_key, optional) if key not in written and example.get(key, None) is not None]
+    return list(dict.fromkeys(keys))
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(key)
+
+
+def _need_compiler() -> None:
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        raise RuntimeError(
+            "export_step(compiled=True) needs a C++ compiler (Debian: apt install g++; or set CXX); compiled=False "
+            "writes a package without one"
+        ) from error

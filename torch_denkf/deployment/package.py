@@ -1,0 +1,89 @@
+"""Loading a packaged step. This file imports torch alone: it is what runs on the robot."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+FACTS = "torch_denkf"  # name of the description inside a package
+
+
+class PackagedStep:
+    """One step of a filter: state in, state out.
+
+    Entries are named like the filter's keys, nested ones with dots: ``"belief.ensemble"``.
+
+    Args:
+        run: takes the inputs in order and returns the outputs in order.
+        facts: names, shapes and dtypes, as :func:`torch_denkf.deployment.export_step` wrote them.
+
+    Attributes:
+        inputs: what a call needs, by name: shape and dtype.
+        outputs: names of what it returns.
+        carry: the outputs that are inputs of the next step.
+    """
+
+    def __init__(self, run: Callable[..., tuple[Tensor, ...]], facts: dict):
+        self._run = run
+        self.inputs = {name: (tuple(shape), dtype) for name, shape, dtype in facts["inputs"]}
+        self.outputs: list[str] = facts["outputs"]
+        self.carry: list[str] = facts["carry"]
+
+    def __call__(self, entries: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Takes one step.
+
+        Args:
+            entries: all ``inputs``; others are ignored, so that the last outputs and a new frame can be passed on
+                together.
+
+        Raises:
+            KeyError: if an input is missing.
+            ValueError: if it has another shape or dtype than the package was made for.
+        """
+        values = []
+        for name, (shape, dtype) in self.inputs.items():
+            if name not in entries:
+                raise KeyError(f"the step needs {name!r} {list(shape)}; it got {sorted(entries)}")
+            value = entries[name]
+            if tuple(value.shape) != shape or str(value.dtype) != dtype:
+                raise ValueError(
+                    f"{name!r} must be {dtype} {list(shape)}, got {value.dtype} {list(value.shape)}; a package has "
+                    "static shapes: export another one"
+                )
+            values.append(value)
+        return dict(zip(self.outputs, self._run(*values), strict=True))
+
+
+def load_step(path: str | Path) -> PackagedStep:
+    """Loads what :func:`torch_denkf.deployment.export_step` wrote.
+
+    Args:
+        path: the ``.pt2`` file.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is not a packaged step.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; export_step(filter, example, path) writes it")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            compiled = any("aotinductor" in name for name in archive.namelist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{path} is no package of a step, or it was cut; export it again") from error
+    if compiled:
+        run = torch._inductor.aoti_load_package(str(path))
+        facts = run.get_metadata().get(FACTS, "")
+    else:
+        files = {FACTS: ""}
+        run = torch.export.load(path, extra_files=files).module()
+        facts = files[FACTS]
+    if not facts:
+        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {FACTS!r}")
+    return PackagedStep(run, json.loads(facts))
