@@ -24,6 +24,7 @@ import numpy as np
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
 TASKS = ("pick", "push", "put_down")
+DOMAINS = ("sim", "real_like")
 COMMAND = "python -m torch_denkf.data.collect_ur5"
 
 
@@ -34,7 +35,7 @@ class Demo:
     Attributes:
         number: of the demo in its collection.
         task: one of ``TASKS``.
-        domain: ``"sim"`` or ``"real_like"``.
+        domain: one of ``DOMAINS``.
         seed: of the environment, for this episode.
         state: float32 ``[T, 10]``, see :class:`torch_denkf.envs.UR5TableEnv`.
         action: float32 ``[T, 7]``: sent in that state; it leads to the next row's.

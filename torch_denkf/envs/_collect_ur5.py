@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torch_denkf.data._demo_files import TASKS, Demo, Entry, write_demo
+from torch_denkf.data._demo_files import DOMAINS, TASKS, Demo, Entry, write_demo
 from torch_denkf.envs.ur5 import STEPS, UR5TableEnv
 from torch_denkf.envs.ur5_expert import UR5Expert
 
-DOMAINS = ("sim", "real_like")
 DRAWS = 20  # episodes tried for a demo; the expert seldom fails
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from torch_denkf.data import _demo_files
 from torch_denkf.envs._ur5_scene import UR5Scene
 
 __all__ = ["DOMAINS", "Domain", "apply_domain", "light_of_episode"]
@@ -70,7 +71,7 @@ REAL_LIKE = replace(
     damping=(6.0, 6.0, 4.0, 1.0, 1.0, 0.8),
     offset=(0.012, -0.008, 0.01, -0.012, 0.01, 0.015),
 )
-DOMAINS = {"sim": SIM, "real_like": REAL_LIKE}
+DOMAINS = dict(zip(_demo_files.DOMAINS, (SIM, REAL_LIKE), strict=True))
 
 
 def apply_domain(scene: UR5Scene, domain: Domain) -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torch_denkf.data._demo_files import TASKS
 from torch_denkf.envs._ur5_kinematics import READY, Unreachable, Waypoint, inverse_kinematics, plan_path, tool_down
 from torch_denkf.envs._ur5_scene import FINGER_TRAVEL, FULL_OPENING, UR5Scene
 
 __all__ = ["TASKS", "Episode", "draw_episode", "succeeded"]
 
-TASKS = ("pick", "push", "put_down")
 COLOURS = np.array([[0.85, 0.2, 0.15], [0.15, 0.35, 0.8], [0.9, 0.7, 0.1], [0.5, 0.2, 0.6], [0.1, 0.55, 0.55]])
 LOWEST = 0.021  # m: below it the tips of a tilted gripper touch the table
 TILT = 0.3  # rad: a tool that always points straight down would leave wrist_2 where it is
@@ -202,4 +202,4 @@ def _in_hand(scene: UR5Scene, joints: np.ndarray, hold: np.ndarray, half_size: n
     return data.site_xpos[scene.pinch] - data.site_xpos[scene.centre] + offset, rotation
 
 
-_DRAW = {"pick": _pick, "push": _push, "put_down": _put_down}
+_DRAW = dict(zip(TASKS, (_pick, _push, _put_down), strict=True))
