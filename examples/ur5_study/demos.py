@@ -31,6 +31,8 @@ class Collections:
         demos: in the simulator.
         frames: drawn at random steps of each.
         sequences: of the first demos, with all frames.
+        tune: of these, at most so many train the filters.
+        validation: and at most so many decide.
         real: demos of ``real_like``, with all frames.
         real_train: of these, on the train side.
         steps: of a sequence.
@@ -42,6 +44,8 @@ class Collections:
     demos: int = 2000
     frames: int = 8
     sequences: int = 220
+    tune: int = 80
+    validation: int = 16
     real: int = 130
     real_train: int = 20
     steps: int = 350
@@ -134,9 +138,9 @@ def sim_roles(collections: Collections) -> Roles:
     frames = collections.replay("sim-frames", "train", frames_only=True)
     sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
     test = _numbers(collections, "sim-sequences", "test", collections.sequences)
-    held = max(len(sequences) // 7, 1)
+    held = min(max(len(sequences) // 7, 1), collections.validation)
     sensor = {e.demo for e in frames.episodes if e.demo >= collections.sequences}
-    return Roles(sensor, sequences[:-held], sequences[-held:], test)
+    return Roles(sensor, sequences[:-held][: collections.tune], sequences[-held:], test)
 
 
 def real_roles(collections: Collections) -> Roles:

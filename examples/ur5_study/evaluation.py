@@ -91,8 +91,8 @@ def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) ->
 def filter_rows(recipe: Recipe, model: Filter, readings: dict[str, TensorDict], names: dict) -> list[dict]:
     """A filter in all conditions."""
     costs, rows = cost(recipe, model, readings["clean"]), []
-    for condition, reading in readings.items():
-        out = run_filter(recipe, model, reading)
+    outs = run_filter(recipe, model, torch.cat(list(readings.values()))).split(len(readings["clean"]))
+    for (condition, reading), out in zip(readings.items(), outs, strict=True):
         rows.append({**names, "condition": condition, **scores(out), **costs, "demos": len(out)})
         if condition == "black20":
             mean, var = out["belief", "mean"][..., :STATE], out["belief", "var"]

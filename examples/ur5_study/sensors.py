@@ -150,9 +150,10 @@ SENSORS = {preset.name: preset for preset in _PRESETS}
 
 
 def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, count: int = 1500) -> None:
-    """Gives a sensor with a second look the trunk of a trained one, and aims it at the gripper."""
+    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper."""
     trunk = sensor.module["trunk"]
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
+    trunk.coarse.requires_grad_(False)
     rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
     trunk.aim(sensor._prepare(rows["pixels"]), rows["state"][:, 7:])
 
@@ -267,6 +268,7 @@ def train_sensor(
     seed: int,
     updates: int,
     lr: float = 2e-3,
+    schedule: str = "one_cycle",
     batch: int = 64,
 ) -> ImageSensor:
     """Trains a sensor, or goes on where that was broken off, or reads it where it was done."""
@@ -280,6 +282,7 @@ def train_sensor(
         updates,
         lr=lr,
         weight_decay=0.02,
+        schedule=schedule,
     )
     FilterTrainer(
         nn.ModuleDict({"sensor": sensor}),

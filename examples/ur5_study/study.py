@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules import ImageSensor
-from torch_denkf.training import read_checkpoint
+from torch_denkf.training import read_checkpoint, write_checkpoint
 from ur5_study.demos import Collections, FramePool, Roles, all_actions, all_states, real_roles, row_block, sim_roles
 from ur5_study.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows
 from ur5_study.motion import ArmMotion, train_motion
@@ -62,33 +62,40 @@ class Base:
         self._motions: dict[bool, ArmMotion] = {}
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
+        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        out = self.study.out / "sensors" / self.name
+        self.states, self.actions = self._truth()
+        if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
+            facts = Statistics(**read_checkpoint(out / "facts.pt"))
+            sensor = self.preset.build(facts, SAMPLES)
+            sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
+            return sensor.eval(), facts
+        sensor, facts = self._train_sensor(out)
+        write_checkpoint(out / "facts.pt", vars(facts))
+        return sensor, facts
+
+    def _train_sensor(self, out: Path) -> tuple[ImageSensor, Statistics]:
         collections, roles, budget = self.study.collections, self.roles, self.study.budget
         name = "sim-frames" if self.training == "sim" else "real_like-sequences"
         data = collections.replay(name, "train", frames_only=True)
-        held_out = {*roles.tune, *roles.validation} if self.training == "sim" else set(roles.validation)
-        if self.training == "sim":
-            held_out = set(sorted(held_out)[::3])
+        held_out = set(sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation)
         pool, checked = FramePool(data, roles.sensor), FramePool(data, held_out)
-        self.states, self.actions = self._truth()
         torch.manual_seed(self.seed)
-        out = self.study.out / "sensors" / self.name
-        updates = budget.sensor
-        if self.training == "real_like":
-            updates = max(updates // 2, 1)  # of a tenth of the pictures
-        settings = {"seed": self.seed, "updates": updates}
-        if self.parent is None:
-            facts = Statistics.of(self.states, pool)
-            sensor, lr = self.preset.build(facts, SAMPLES), 2e-3
-            if self.preset.coarse is not None:
-                coarse = SENSORS[self.preset.coarse]
-                first, folder = coarse.build(facts, SAMPLES), out.with_name(out.name.replace(self.kind, coarse.name))
-                train_sensor(first, coarse, pool, checked, out=folder, lr=lr, **settings)
-                adopt(sensor, first, pool)
-                settings["updates"], lr = max(updates * 3 // 5, 1), 1e-3
-        else:
+        # In the other domain as many as fine-tuning gets, of a third of the pictures.
+        updates, lr = budget.sensor if self.training == "sim" else budget.fine_tuning, 2e-3
+        if self.parent is not None:
             facts, sensor, lr = self.parent.facts, deepcopy(self.parent.sensor), 1e-3
-            settings["updates"] = budget.fine_tuning
-        train_sensor(sensor, self.preset, pool, checked, out=out, lr=lr, **settings)
+            sensor.requires_grad_(True)  # the coarse part of a second look, too: the camera stands elsewhere
+        else:
+            facts = Statistics.of(self.states, pool)
+            sensor = self.preset.build(facts, SAMPLES)
+        if self.parent is None and self.preset.coarse is not None:
+            coarse = SENSORS[self.preset.coarse]
+            first, folder = coarse.build(facts, SAMPLES), out.with_name(out.name.replace(self.kind, coarse.name))
+            train_sensor(first, coarse, pool, checked, out=folder, seed=self.seed, updates=updates, lr=lr)
+            adopt(sensor, first, pool)
+            updates, lr = max(updates // 2, 1), 1.5e-3
+        train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
         return sensor, facts
 
     def _truth(self) -> tuple[Tensor, Tensor]:

@@ -38,7 +38,7 @@ class Budget:
 
 
 @torch.no_grad()
-def run_filter(recipe: Recipe, model: Filter, readings: TensorDict, chunk: int = 64) -> TensorDict:
+def run_filter(recipe: Recipe, model: Filter, readings: TensorDict, chunk: int = 128) -> TensorDict:
     """Filters demos ``[N, T]``, each from around its true first state."""
     behind, parts = recipe.behind(model), []
     with torch.random.fork_rng(devices=[]):
@@ -54,17 +54,15 @@ KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), ("belief"
 
 def filter_error(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
     """CRPS of the belief taken for a Gaussian, in the units of the loss, and mean absolute errors."""
-    scores, joints, places = [], [], []
-    for reading in readings:
-        out = run_filter(recipe, model, reading)
-        mean, var = (out["belief", name][:, 1:, :STATE].flatten(0, 1) for name in ("mean", "var"))
-        truth = out["state"][:, 1:].flatten(0, 1)
-        scores.append((crps_gaussian(mean, var.clamp_min(1e-10), truth) / ERRORS).mean())
-        error = (mean - truth).abs().mean(0)
-        joints.append(error[:JOINTS].mean().rad2deg())
-        places.append(100 * error[JOINTS:].mean())
-    means = (float(torch.stack(values).mean()) for values in (scores, joints, places))
-    return dict(zip(("crps", "joint_mae_deg", "ee_mae_cm"), means, strict=True))
+    out = run_filter(recipe, model, torch.cat(list(readings)))
+    mean, var = (out["belief", name][:, 1:, :STATE].flatten(0, 1) for name in ("mean", "var"))
+    truth = out["state"][:, 1:].flatten(0, 1)
+    error = (mean - truth).abs().mean(0)
+    return {
+        "crps": float((crps_gaussian(mean, var.clamp_min(1e-10), truth) / ERRORS).mean()),
+        "joint_mae_deg": float(error[:JOINTS].mean().rad2deg()),
+        "ee_mae_cm": 100 * float(error[JOINTS:].mean()),
+    }
 
 
 class WithHead(nn.Module):
@@ -175,8 +173,8 @@ def calibrate(recipe: Recipe, model: Filter, readings: TensorDict, level: float 
     distance = {}
     for inflation in INFLATIONS:
         recipe.set_inflation(model, inflation)
-        outs = [run_filter(recipe, model, each) for each in (readings, fail(readings, "missing", seed=1))]
-        distance[inflation] = float((torch.stack([coverage(out) for out in outs]).mean() - level).abs())
+        out = run_filter(recipe, model, torch.cat([readings, fail(readings, "missing", seed=1)]))
+        distance[inflation] = float((coverage(out).mean() - level).abs())
     best = min(distance, key=distance.get)
     recipe.set_inflation(model, best)
     return best

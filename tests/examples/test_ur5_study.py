@@ -78,6 +78,16 @@ def test_samples_turn_to_the_side_of_the_forecast(weighted):
     torch.testing.assert_close(near[..., 5], expected.unsqueeze(-1).expand(2, 4), atol=1e-5, rtol=0)
 
 
+def test_a_factor_scales_the_samples_around_their_mean():
+    near = NearForecast(SENSORS["paper"])
+    samples = states(2, 5)
+    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": torch.zeros(2, 3, SIZE)}}, [2])
+    near.factor = 1.5
+    out = near(td)[NEAR]
+    torch.testing.assert_close(out.mean(1), samples.mean(1))
+    torch.testing.assert_close(out.std(1), 1.5 * samples.std(1))
+
+
 # ------------------------------------------------------------------------------------------------------ the motion
 
 
