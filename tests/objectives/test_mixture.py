@@ -10,7 +10,7 @@ from scipy.stats import norm
 from tensordict import TensorDict
 
 from tests.filters.factories import OBS, E, FixedEnsemble, NoisyLinear, S, toy_denkf, toy_frames
-from tests.filters.test_particle import toy_filter
+from tests.filters.particle_for_tests import toy_filter
 from torch_denkf.filters import DPF, ParticleFilter
 from torch_denkf.modules import (
     AroundState,

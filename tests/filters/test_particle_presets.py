@@ -1,0 +1,99 @@
+"""The presets are made of the parts they say, parts that are there already are kept, and clones move along."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import OBS, M, toy_frames
+from tests.filters.particle_for_tests import E, toy_parts
+from torch_denkf.filters import DPF, PFM, ParticleFilter
+from torch_denkf.modules import (
+    AroundState,
+    ClonedPrior,
+    ClonedTransition,
+    ConstantNoise,
+    DiagonalNoise,
+    GaussianLikelihood,
+    LearnedLikelihood,
+    NoisyTransition,
+    PairObservation,
+    ResampledTransition,
+    UnicycleTransition,
+    WithWeights,
+)
+
+
+def test_dpf():
+    parts = toy_parts()
+    noisy = parts.pop("transition")
+    filter = DPF(
+        noisy.module["transition"],
+        likelihood=LearnedLikelihood(M, OBS, num_cells=(8,), encoding_key="measurement"),
+        motion_noise=noisy.module["noise"],
+        noisy_dims=[0, 2],
+        **parts,
+    )
+    assert filter["transition"].scheme == "systematic"
+    assert isinstance(filter["transition"].module, NoisyTransition)
+    assert filter["transition"].module.before
+    assert "noise" not in dict(filter.module.named_children())
+    out = filter.sequence(toy_frames((3, 6)))
+    out["belief", "mean"].square().sum().backward()
+    for part in (filter["transition"], filter["likelihood"], filter["observation"]):
+        assert any(p.grad is not None and p.grad.any() for p in part.parameters())
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_pfm(learned):
+    likelihood = LearnedLikelihood(M, OBS, bound="clipped", encoding_key="measurement") if learned else None
+    filter = PFM(**toy_parts(), noise=None if learned else DiagonalNoise(OBS), learned_likelihood=likelihood)
+    assert (filter["transition"].scheme, filter["transition"].alpha) == ("soft", 0.05)
+    assert isinstance(filter["likelihood"], LearnedLikelihood if learned else GaussianLikelihood)
+    out = filter.sequence(toy_frames((3, 6)))
+    out["belief", "mean"].square().sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())
+    with pytest.raises(ValueError, match="its Gaussian likelihood, or a learned_likelihood"):
+        PFM(**toy_parts())
+
+
+def test_what_is_there_already_is_kept():
+    parts = toy_parts()
+    transition = ResampledTransition(parts.pop("transition"), "transport")
+    initial = WithWeights(parts.pop("initial"))
+    filter = ParticleFilter(transition, initial=initial, noise=DiagonalNoise(OBS), **parts)
+    assert filter["transition"] is transition
+    assert filter.initial is initial
+    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "log_weight")]
+    assert filter["transition"].module.ensemble_size == E
+
+
+def test_clones_of_past_velocities_are_resampled_along():
+    # Pairs over gaps with particles: the past is part of each particle.
+    q = ConstantNoise([1.0, 0.1], in_key=("belief", "ensemble"), out_key=("forecast", "q"))
+    vehicle = NoisyTransition(UnicycleTransition(torch.zeros_like, dt=0.1), q, [3, 4], before=True)
+    filter = ParticleFilter(
+        ClonedTransition(vehicle),
+        None,
+        PairObservation(history_key=None),
+        GaussianLikelihood(sensor_key="y", observed_key=("forecast", "observed")),
+        noise=ConstantNoise([0.5, 0.1], in_key="y"),
+        initial=ClonedPrior(AroundState([0.0, 0.0, 0.0, 1.0, 0.1], ensemble_size=200), lags=2),
+        resampling="soft",
+    )
+    frames = TensorDict({"y": torch.zeros(2, 6, 2), "state": torch.zeros(2, 6, 5)}, [2, 6])
+    frames["observed"] = torch.ones(2, 6, 1, dtype=torch.bool)
+    frames["steps"] = torch.ones(2, 6, 1, dtype=torch.int64)
+    frames["observed"][:, 3] = False
+    frames["steps"][:, 4] = 2
+    frames["y"][..., 0] = frames["state"][..., 3] = 10.0  # 1 m a step
+    frames["y"][:, 4] = torch.tensor([20.0, 0.0])  # over two steps
+    out = filter.sequence(frames.copy())
+    ensemble = out["belief", "ensemble"]
+    assert ensemble.shape == (2, 6, 200, 9)
+    # The pose of every particle is the sum of its own velocities: of this step and the two before it.
+    moved = 0.1 * (ensemble[:, 5, :, 4] + ensemble[:, 5, :, 6] + ensemble[:, 5, :, 8])
+    start = ensemble[:, 5, :, 2] - moved
+    known = out["belief", "ensemble"][:, 2, :, 2]
+    assert (start.unsqueeze(-1) - known.unsqueeze(-2)).abs().min(-1).values.max() < 1e-5
+    # Steps of noise 1 m/s and readings of 0.5 m/s leave a standard deviation of some 0.5 m/s.
+    assert ((out["belief", "mean"][:, 1:, 3] - 10).abs() < 2).all()
