@@ -6,7 +6,16 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import FlipoutLinear, StochasticMLP
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    FlipoutLinear,
+    LearnedTransition,
+    NoisyTransition,
+    Select,
+    StochasticMLP,
+)
 
 
 def widths(network):
@@ -95,3 +104,19 @@ def test_standard_prior():
     denkf = DEnKF.paper(4, 3, image_shape=(3, 16, 16))
     assert denkf.initial.mean.equal(torch.zeros(4))
     assert denkf.initial.std.equal(torch.ones(4))
+
+
+def test_process_noise_of_another_width_leaves_the_analysis_its_own():
+    motion = NoisyTransition(
+        LearnedTransition(torch.zeros_like), ConstantNoise([0.1] * 3, in_key=("belief", "mean")), [0, 1, 2]
+    )
+    denkf = DEnKF(
+        motion,
+        None,
+        Select([0, 2]),
+        ConstantNoise([0.1, 0.2], in_key="y"),
+        EnsembleAnalysis("perturbed", sensor_key="y"),
+        initial=AroundState([0.1] * 3, ensemble_size=8),
+    )
+    noise = denkf.draw_noise(TensorDict({"y": torch.zeros(5, 2)}, [5]))
+    assert noise["noise", "analysis"].shape == (5, 8, 2)

@@ -110,7 +110,8 @@ class Filter(TensorDictSequential):
         # The first module of the recursion is the transition; what it writes is the forecast of the carry, in order.
         self._forecast_of = dict(zip(self.carry_keys, map(unravel_key, recursion[0].out_keys), strict=False))
         self._share_size("ensemble_size", (self.initial,))
-        self._share_size("observation_dim", modules)
+        # A transition may hold process noise, whose width is another.
+        self._share_size("observation_dim", [module for module in modules if module is not recursion[0]])
 
     def _share_size(self, name: str, sources: Iterable[TensorDictModuleBase]) -> None:
         """Tells the sub-models that leave ``name`` open the size on which all ``sources`` agree, if they do."""
