@@ -1,4 +1,4 @@
-"""Oracles: sums over components with scipy, integrals of distribution functions, each term by hand, differences."""
+"""Oracles: sums over components with scipy, integrals of distribution functions, each term by hand."""
 
 import math
 
@@ -11,16 +11,9 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, E, FixedEnsemble, NoisyLinear, S, toy_denkf, toy_frames
 from tests.filters.particle_for_tests import toy_filter
-from torch_denkf.filters import DPF, ParticleFilter
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    DiagonalNoise,
-    GaussianLikelihood,
-    LearnedLikelihood,
-    LearnedTransition,
-    Select,
-)
+from tests.objectives.problem_for_tests import only, problem, stepped
+from torch_denkf.filters import ParticleFilter
+from torch_denkf.modules import ConstantNoise, GaussianLikelihood, Select
 from torch_denkf.objectives import MixtureLoss
 
 TERMS = ["state", "transition", "mean", "sensor", "nll"]
@@ -30,23 +23,6 @@ CLOSE = {"rtol": 1e-11, "atol": 1e-12}  # the same numbers in another order
 @pytest.fixture(autouse=True)
 def _double(float64):
     return
-
-
-def problem(filter, batch=(2, 7), **kwargs):
-    """Frames with noise, true states and true observations, and what the filter makes of them."""
-    frames = filter.draw_noise(toy_frames(batch, **kwargs))
-    frames["state"], frames["target_observation"] = torch.randn(*batch, S), torch.randn(*batch, OBS)
-    return frames, filter.sequence(frames.copy())
-
-
-def only(name, weight=1.0):
-    return {term: weight * (term == name) for term in TERMS}
-
-
-def stepped(frames):
-    mask = ~frames["is_init"].squeeze(-1)
-    mask[..., 0] = False
-    return mask
 
 
 def mixture_by_hand(out, prefix, truth, std, dims):
@@ -147,7 +123,7 @@ def test_one_sample_of_the_sensor_has_a_squared_error():
     out = filter.sequence(frames.copy())
     assert out["sensor", "ensemble"].shape == (2, 7, 1, OBS)
     error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"]).square().mean(-1)
-    value = MixtureLoss(filter, **only("sensor"))(frames)["loss_sensor"]
+    value = MixtureLoss(filter, **only(TERMS, "sensor"))(frames)["loss_sensor"]
     torch.testing.assert_close(value, error[frames["observed"].all(-1)].mean(), **CLOSE)
 
 
@@ -166,7 +142,7 @@ def known_filter():
 def test_a_known_observation_needs_no_target():
     filter = known_filter()
     frames = TensorDict({"y": torch.randn(3, 4, 1), "state": torch.randn(3, 4, 2)}, [3, 4])
-    loss = MixtureLoss(filter, **only("sensor"))
+    loss = MixtureLoss(filter, **only(TERMS, "sensor"))
     loss.set_keys(sensor="y")
     expected = (frames["y"] - frames["state"][..., :1]).square().mean()
     torch.testing.assert_close(loss(frames)["loss_sensor"], expected, **CLOSE)
@@ -207,86 +183,6 @@ def test_reductions(reduction):
     torch.testing.assert_close(value, expected[reduction], **CLOSE)
 
 
-# -------------------------------------------------------------------------------------------------- gradients
-
-
-def test_far_from_all_particles_there_is_still_a_gradient():
-    filter = toy_filter()
-    frames, _ = problem(filter)
-    frames["state"] = frames["state"] + 1e3  # the density itself is zero in floating point
-    loss = MixtureLoss(filter, component_std=0.1)(frames)["loss_state"]
-    loss.backward()
-    grads = [p.grad for p in filter.parameters() if p.grad is not None]
-    assert loss.isfinite()
-    assert all(grad.isfinite().all() for grad in grads)
-    assert sum(grad.abs().sum() for grad in grads) > 1
-
-
-@pytest.mark.parametrize("scheme", ["soft", "transport"])
-@pytest.mark.parametrize("score", ["mixture", "crps"])
-def test_gradient_by_finite_differences(scheme, score):
-    filter = toy_filter(scheme, learned=True)
-    frames, _ = problem(filter, batch=(2, 5))
-    loss = MixtureLoss(filter, score=score, mean=0.3, component_std=0.5)
-    sum(loss(frames).values()).backward()
-    step, checked = 1e-6, 0
-    for name in ("observation", "likelihood", "transition"):
-        for parameter in filter[name].parameters():
-            if parameter.grad is None or not parameter.grad.any():
-                continue
-            entry, values = int(parameter.grad.abs().argmax()), []
-            for sign in (1, -1):
-                with torch.no_grad():
-                    parameter.view(-1)[entry] += sign * step
-                    values.append(sum(loss(frames).values()))
-                    parameter.view(-1)[entry] -= sign * step
-            difference = (values[0] - values[1]) / (2 * step)
-            # A jump, a particle picked anew within 1e-6, would show as a difference of order 1e5.
-            torch.testing.assert_close(parameter.grad.view(-1)[entry], difference, rtol=1e-4, atol=1e-8)
-            checked += 1
-    assert checked >= 6
-
-
-def test_gradients_reach_the_likelihood_through_hard_resampling():
-    # In each step the belief holds all particles with the weights of that step's reading.
-    filter = toy_filter("systematic", learned=True)
-    frames, _ = problem(filter, resets=False, masks=0)
-    MixtureLoss(filter)(frames)["loss_state"].backward()
-    for name in ("likelihood", "observation", "transition"):
-        assert sum(p.grad.abs().sum() for p in filter[name].parameters() if p.grad is not None) > 1e-6, name
-
-
-@pytest.mark.parametrize("score", ["mixture", "crps"])
-def test_training_teaches_likelihood_and_motion_noise(score):
-    # A random walk, read through a learned likelihood that knows nothing at first: it must learn to follow.
-    torch.manual_seed(1)
-    still = LearnedTransition(torch.nn.Linear(1, 1))
-    with torch.no_grad():
-        still.module.weight.zero_(), still.module.bias.zero_()
-    filter = DPF(
-        still.requires_grad_(False),
-        None,
-        Select([0]),
-        LearnedLikelihood(1, 1, num_cells=(16,), encoding_key="y"),
-        DiagonalNoise(1, r=0.3, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q")),
-        noisy_dims=[0],
-        initial=AroundState([0.1], ensemble_size=32),
-    )
-    walk = torch.randn(16, 9, 1).cumsum(1)
-    frames = TensorDict({"state": walk, "y": walk + 0.1 * torch.randn_like(walk)}, [16, 9])
-    loss = MixtureLoss(filter, score=score, component_std=0.5)
-    optimiser = torch.optim.Adam(loss.parameters(), 2e-2)
-    values = []
-    for _ in range(60):
-        value = loss(frames)["loss_state"]
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        values.append(value.item())
-    first, last = sum(values[:5]) / 5, sum(values[-5:]) / 5
-    assert last < 0.6 * first
-
-
 # ------------------------------------------------------------------------------------------------ interface
 
 
@@ -300,7 +196,7 @@ def test_set_keys_and_in_keys():
     renamed["truth", "x"] = renamed["state"]
     assert loss(renamed.exclude("state"))["loss_state"].equal(expected)
     assert ("truth", "x") in loss.in_keys
-    assert ("truth", "x") not in MixtureLoss(filter, **only("nll")).in_keys
+    assert ("truth", "x") not in MixtureLoss(filter, **only(TERMS, "nll")).in_keys
     assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
 
 

@@ -1,0 +1,65 @@
+"""Oracles: finite differences; training lowers the loss."""
+
+import pytest
+import torch
+
+from tests.filters.differences_for_tests import central_difference
+from tests.filters.factories import S, toy_denkf
+from tests.objectives.denkf_for_tests import ONLY_STATE
+from tests.objectives.problem_for_tests import problem
+from torch_denkf.objectives import DEnKFLoss
+
+
+@pytest.mark.parametrize("score", ["crps", "energy", "mse"])
+@pytest.mark.parametrize("layer", ["dropout", "flipout"])
+def test_gradient_by_finite_differences(float64, score, layer):
+    filter = toy_denkf("sensor", layer)
+    frames, _ = problem(filter)
+    loss = DEnKFLoss(filter, score=score, **ONLY_STATE)
+    loss(frames)["loss_state"].backward()
+    generator, checked = torch.Generator().manual_seed(1), 0
+    for name in ("transition", "sensor", "observation", "noise"):
+        for parameter in filter[name].parameters():
+            if parameter.grad is None or not parameter.grad.any():
+                continue
+            # The entry with the largest gradient and one at random.
+            entries = {
+                int(parameter.grad.abs().argmax()),
+                int(torch.randint(parameter.numel(), (), generator=generator)),
+            }
+            for entry in entries:
+                difference = central_difference(lambda: loss(frames)["loss_state"], parameter, entry)
+                # Central differences: 1e-12 of curvature, 1e-16 / 1e-6 = 1e-10 of rounding.
+                torch.testing.assert_close(parameter.grad.view(-1)[entry], difference, rtol=1e-5, atol=1e-8)
+                checked += 1
+    assert checked > 15
+
+
+def test_detach_every_reaches_the_filter(float64):
+    filter = toy_denkf("etkf")
+    frames, _ = problem(filter, resets=False, masks=0)
+
+    def gradient(detach_every):
+        loss = DEnKFLoss(filter, **ONLY_STATE, detach_every=detach_every)
+        value = loss(frames)["loss_state"]
+        return value, torch.autograd.grad(value, filter["transition"].module.layers[0].weight)[0]
+
+    (full, full_grad), (cut, cut_grad) = gradient(None), gradient(2)
+    assert full.equal(cut)
+    assert not full_grad.allclose(cut_grad)
+
+
+def test_training_lowers_the_loss(float64):
+    filter = toy_denkf(sensor_layer="none")
+    frames, _ = problem(filter, resets=False)
+    frames["state"] = frames["measurement"][..., :S].cumsum(1)
+    loss = DEnKFLoss(filter, **ONLY_STATE)
+    optimiser = torch.optim.Adam(loss.parameters(), 1e-2)
+    values = []
+    for _ in range(60):
+        value = loss(frames)["loss_state"]
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+        values.append(value.item())
+    assert values[-1] < 0.8 * values[0]

@@ -1,0 +1,121 @@
+"""Presets, keys, parameters and errors; known observation models give the target."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import A, M, S, linear_kalman, toy_denkf
+from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
+from tests.objectives.problem_for_tests import only, problem, stepped
+from torch_denkf.filters import LSTMFilter
+from torch_denkf.modules import Select
+from torch_denkf.objectives import DEnKFLoss
+
+
+def test_paper_preset(float64):
+    filter = toy_denkf()
+    frames, out = problem(filter)
+    losses = DEnKFLoss.paper(filter)(frames)
+    assert set(losses.keys()) == {"loss_state", "loss_transition", "loss_sensor"}
+    expected = (out["belief", "mean"] - frames["state"]).square().mean(-1)[stepped(frames)].mean()
+    torch.testing.assert_close(losses["loss_state"], expected, **CLOSE)
+    assert set(DEnKFLoss.paper(filter, sensor=0.0)(frames).keys()) == {"loss_state", "loss_transition"}
+
+
+def test_known_observation_model_gives_the_target(float64):
+    filter = toy_denkf()
+    filter = type(filter)(
+        filter["transition"], filter["sensor"], Select([2, 0]), filter["noise"], initial=filter.initial
+    )
+    frames, out = problem(filter)
+    frames = frames.exclude("target_observation")
+    expected = score_by_hand("crps", out["sensor", "ensemble"], frames["state"][..., [2, 0]])
+    observed = frames["observed"].all(-1)
+    torch.testing.assert_close(DEnKFLoss(filter)(frames)["loss_sensor"], expected[observed].mean(), **CLOSE)
+
+
+def test_set_keys(float64):
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    renamed = frames.copy()
+    for old, new in (("state", ("truth", "x")), ("target_observation", "y"), ("observed", "seen")):
+        renamed[new] = renamed[old]
+    renamed = renamed.exclude("state", "target_observation")
+    loss = DEnKFLoss(filter)
+    expected = loss(frames)
+    loss.set_keys(state=("truth", "x"), target_observation="y", observed="seen")
+    out = loss(renamed)
+    assert all(out[key].equal(expected[key]) for key in list(expected.keys()))
+    assert ("truth", "x") in loss.in_keys
+    with pytest.raises(ValueError, match="not an accepted"):
+        loss.set_keys(reward="r")
+
+
+def test_score_of_other_entries(float64):
+    filter = toy_denkf()
+    frames, out = problem(filter)
+    loss = DEnKFLoss(filter, **ONLY_STATE)
+    loss.set_keys(belief=("forecast", "ensemble"))
+    expected = score_by_hand("crps", out["forecast", "ensemble"], frames["state"])[stepped(frames)].mean()
+    torch.testing.assert_close(loss(frames)["loss_state"], expected, **CLOSE)
+
+
+def test_arguments_by_keyword(float64):
+    # tensordict takes the leading sizes that all entries share for the batch: [2, 6], because the last ones differ.
+    filter = toy_denkf(sensor_layer="none", layer="none")
+    filter.initial.std.zero_()  # nothing is random
+    loss = DEnKFLoss(filter, **ONLY_STATE, score="mse")
+    assert loss.in_keys == ["measurement", "action", "state"]
+    entries = {"measurement": torch.randn(2, 6, M), "action": torch.randn(2, 6, A), "state": torch.randn(2, 6, S)}
+    expected = loss(TensorDict(entries, [2, 6]))["loss_state"]
+    torch.testing.assert_close(loss(**entries), expected, **CLOSE)
+
+
+def test_the_tensordict_is_left_as_it_is():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    before = frames.clone()
+    DEnKFLoss(filter)(frames)
+    assert set(frames.keys(True, True)) == set(before.keys(True, True))
+    assert (frames == before).all()
+
+
+def test_parameters_and_state_are_the_filters():
+    filter = toy_denkf()
+    loss = DEnKFLoss(filter, state_scale=[1.0, 2.0, 3.0])
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
+    assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
+    assert "state_scale" in loss.state_dict()
+
+
+def test_flat_slices(float64):
+    # What a SliceSampler gives: [B * T], is_init at the start of every slice.
+    filter = toy_denkf()
+    frames, _ = problem(filter, batch=(3, 5))
+    loss = DEnKFLoss(filter)
+    expected, out = loss(frames), loss(frames.reshape(15))
+    for key in list(expected.keys()):
+        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-12)
+
+
+def test_errors():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    with pytest.raises(ValueError, match="'nll'"):
+        DEnKFLoss(filter, score="nll")
+    with pytest.raises(KeyError, match=r"DEnKFLoss reads .*state.*set_keys"):
+        DEnKFLoss(filter)(frames.exclude("state"))
+    with pytest.raises(KeyError, match="'target_observation'"):
+        DEnKFLoss(filter)(frames.exclude("target_observation"))
+    with pytest.raises(KeyError, match="target_observation"):
+        DEnKFLoss(filter, **only(TERMS, "observation"))(frames.exclude("target_observation"))
+    td = TensorDict({"observation": torch.randn(4, 2), "state": torch.randn(4, 2)}, [4])
+    lstm = LSTMFilter(None, state_dim=2, observation_dim=2, observation_key="observation")
+    with pytest.raises(KeyError, match="no observation model"):
+        DEnKFLoss(lstm, **only(TERMS, "sensor"))(td)
+    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing"):
+        DEnKFLoss(linear_kalman(), **only(TERMS, "sensor"))(td)
+    with pytest.raises(KeyError, match="measurement"):
+        DEnKFLoss(filter)(frames.exclude("measurement"))
+    with pytest.raises(AttributeError, match="set_keys"):
+        DEnKFLoss(filter).in_keys = ["state"]

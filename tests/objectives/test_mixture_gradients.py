@@ -1,0 +1,89 @@
+"""Oracles: finite differences; training teaches likelihood and motion noise."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.differences_for_tests import central_difference
+from tests.filters.particle_for_tests import toy_filter
+from tests.objectives.problem_for_tests import problem
+from torch_denkf.filters import DPF
+from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, LearnedTransition, Select
+from torch_denkf.objectives import MixtureLoss
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+def test_far_from_all_particles_there_is_still_a_gradient():
+    filter = toy_filter()
+    frames, _ = problem(filter)
+    frames["state"] = frames["state"] + 1e3  # the density itself is zero in floating point
+    loss = MixtureLoss(filter, component_std=0.1)(frames)["loss_state"]
+    loss.backward()
+    grads = [p.grad for p in filter.parameters() if p.grad is not None]
+    assert loss.isfinite()
+    assert all(grad.isfinite().all() for grad in grads)
+    assert sum(grad.abs().sum() for grad in grads) > 1
+
+
+@pytest.mark.parametrize("scheme", ["soft", "transport"])
+@pytest.mark.parametrize("score", ["mixture", "crps"])
+def test_gradient_by_finite_differences(scheme, score):
+    filter = toy_filter(scheme, learned=True)
+    frames, _ = problem(filter, batch=(2, 5))
+    loss = MixtureLoss(filter, score=score, mean=0.3, component_std=0.5)
+    sum(loss(frames).values()).backward()
+    checked = 0
+    for name in ("observation", "likelihood", "transition"):
+        for parameter in filter[name].parameters():
+            if parameter.grad is None or not parameter.grad.any():
+                continue
+            entry = int(parameter.grad.abs().argmax())
+            difference = central_difference(lambda: sum(loss(frames).values()), parameter, entry)
+            # A jump, a particle picked anew within 1e-6, would show as a difference of order 1e5.
+            torch.testing.assert_close(parameter.grad.view(-1)[entry], difference, rtol=1e-4, atol=1e-8)
+            checked += 1
+    assert checked >= 6
+
+
+def test_gradients_reach_the_likelihood_through_hard_resampling():
+    # In each step the belief holds all particles with the weights of that step's reading.
+    filter = toy_filter("systematic", learned=True)
+    frames, _ = problem(filter, resets=False, masks=0)
+    MixtureLoss(filter)(frames)["loss_state"].backward()
+    for name in ("likelihood", "observation", "transition"):
+        assert sum(p.grad.abs().sum() for p in filter[name].parameters() if p.grad is not None) > 1e-6, name
+
+
+@pytest.mark.parametrize("score", ["mixture", "crps"])
+def test_training_teaches_likelihood_and_motion_noise(score):
+    # A random walk, read through a learned likelihood that knows nothing at first: it must learn to follow.
+    torch.manual_seed(1)
+    still = LearnedTransition(torch.nn.Linear(1, 1))
+    with torch.no_grad():
+        still.module.weight.zero_(), still.module.bias.zero_()
+    filter = DPF(
+        still.requires_grad_(False),
+        None,
+        Select([0]),
+        LearnedLikelihood(1, 1, num_cells=(16,), encoding_key="y"),
+        DiagonalNoise(1, r=0.3, num_cells=(4,), in_key=("belief", "mean"), out_key=("forecast", "q")),
+        noisy_dims=[0],
+        initial=AroundState([0.1], ensemble_size=32),
+    )
+    walk = torch.randn(16, 9, 1).cumsum(1)
+    frames = TensorDict({"state": walk, "y": walk + 0.1 * torch.randn_like(walk)}, [16, 9])
+    loss = MixtureLoss(filter, score=score, component_std=0.5)
+    optimiser = torch.optim.Adam(loss.parameters(), 2e-2)
+    values = []
+    for _ in range(60):
+        value = loss(frames)["loss_state"]
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+        values.append(value.item())
+    first, last = sum(values[:5]) / 5, sum(values[-5:]) / 5
+    assert last < 0.6 * first
