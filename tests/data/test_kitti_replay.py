@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import MemoryMappedTensor
-from torchrl.data import SamplerWithoutReplacement, SliceSampler, SliceSamplerWithoutReplacement
+from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.data._kitti_episodes as episodes_module
 import torch_denkf.data.kitti as kitti_module
+from tests.data.replay_for_tests import check_slices, counting_bars, ways_to_slice
 from torch_denkf.data import (
     KITTIOdometryExperienceReplay,
     drive_frames,
@@ -87,40 +88,10 @@ def test_all_rows(root):
     assert data[torch.tensor([70, 3, 3])]["state"].equal(rows["state"][[70, 3, 3]])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"num_slices": 4},
-        {"slice_len": 6},
-        {"sampler": SliceSampler(num_slices=4)},
-        {"sampler": SliceSampler(num_slices=4, end_key=("next", "done"))},
-        {"sampler": SliceSamplerWithoutReplacement(num_slices=2), "batch_size": 12},
-        {"num_slices": 4, "prefetch": 2},
-    ],
-)
+@pytest.mark.parametrize("options", ways_to_slice())
 def test_slices_are_contiguous_and_in_one_episode(root, options):
-    data = open_dataset(root, mirrored=True, **{"batch_size": 24, **options})
-    rows = data[:]
-    starts = set()
-    for _ in range(40):
-        flat = data.sample()
-        batch = flat.reshape(-1, 6)
-        slices = len(batch)
-        assert (batch["episode"] == batch["episode"][:, :1]).all()
-        assert (batch["frame"].diff(dim=1) == 1).all()
-        index = flat["index"].reshape(-1, 6)
-        assert (index.diff(dim=1) == 1).all()
-        for key in KEYS:
-            assert (batch[key] == rows[key][index]).all(), key
-        assert batch["is_init"].squeeze(-1).tolist() == [[True] + [False] * 5] * slices
-        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * 5 + [True]] * slices
-        assert slices == data._batch_size // 6
-        starts |= set(index[:, 0].tolist())
-    # 18 + 8 + 36 windows fit in the drives and as many in their mirror images; most have turned up in 160 draws.
-    if not isinstance(options.get("sampler"), SliceSamplerWithoutReplacement):
-        possible = {e.start + k for e in data.episodes for k in range(e.length - 5)}
-        assert starts <= possible
-        assert len(starts) > 0.75 * len(possible)
+    # 18 + 8 + 36 windows fit in the drives and as many in their mirror images.
+    check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "frame", KEYS)
 
 
 def test_single_rows(root):
@@ -236,21 +207,7 @@ def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypa
 
 
 def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
-    bars = []
-
-    class Bar:
-        def __init__(self, total, initial, disable, **_):
-            self.total, self.n, self.closed = total, initial, False
-            assert disable is None  # silent without a terminal
-            bars.append(self)
-
-        def update(self, count):
-            self.n += count
-
-        def close(self):
-            self.closed = True
-
-    monkeypatch.setattr(episodes_module, "tqdm", Bar)
+    bars = counting_bars(monkeypatch, episodes_module)
     open_dataset(root, "hill", cache=tmp_path)
     assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
     open_dataset(root, "hill", cache=tmp_path)  # from the cache: no bar

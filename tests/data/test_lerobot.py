@@ -23,6 +23,7 @@ from tests.data.lerobot_folder import (
     write_version_2,
     write_version_3,
 )
+from tests.data.replay_for_tests import counting_bars
 from torch_denkf.data import LeRobotExperienceReplay
 
 LENGTHS = [9, 6, 12, 7, 8]
@@ -257,21 +258,7 @@ def test_changed_files_are_read_anew(tmp_path):
 
 
 def test_a_bar_counts_frames(root, tmp_path, monkeypatch):
-    bars = []
-
-    class Bar:
-        def __init__(self, total, disable, **_):
-            self.total, self.n, self.closed = total, 0, False
-            assert disable is None  # silent without a terminal
-            bars.append(self)
-
-        def update(self, count):
-            self.n += count
-
-        def close(self):
-            self.closed = True
-
-    monkeypatch.setattr(recording_module, "tqdm", Bar)
+    bars = counting_bars(monkeypatch, recording_module)
     open_all(root, cache=tmp_path)
     open_all(root, cache=tmp_path)  # from the cache: no bar
     open_all(root, progress=False)

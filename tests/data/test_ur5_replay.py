@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SamplerWithoutReplacement, SliceSampler, SliceSamplerWithoutReplacement
+from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
-from tests.data.ur5_demos import LENGTHS, SIZE, make_demo, write_folder
+from tests.data.replay_for_tests import check_slices, ways_to_slice
+from tests.data.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
 from torch_denkf.data import UR5ExperienceReplay, _demo_cache
 from torch_denkf.data._demo_files import TASKS, read_demo
 from torch_denkf.data._demo_rows import split_of
@@ -20,9 +21,7 @@ open_dataset = partial(UR5ExperienceReplay, cache=None)
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Ten demos of various lengths, three pictures in each."""
-    demos = [make_demo(number, rows) for number, rows in enumerate(LENGTHS)]
-    return write_folder(tmp_path_factory.mktemp("demos"), demos)
+    return ten_demos(tmp_path_factory)
 
 
 def test_all_rows(root):
@@ -90,37 +89,10 @@ def test_splits_are_by_demo(root, tmp_path):
     assert {e.demo for e in open_dataset(fewer, split="test").episodes} == set(tests[:3])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"num_slices": 4},
-        {"slice_len": 6},
-        {"sampler": SliceSampler(num_slices=4)},
-        {"sampler": SliceSampler(num_slices=4, end_key=("next", "done"))},
-        {"sampler": SliceSamplerWithoutReplacement(num_slices=2), "batch_size": 12},
-        {"num_slices": 4, "prefetch": 2},
-    ],
-)
+@pytest.mark.parametrize("options", ways_to_slice())
 def test_slices_are_contiguous_and_in_one_demo(root, options):
     data = open_dataset(root, split="all", **{"batch_size": 24, **options})
-    rows = data[:]
-    starts = set()
-    for _ in range(40):
-        flat = data.sample()
-        batch = flat.reshape(-1, 6)
-        assert len(batch) == data._batch_size // 6
-        assert (batch["episode"] == batch["episode"][:, :1]).all()
-        assert (batch["step"].diff(dim=1) == 1).all()
-        index = flat["index"].reshape(-1, 6)
-        for key in ("pixels", "state", "action", "observed", "step"):
-            assert (batch[key] == rows[key][index]).all(), key
-        assert batch["is_init"].squeeze(-1).tolist() == [[True] + [False] * 5] * len(batch)
-        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * 5 + [True]] * len(batch)
-        starts |= set(index[:, 0].tolist())
-    if not isinstance(options.get("sampler"), SliceSamplerWithoutReplacement):
-        possible = {e.start + k for e in data.episodes for k in range(e.length - 5)}
-        assert starts <= possible
-        assert len(starts) > 0.75 * len(possible)
+    check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
 
 
 def test_statistics_are_of_the_training_demos_alone(root):

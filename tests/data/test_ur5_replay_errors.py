@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from tests.data.ur5_demos import LENGTHS, make_demo, write_folder
+from tests.data.ur5_demos import make_demo, ten_demos, write_folder
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.data._demo_files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
 
@@ -15,9 +15,7 @@ open_dataset = partial(UR5ExperienceReplay, cache=None)
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Ten demos of various lengths, three pictures in each."""
-    demos = [make_demo(number, rows) for number, rows in enumerate(LENGTHS)]
-    return write_folder(tmp_path_factory.mktemp("demos"), demos)
+    return ten_demos(tmp_path_factory)
 
 
 def test_options_out_of_range(root):

@@ -26,3 +26,9 @@ def make_demo(number, rows, frames=3, size=SIZE):
 def write_folder(folder, demos):
     write_manifest(folder, [write_demo(folder, demo) for demo in demos])
     return folder
+
+
+def ten_demos(tmp_path_factory):
+    """A folder of ten demos of various lengths, three pictures in each."""
+    demos = [make_demo(number, rows) for number, rows in enumerate(LENGTHS)]
+    return write_folder(tmp_path_factory.mktemp("demos"), demos)
