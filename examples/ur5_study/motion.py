@@ -20,6 +20,7 @@ from ur5_study.demos import JOINTS, STATE
 from ur5_study.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
 
 SIZE = STATE + JOINTS  # of the filters' state
+FADING = 0.95  # of a bias in a step, before training
 RATES = list(range(STATE, SIZE))
 NOISY = [*range(JOINTS, SIZE)]  # place and rates; the joints follow from their rates
 
@@ -104,7 +105,7 @@ class WithBias(nn.Module):
     def __init__(self, motion: ArmMotion):
         super().__init__()
         self.motion = motion
-        self.fading = nn.Parameter(torch.full((STATE,), 3.0))  # of it the sigmoid: 0.95
+        self.fading = nn.Parameter(torch.full((STATE,), FADING).logit())
 
     def forward(self, features: Tensor) -> Tensor:
         """States ``[*, 27]`` of states ``[*, 27]``, or of states and actions ``[*, 34]``."""

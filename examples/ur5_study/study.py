@@ -21,7 +21,7 @@ from ur5_study.evaluation import conditions_of, filter_rows, save_beliefs, senso
 from ur5_study.motion import ArmMotion, train_motion
 from ur5_study.readings import read_all, read_codes
 from ur5_study.recipes import FILTERS, Recipe
-from ur5_study.sensors import SAMPLES, SENSORS, Statistics, adopt, train_sensor
+from ur5_study.sensors import SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
 from ur5_study.training import Budget, train_filter
 
 TRAININGS = ("sim", "real_like", "fine_tuned")
@@ -135,7 +135,15 @@ class Base:
     def recipe(self, name: str, size: int = SAMPLES) -> Recipe:
         """A filter's recipe, with a sensor of its own."""
         kind = FILTERS[name]
-        return kind(deepcopy(self.sensor), self.preset, self.facts, self.motion(kind.actions), size)
+        motion, error = self.motion(kind.actions), self.error()
+        return kind(deepcopy(self.sensor), self.preset, self.facts, motion, error, size)
+
+    def error(self) -> Tensor:
+        """Root mean square error of the sensor on the validation demos, ``[10]``."""
+        reading = read_all(self.sensor, self.codes("validation"), SAMPLES)
+        truth = reading["state"]
+        read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
+        return (read - truth).square().mean((0, 1)).sqrt()
 
     def train(self, name: str) -> tuple[Recipe, Filter, Path]:
         """Trains a filter, or reads it."""

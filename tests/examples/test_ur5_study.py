@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from ur5_study.demos import Roles
 from ur5_study.evaluation import COLUMNS, blackout, errors, hold_last, sensor_rows
 from ur5_study.glimpse import GlimpseTrunk, keypoint_trunk, project
-from ur5_study.motion import SIZE, ArmMotion, AtRest, BiasedReading, WithBias, with_rates
+from ur5_study.motion import ERRORS, FADING, SIZE, ArmMotion, AtRest, BiasedReading, WithBias, with_rates
 from ur5_study.readings import BLACK, Windows, blackouts, fail, read_head
 from ur5_study.recipes import FILTERS
 from ur5_study.sensors import NEAR, SENSORS, BlackIsMissing, NearForecast, Statistics, TurnedWrist, wrist_of
@@ -126,7 +126,7 @@ def test_biases_fade_and_add_to_the_reading():
     state = torch.cat([states(3), torch.zeros(3, 7), torch.ones(3, 10)], -1)
     moved = network(state)
     torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
-    torch.testing.assert_close(moved[:, SIZE:], torch.sigmoid(torch.tensor(3.0)).expand(3, 10))
+    torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
     torch.testing.assert_close(BiasedReading()(state), state[:, :10] + 1)
     torch.testing.assert_close(BiasedReading()(state[:, :SIZE]), state[:, :10])
 
@@ -269,7 +269,7 @@ def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right
     kind = FILTERS[name]
     own = ArmMotion(FACTS, actions=True) if kind.actions else motion
     torch.manual_seed(0)
-    recipe = kind(copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, own)
+    recipe = kind(copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, own, ERRORS)
     model = recipe.build()
     out = run_filter(recipe, model, td)
     assert out["belief", "mean"].shape[-1] >= 10

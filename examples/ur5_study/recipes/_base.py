@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, SubModel
 from ur5_study.demos import JOINTS, STATE
-from ur5_study.motion import ERRORS, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
+from ur5_study.motion import ERRORS, FADING, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
 from ur5_study.sensors import SAMPLES, BlackIsMissing, NearForecast, Preset, Statistics
 
+WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
 FILTERS: dict[str, type[Recipe]] = {}
 INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states
 
@@ -52,6 +53,8 @@ class Recipe:
         preset: what it reads of a state.
         facts: statistics of the training demos.
         motion: trained before; the filter gets a copy.
+        error: root mean square error of what the sensor says of the state, ``[10]``, on demos it has not seen. It sets
+            how far R, bias and start are off before training.
         ensemble_size: members of an ensemble.
     """
 
@@ -59,10 +62,16 @@ class Recipe:
     bias = True  # whether the state holds the sensor's slow errors
 
     def __init__(
-        self, sensor: ImageSensor, preset: Preset, facts: Statistics, motion: ArmMotion, ensemble_size: int = SAMPLES
+        self,
+        sensor: ImageSensor,
+        preset: Preset,
+        facts: Statistics,
+        motion: ArmMotion,
+        error: Tensor,
+        ensemble_size: int = SAMPLES,
     ):
         self.sensor, self.preset, self.facts, self.motion = sensor, preset, facts, deepcopy(motion)
-        self.ensemble_size = ensemble_size
+        self.ensemble_size, self.error = ensemble_size, error
         self.encoding = sensor.module["head"].layers[-1].in_features
 
     def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
@@ -91,7 +100,7 @@ class Recipe:
         return Scaled(self._noise())
 
     def _noise(self) -> SubModel:
-        return DiagonalNoise(STATE, r=ERRORS, in_features=self.encoding, in_key=("sensor", "encoding"))
+        return DiagonalNoise(STATE, r=WHITE * self.error, in_features=self.encoding, in_key=("sensor", "encoding"))
 
     @property
     def size(self) -> int:
@@ -113,8 +122,9 @@ class Recipe:
 
     @property
     def process_std(self) -> Tensor:
-        """What the motion does not know before training: half a millimetre, usual accelerations, a tenth of a bias."""
-        return torch.cat([torch.full((3,), 0.0005), self.facts.acceleration, 0.3 * ERRORS])[: len(self.noisy)]
+        """What motion and bias do not know before training: 0.5 mm, usual accelerations; biases stay as large."""
+        slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
+        return torch.cat([torch.full((3,), 0.0005), self.facts.acceleration, slow])[: len(self.noisy)]
 
     def process_noise(self) -> SubModel:
         """Q of place, rates and bias, from the belief's mean."""
@@ -140,10 +150,12 @@ class Recipe:
     @property
     def start_std(self) -> Tensor:
         """How wrong training windows begin, ``[17]``."""
-        return torch.cat([2 * INITIAL * self.facts.scale, 0.3 * self.facts.rate])
+        # As far as a filter is off in the long run, or it learns to hold on to where it began.
+        wrong = torch.maximum(2 * INITIAL * self.facts.scale, self.error)
+        return torch.cat([wrong, 0.3 * self.facts.rate])
 
     def _with_bias(self, std: Tensor) -> Tensor:
-        return torch.cat([std, ERRORS])[: self.size]
+        return torch.cat([std, WHITE * self.error])[: self.size]
 
     def initial(self) -> TensorDictModuleBase:
         """The belief at the start of an episode: near the true state, at rest."""
