@@ -74,7 +74,7 @@ class PairObservation(SubModel):
 
     Args:
         reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
-            of zero: where the forecast's mean says more, the frame counts as not observed.
+            of zero: where the forecast's mean says more over a gap, the frame counts as not observed.
         curve: h, what the sensor reads at a true sum ``[*, 2]``, for one that hedges; by default the sum itself.
         in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
         history_key: see :class:`WithHistory`; ``None`` where the past is part of the state, see
@@ -126,7 +126,9 @@ class PairObservation(SubModel):
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(tensordict.get(self.optional_keys[0], None), history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        readable = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        # Neighbours are always read: a filter that believes itself too fast would otherwise stay blind.
+        within_reach = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        readable = within_reach | ~past.flatten(-2).any(-1)
         for key in self.optional_keys:
             value = tensordict.get(key, None)
             if value is not None:
