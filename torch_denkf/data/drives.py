@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torch_denkf.data._altitude import steady_altitude
 from torch_denkf.data._camera import KITTI_FOCAL, Camera
 from torch_denkf.data._drive_writer import FORMAT, Job, write
 from torch_denkf.data._kitti_files import read_poses, state_to_poses
@@ -44,7 +45,8 @@ def render_drives(
 ) -> list[str]:
     """Render drives along recorded or invented poses, with hills and moving cars, in KITTI's layout.
 
-    The camera takes the poses' full motion, with pitch, roll and climbs; the road lies 1.65 m under it and follows its
+    The camera takes the poses' full motion, with pitch, roll and climbs (without those that its attitude contradicts,
+    because recorded altitudes drift while a car stands); the road lies 1.65 m under it and follows its
     hills. Frames are 0.103 s apart. A drive follows from its name, its poses, the seed and the options alone, not from
     the number of processes. Finished drives of the same options are kept, so that an interrupted call can be repeated;
     a drive that is there is always complete.
@@ -100,7 +102,8 @@ def render_drives(
         tracks = {name: _invent(name, FRAMES if frames is None else frames, seed) for name in names}
     else:
         names = _pose_files(Path(poses).expanduser(), names)
-        tracks = {name: read_poses(Path(poses).expanduser() / f"{name}.txt")[:frames] for name in names}
+        folder = Path(poses).expanduser()
+        tracks = {name: steady_altitude(read_poses(folder / f"{name}.txt")[:frames]) for name in names}
         for name in names:
             _check([name], len(tracks[name]))
     jobs = []
