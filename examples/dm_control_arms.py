@@ -35,6 +35,8 @@ from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.transforms import DEnKFTransform
 
+DRIFT = 0.004  # rad a step: noise of the angles, which the learned accelerations do not have
+
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
     """Episodes ``[N, T]`` that begin alike for all policies."""
@@ -63,8 +65,20 @@ class ArmTransition(m.SubModel):
         mean, noise = self.module(features).chunk(2, -1)
         noise = (0.02 + nn.functional.softplus(noise - 1.5)) * torch.randn_like(noise)
         velocity = velocity + self.change * (mean + noise)
-        angles = angles + self.arm.dt * velocity  # as MuJoCo's semi-implicit Euler has it
+        # As MuJoCo's semi-implicit Euler has it; without the noise an arm at rest would be believed for ever.
+        angles = angles + self.arm.dt * velocity + DRIFT * torch.randn_like(angles)
         return tensordict.set(("forecast", "ensemble"), self.arm.join(angles, velocity))
+
+
+def collect(arm: Arm, pixels: bool, args: argparse.Namespace) -> TensorDict:
+    """Episodes of the controller on the truth with noise on its actions; many short ones where pictures are learned."""
+    at_once, steps = (30, min(60, args.steps)) if pixels else (args.demos, args.steps)
+    env = make_env(arm, pixels, min(at_once, args.demos))
+    policy = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
+    rounds = range(-(-args.demos // at_once))
+    data = torch.cat([run(env, policy, steps, args.seed + number).exclude("next") for number in rounds])
+    env.close()
+    return data
 
 
 def make_filter(arm: Arm, data: TensorDict, pixels: bool) -> DEnKF:
@@ -118,10 +132,10 @@ def train(denkf: DEnKF, data: TensorDict, args: argparse.Namespace) -> None:
         fit(Stage("sensor", loss_sensor, sample, args.sensor_updates, parameters=sensor.parameters()))
         with torch.no_grad():  # once, instead of in every window
             data = torch.stack([sensor(episode) for episode in data])
-    data = data.exclude("pixels", "next")
+    data = data.exclude("pixels")
     parts = {name: denkf[name] for name in ("transition", "observation", "noise", "analysis")}
     loss = DEnKFLoss(DEnKF(sensor=None, **parts, initial=denkf.initial), sensor=0.0, state_scale=scale)
-    lengths = {0: 10, args.updates // 3: 25, args.updates * 3 // 4: 60}
+    lengths = {0: 10, args.updates // 3: 25, args.updates * 3 // 4: 100}
     fit(Stage("filter", loss, sample_windows, args.updates, lr=3e-3, lengths=lengths))
 
 
@@ -161,10 +175,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=sorted(ARMS), default="reacher")
     parser.add_argument("--from", dest="source", choices=["proprioception", "pixels"], default="proprioception")
-    parser.add_argument("--demos", type=int, default=60, help="episodes to train on")
+    parser.add_argument("--demos", type=int, help="episodes to train on; by default 100, from pixels 240")
     parser.add_argument("--episodes", type=int, default=20, help="episodes to test on")
-    parser.add_argument("--steps", type=int, default=200, help="of an episode")
-    parser.add_argument("--sensor-updates", type=int, default=600)
+    parser.add_argument("--steps", type=int, help="of an episode; by default 200, from pixels 120")
+    parser.add_argument("--sensor-updates", type=int, default=1500)
     parser.add_argument("--updates", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/dm_control_arms"))
@@ -172,20 +186,18 @@ def main() -> None:
     args = parser.parse_args()
     if args.smoke:
         args.demos, args.episodes, args.steps, args.sensor_updates, args.updates = 4, 2, 24, 3, 4
+    arm, pixels, start = ARMS[args.task], args.source == "pixels", time.perf_counter()
+    args.demos, args.steps = args.demos or (240 if pixels else 100), args.steps or (120 if pixels else 200)
     args.out = args.out / "smoke" if args.smoke else args.out / f"{args.task}_{args.source}"
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
-    arm, pixels, start = ARMS[args.task], args.source == "pixels", time.perf_counter()
     try:
         make_one(arm, pixels).reset()
     except Exception as error:  # each OpenGL library has its own
         where = "libegl1 and libgl1-mesa-dri (Debian)" if pixels else "dm-control and mujoco<4"
         sys.exit(f"dm_control cannot show {args.task}: {type(error).__name__}: {error}. Install {where}.")
 
-    explore = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
-    env = make_env(arm, pixels, args.demos)
-    data = run(env, explore, args.steps, args.seed)
-    env.close()
+    data = collect(arm, pixels, args)
     denkf = make_filter(arm, data, pixels)
     train(denkf, data, args)
     lines = ["| missing | policy reads | angles, deg | velocities, rad/s | tip to goal, cm | return | effort |"]

@@ -69,12 +69,18 @@ class Arm:
         return torch.stack([shoulder, wrist], -1)
 
     def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
-        """Proportional to the angles' errors, damped: the policy, whatever its estimate of the state comes from."""
+        """Proportional to the angles' errors, damped: the policy, whatever its estimate of the state comes from.
+
+        With ``explore`` random actions come on top, the larger the later the arm stands in the batch; an arm at rest
+        has to be learned, too.
+        """
         angles, velocity = self.split(state)
         error = torch.cat(
             [wrap(goal - angles)[..., :1], (goal - angles)[..., 1:]], -1
         )  # only the first turns all round
-        action = self.stiffness * error - self.damping * velocity + explore * torch.randn_like(error)
+        action = self.stiffness * error - self.damping * velocity
+        if explore:
+            action = action + explore * torch.linspace(0, 1, len(action)).unsqueeze(-1) * torch.randn_like(action)
         return nn.functional.pad(action, (0, self.actions - self.joints)).clamp(-1, 1)  # the grip stays as it is
 
 
