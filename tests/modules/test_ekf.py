@@ -215,10 +215,10 @@ def test_masks_full_noise_and_plain_readings(float64, Analysis, width):
 
 @pytest.mark.parametrize("Analysis", ANALYSES)
 def test_the_observation_model_may_read_steps_and_write_the_mask(float64, Analysis):
-    # Pairs over 1, 2 and 3 steps, one that does not exist, and one beyond the sensor's reach.
+    # Pairs over 1, 2 and 3 steps, one that does not exist, and one over a gap beyond the sensor's reach.
     td = forecast(5, dim=9)
     td["forecast", "mean"][4, 3] = 100.0
-    td["steps"] = torch.tensor([[1], [2], [3], [0], [1]])
+    td["steps"] = torch.tensor([[1], [2], [3], [0], [2]])
     module = Analysis(PairObservation([50.0, torch.inf], history_key=None), observed_key=("forecast", "observed"))
     assert ("forecast", "ensemble") not in module.in_keys
     out = module(td.copy())

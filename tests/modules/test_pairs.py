@@ -168,6 +168,16 @@ def test_what_is_out_of_reach_is_not_read(float64):
     assert far["belief", "ensemble"].equal(blind["belief", "ensemble"])
 
 
+def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
+    """Otherwise a filter whose speed has run away stays blind, and keeps it."""
+    frames = frames_of(torch.full((12, 2), 4.0) * torch.tensor([1.0, 0.0]), [0, *[1] * 11])
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 60.0, 0.0]).expand(12, 5)
+    torch.manual_seed(0)
+    out = pair_filter(32, reach=[10.0, torch.inf]).sequence(frames)
+    assert out["forecast", "observed"][1:].all()
+    assert abs(float(out["belief", "mean"][-1, 3]) - 4.0) < 2.0  # far within the 10 m/s of the reach
+
+
 def test_steps_equal_the_sequence(float64):
     filter = pair_filter(8, "etkf", change=torch.nn.Linear(2, 2))
     frames = frames_of(torch.randn(10, 2) + torch.tensor([4.0, 0.1]), [0, 1, 0, 2, 1, 0, 0, 3, 1, 0])
