@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import os
+import threading
 import uuid
 import zipfile
 from collections.abc import Iterable
@@ -111,6 +112,25 @@ def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
     return f"{root / entry.file} ({len(data)} bytes) does not have the checksum in {MANIFEST}: it was cut or changed"
 
 
+_HEADERS = threading.Lock()
+
+
+def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, by name.
+
+    NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 fails now and then where threads do it at a
+    time ("AST constructor recursion depth mismatch", CPython issue 106905). So headers are read one after the other,
+    and decompression, which takes the time, side by side.
+    """
+    arrays = {}
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        for member in archive.namelist():
+            stream = io.BytesIO(archive.read(member))
+            with _HEADERS:
+                arrays[member.removesuffix(".npy")] = np.lib.format.read_array(stream, allow_pickle=False)
+    return arrays
+
+
 def read_demo(root: Path, entry: Entry) -> Demo:
     """Read a demo and compare it with its line in the manifest.
 
@@ -128,8 +148,7 @@ def read_demo(root: Path, entry: Entry) -> Demo:
     if wrong is not None:
         raise ValueError(f"{wrong}; {again}")
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            demo = Demo(**{key: arrays[key] for key in arrays.files})
+        demo = Demo(**_read_arrays(data))
     except (TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} does not hold a demo ({error}); was it written by another version?") from error
     demo.number, demo.seed = int(demo.number), int(demo.seed)
