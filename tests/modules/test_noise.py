@@ -1,10 +1,10 @@
-"""Oracle: R = (r^2 - c)(1 + g)^2 + c, written out."""
+"""Oracles: R = (r^2 - c)(1 + g)^2 + c, written out; scaled noise against the Kalman gain, which it must not change."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.modules import ConstantNoise, DiagonalNoise
+from torch_denkf.modules import CholeskyNoise, ConstantNoise, DiagonalNoise, ScaledNoise
 
 
 def variance(model, reading, batch=()):
@@ -80,3 +80,40 @@ def test_constant_trains_the_logarithm(float64):
 def test_constant_bad_r(r):
     with pytest.raises(ValueError, match="one positive standard deviation a dimension"):
         ConstantNoise(r)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_scaled_variances_and_covariances(float64, batch):
+    for noise, diagonal in (
+        (DiagonalNoise(2, r=[0.1, 3.0]), [0.01, 9.0]),
+        (CholeskyNoise(2, r=[0.1, 3.0], in_key=("sensor", "ensemble"), out_key=("sensor", "noise")), [0.01, 9.0]),
+    ):
+        scaled = ScaledNoise(noise)
+        before = variance(scaled, torch.randn(*batch, 8, 2), batch)
+        scaled.factor = 0.5
+        after = variance(scaled, torch.randn(*batch, 8, 2), batch)
+        expected = torch.tensor(diagonal).expand(*batch, 2)
+        expected = expected if after.ndim == len(batch) + 1 else expected.diag_embed()
+        torch.testing.assert_close(before, expected)
+        torch.testing.assert_close(after, expected / 4)
+
+
+def test_scaled_noise_keeps_the_gain_and_scales_the_covariance(float64):
+    """K of (c^2 P, c^2 R) is K of (P, R); the analysis' covariance is c^2 times as large."""
+    forecast = torch.tensor([[2.0, 0.5], [0.5, 1.0]])
+    noise = ScaledNoise(ConstantNoise([0.3, 0.7]))
+
+    def analysis(factor):
+        noise.factor = factor
+        r = variance(noise, torch.zeros(2)).diag_embed()
+        gain = factor**2 * forecast @ torch.linalg.inv(factor**2 * forecast + r)
+        return gain, (torch.eye(2) - gain) @ (factor**2 * forecast)
+
+    for one, other, ratio in zip(analysis(1.0), analysis(3.0), (1.0, 9.0), strict=True):
+        torch.testing.assert_close(other, ratio * one)
+
+
+def test_a_scale_is_in_no_state_dict_and_not_negative():
+    assert list(ScaledNoise(DiagonalNoise(2)).state_dict()) == [f"module.{k}" for k in DiagonalNoise(2).state_dict()]
+    with pytest.raises(ValueError, match="not negative; got -1"):
+        ScaledNoise(ConstantNoise([1.0]), -1.0)

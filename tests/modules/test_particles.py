@@ -177,7 +177,29 @@ def test_learned_likelihood_takes_the_mean_of_members():
     torch.testing.assert_close(model(td)["forecast", "log_likelihood"], model(mean)["forecast", "log_likelihood"])
 
 
-@pytest.mark.parametrize("model", [GaussianLikelihood(), LearnedLikelihood(F, OBS, num_cells=(4,)).double()])
+def test_learned_likelihood_sees_the_reading():
+    """By hand: the encoding, the mean reading and the prediction, both standardised alike; nothing where not observed."""
+    loc, scale = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
+    model = LearnedLikelihood(F, OBS, num_cells=(8,), loc=loc, scale=scale, reading_key=("sensor", "ensemble"))
+    td = reading((4,), members=3)
+    own, predicted = ((td[key] - loc) / scale for key in (("sensor", "ensemble"), ("forecast", "observation")))
+    features = torch.cat([td["sensor", "encoding"], own.mean(-2)], -1).unsqueeze(-2).expand(-1, E, -1)
+    value = model.module(torch.cat([features, predicted], -1))[..., 0]
+    expected = (0.004 + 0.996 * value.sigmoid()).log()
+    torch.testing.assert_close(model(td.copy())["forecast", "log_likelihood"], expected)
+    td["observed"] = torch.tensor([[True], [False], [True], [True]])
+    td["sensor", "ensemble"][1] = torch.nan
+    out = model(td)["forecast", "log_likelihood"]
+    torch.testing.assert_close(out[[0, 2, 3]], expected[[0, 2, 3]])
+    assert (out[1] == 0).all()
+
+
+SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), reading_key=("sensor", "ensemble"))
+
+
+@pytest.mark.parametrize(
+    "model", [GaussianLikelihood(), LearnedLikelihood(F, OBS, num_cells=(4,)).double(), SEES_READING.double()]
+)
 def test_nan_behind_a_mask_leaves_gradients_finite(model):
     td = reading((4,)).set("observed", torch.tensor([[True], [False], [True], [False]]))
     hidden = ~td["observed"]

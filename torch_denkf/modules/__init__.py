@@ -13,7 +13,7 @@ from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTra
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.motion_noise import NoisyTransition
-from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
+from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
@@ -42,6 +42,7 @@ __all__ = [
     "Select",
     "DiagonalNoise",
     "ConstantNoise",
+    "ScaledNoise",
     "ImageSensor",
     "VectorSensor",
     "FlowSensor",

@@ -97,9 +97,12 @@ class LearnedLikelihood(SubModel):
             ``"clipped"``, :math:`\max(\log \mathrm{sigmoid}(g), -20)` (the limit of Kloss et al. 2021).
         loc: mean m of each observation dimension ``[O]``; zero by default.
         scale: standard deviation s of each observation dimension ``[O]``; one by default.
-        network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
+        network: maps ``[*, F + O]`` (with a ``reading_key`` ``[*, F + 2 O]``) to ``[*, 1]``; a multi-layer perceptron
+            with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
+        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used: the network sees it,
+            too, and need not find it in the encoding. Nothing by default, as in the papers.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
             be NaN.
@@ -132,6 +135,7 @@ class LearnedLikelihood(SubModel):
         scale: Sequence[float] | torch.Tensor | None = None,
         network: nn.Module | None = None,
         encoding_key: NestedKey = ("sensor", "encoding"),
+        reading_key: NestedKey | None = None,
         predicted_key: NestedKey = ("forecast", "observation"),
         observed_key: NestedKey = "observed",
         out_key: NestedKey = ("forecast", "log_likelihood"),
@@ -139,8 +143,10 @@ class LearnedLikelihood(SubModel):
         if bound not in ("scaled", "clipped"):
             raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
         if network is None:
-            network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
-        super().__init__(network, [encoding_key, predicted_key], [out_key], optional_keys=[observed_key])
+            seen_dim = encoding_dim + (0 if reading_key is None else observation_dim)
+            network = StochasticMLP(seen_dim + observation_dim, 1, num_cells, layer="none")
+        in_keys = [key for key in (encoding_key, predicted_key, reading_key) if key is not None]
+        super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
         self.bound, self.observation_dim = bound, observation_dim
         dtype = torch.get_default_dtype()
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
@@ -149,14 +155,17 @@ class LearnedLikelihood(SubModel):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the log-likelihoods."""
-        encoding, predicted = (self.read(tensordict, key) for key in self.in_keys)
+        encoding, predicted, *readings = (self.read(tensordict, key) for key in self.in_keys)
         encoding = _mean_of_members(encoding, tensordict)
         predicted = (predicted - self.loc) / self.scale
+        readings = [(_mean_of_members(reading, tensordict) - self.loc) / self.scale for reading in readings]
         observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
             seen = observed.any(-1, keepdim=True)
             encoding = torch.where(seen, encoding, 0.0)
             predicted = torch.where(observed.unsqueeze(-2), predicted, 0.0)
+            readings = [torch.where(observed, reading, 0.0) for reading in readings]
+        encoding = torch.cat([encoding, *readings], -1)
         encoding = encoding.unsqueeze(-2).expand(*predicted.shape[:-1], encoding.shape[-1])
         value = self.module(torch.cat([encoding, predicted], -1)).squeeze(-1)
         if self.bound == "scaled":

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.stochastic import StochasticMLP
 
-__all__ = ["ConstantNoise", "DiagonalNoise"]
+__all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise"]
 
 
 class DiagonalNoise(SubModel):
@@ -128,3 +129,39 @@ class ConstantNoise(SubModel):
         like = self.read(tensordict, self.in_keys[0])
         variance = self.log_variance.exp().to(like.dtype if like.is_floating_point() else self.log_variance.dtype)
         return tensordict.set(self.out_keys[0], variance.expand(*tensordict.batch_size, -1))
+
+
+class ScaledNoise(SubModel):
+    r"""What another noise module writes, times the square of a factor that is set by hand after training.
+
+    A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and
+    leaves its gain as it was trained. Inflating the belief itself in every step would also multiply what nothing
+    observes, such as the pose of a vehicle whose velocities are measured, and that would grow without bound.
+
+    ``factor`` is no parameter and in no state dict: it is chosen after the training, on validation data.
+
+    Args:
+        noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]``; its keys are kept.
+        factor: on standard deviations; not negative.
+
+    Raises:
+        ValueError: if the factor is negative.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = ScaledNoise(ConstantNoise([0.1, 2.0]))
+        >>> noise.factor = 3.0
+        >>> noise(TensorDict({("sensor", "ensemble"): torch.zeros(32, 2)}))["sensor", "noise"]
+        tensor([ 0.0900, 36.0000])
+    """
+
+    def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
+        if factor < 0:
+            raise ValueError(f"ScaledNoise needs a factor that is not negative; got {factor}.")
+        super().__init__(noise, noise.in_keys, noise.out_keys)
+        self.factor = factor
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the scaled variances or covariance."""
+        out, key = self.module(tensordict), self.out_keys[0]
+        return out.set(key, self.factor**2 * self.read(out, key))

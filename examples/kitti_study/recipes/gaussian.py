@@ -16,7 +16,7 @@ from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
     GaussianAround,
-    MappedNoise,
+    ScaledNoise,
     SubModel,
     UKFAnalysis,
     UKFTransition,
@@ -32,9 +32,9 @@ class _Gaussian(Recipe):
 
     def modules(self):
         motion = ClonedTransition(self.transition(torch.zeros_like))
-        process_noise = MappedNoise(self.process_noise(), torch.eye(2))
+        process_noise = ScaledNoise(self.process_noise())
         return OrderedDict(
-            noise=MappedNoise(self.noise(), torch.eye(2)),
+            noise=ScaledNoise(self.noise()),
             transition=self.Transition(motion, UnicycleNoise(process_noise, self.facts.dt)),
             analysis=self.Analysis(self.observation(history_key=None), observed_key=("forecast", "observed")),
         )
@@ -56,8 +56,9 @@ class _Gaussian(Recipe):
     def set_inflation(self, model, factor):
         # In Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply the pose's
         # variance in every step, too, which nothing observes: it would grow without bound.
-        for noise in (model["noise"], model["transition"].process_noise.module):
-            noise.matrix.copy_(factor * torch.eye(2))
+        for module in model.modules():
+            if isinstance(module, ScaledNoise):
+                module.factor = factor
 
 
 @register

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import OrderedDict
 
 import torch
-from torch import nn
 
 from kitti_study.recipes._base import Recipe, register
 from kitti_study.streams import LONGEST
@@ -19,27 +18,11 @@ from torch_denkf.modules import (
     NoisyTransition,
     ParticleAnalysis,
     ResampledTransition,
-    SubModel,
     WithWeights,
 )
 from torch_denkf.objectives import MixtureLoss
 
 PARTICLES = 100  # as both papers train with
-
-
-class Reading(SubModel):
-    """What a learned likelihood looks at: the sensor's encoding, and its reading, standardised."""
-
-    def __init__(self, loc: torch.Tensor, scale: torch.Tensor):
-        super().__init__(nn.Identity(), [("sensor", "ensemble"), ("sensor", "encoding")], [("sensor", "reading")])
-        self.register_buffer("loc", loc)
-        self.register_buffer("scale", scale)
-
-    def forward(self, tensordict):
-        """Writes ``("sensor", "reading")`` ``[*B, F + 2]``."""
-        samples, encoding = (self.read(tensordict, key) for key in self.in_keys)
-        reading = (samples.mean(-2) - self.loc) / self.scale
-        return tensordict.set(self.out_keys[0], torch.cat([encoding, reading], -1))
 
 
 class _Particles(Recipe):
@@ -67,14 +50,13 @@ class _Particles(Recipe):
         )
         modules = OrderedDict()
         if self.learned:
-            modules["reading"] = Reading(facts.loc, facts.scale)
             likelihood = LearnedLikelihood(
-                self.encoding + 2,
+                self.encoding,
                 2,
                 bound=self.learned,
                 loc=facts.loc,
                 scale=facts.scale,
-                encoding_key=("sensor", "reading"),
+                reading_key=("sensor", "ensemble"),
                 **keys,
             )
         else:

@@ -6,12 +6,11 @@ from collections import OrderedDict
 from copy import deepcopy
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, SubModel
+from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
 from ur5_study.demos import JOINTS, STATE
 from ur5_study.motion import ERRORS, FADING, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
 from ur5_study.sensors import SAMPLES, BlackIsMissing, NearForecast, Preset, Statistics
@@ -25,23 +24,6 @@ def register(recipe: type[Recipe]) -> type[Recipe]:
     """Makes a filter available to all commands under its class's name in lower case."""
     FILTERS[recipe.__name__.lower()] = recipe
     return recipe
-
-
-class Scaled(SubModel):
-    """Variances, or a covariance, times the square of a factor. It belongs to no state dict: see ``set_inflation``.
-
-    Inflating the belief itself in each step would do harm here: only the sum of a number and its bias is seen, and
-    what they differ by would grow without bound.
-    """
-
-    def __init__(self, noise: SubModel):
-        super().__init__(noise, noise.in_keys, noise.out_keys)
-        self.factor = 1.0
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes what ``noise`` writes, scaled."""
-        out, key = self.module(tensordict), self.out_keys[0]
-        return out.set(key, self.factor**2 * out.get(key))
 
 
 class Recipe:
@@ -89,15 +71,16 @@ class Recipe:
     def set_inflation(self, model: Filter, factor: float) -> None:
         """The one number that is chosen on the validation demos: a factor on all standard deviations of noise.
 
-        Of Q, R, and the sensor's samples around their mean: gains stay, and spreads grow by it.
+        Of Q, R, and the sensor's samples around their mean: gains stay, and spreads grow by it. Inflating the belief
+        itself would do harm here: only the sum of a number and its bias is seen, and what they differ by would grow.
         """
         for module in model.modules():
-            if isinstance(module, (Scaled, NearForecast)):
+            if isinstance(module, (ScaledNoise, NearForecast)):
                 module.factor = factor
 
     def noise(self) -> SubModel:
         """R, from what the sensor saw."""
-        return Scaled(self._noise())
+        return ScaledNoise(self._noise())
 
     def _noise(self) -> SubModel:
         return DiagonalNoise(STATE, r=WHITE * self.error, in_features=self.encoding, in_key=("sensor", "encoding"))
@@ -128,7 +111,7 @@ class Recipe:
 
     def process_noise(self) -> SubModel:
         """Q of place, rates and bias, from the belief's mean."""
-        return Scaled(self._process_noise())
+        return ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> SubModel:
         facts, blind = self.facts, self.size - SIZE

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-import torch
-from torch import Tensor, nn
-
 from torch_denkf.modules import (
     AroundState,
     GaussianLikelihood,
@@ -14,7 +11,6 @@ from torch_denkf.modules import (
     NoisyTransition,
     ParticleAnalysis,
     ResampledTransition,
-    SubModel,
     WithWeights,
 )
 from torch_denkf.objectives import MixtureLoss
@@ -24,21 +20,6 @@ from ur5_study.recipes._base import Recipe, register
 from ur5_study.sensors import NEAR, NearForecast
 
 PARTICLES = 100  # as both papers train with
-
-
-class Reading(SubModel):
-    """What a learned likelihood looks at: the sensor's encoding, and its reading, standardised."""
-
-    def __init__(self, loc: Tensor, scale: Tensor):
-        super().__init__(nn.Identity(), [NEAR, ("sensor", "encoding")], [("sensor", "reading")])
-        self.register_buffer("loc", loc.clone())
-        self.register_buffer("scale", scale.clone())
-
-    def forward(self, tensordict):
-        """Writes ``("sensor", "reading")`` ``[*B, F + O]``."""
-        samples, encoding = (self.read(tensordict, key) for key in self.in_keys)
-        reading = (samples.mean(-2) - self.loc) / self.scale
-        return tensordict.set(self.out_keys[0], torch.cat([encoding, reading], -1))
 
 
 class _Particles(Recipe):
@@ -58,14 +39,13 @@ class _Particles(Recipe):
         modules["near"] = NearForecast(self.preset)
         if self.learned:
             loc, scale = self.facts.loc, self.facts.scale
-            modules["reading"] = Reading(loc, scale)
             likelihood = LearnedLikelihood(
-                self.encoding + STATE,
+                self.encoding,
                 STATE,
                 bound=self.learned,
                 loc=loc,
                 scale=scale,
-                encoding_key=("sensor", "reading"),
+                reading_key=NEAR,
             )
         else:
             likelihood = GaussianLikelihood(sensor_key=NEAR)
