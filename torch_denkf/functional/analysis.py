@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional._checks import check_ensemble, check_shape
-from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
+from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
+from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
 Space = Literal["auto", "observation", "ensemble"]
@@ -85,7 +86,8 @@ def analyse(
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
-            ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one.
+            ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one. Without
+            gradients, ensemble space takes large states in tiles: memory is the result's and a few tiles.
 
     Returns:
         An :class:`Analysis`; all NaN for those batch elements whose system is not positive definite.
@@ -106,6 +108,14 @@ def analyse(
     _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space)
     size, dim = predicted.shape[-2:]
     has_samples = observation.ndim == forecast.ndim
+    in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
+    if not in_observation_space:
+        columns = columns_in_a_tile(forecast, predicted, observation, noise, perturbation)
+        if columns is not None:
+            rest = {"observed": observed, "perturbation": perturbation, "rotation": rotation}
+            return Analysis(
+                *analyse_in_tiles(forecast, predicted, observation, noise, scheme=scheme, columns=columns, **rest)
+            )
 
     if observed is not None:  # masked components: anomalies and innovation 0, variance 1
         members_observed = observed.unsqueeze(-2)
@@ -136,7 +146,6 @@ def analyse(
     else:
         shift = mean_shift
 
-    in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
     solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
     increment, square_root, nis, log_det = solve(normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf")
     if scheme != "etkf":
@@ -188,23 +197,15 @@ def _observation_space(
 def _ensemble_space(
     normalised: Tensor, anomalies: Tensor, shift: Tensor, mean_shift: Tensor, *, square_root: bool
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s.
-
-    YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
-    free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
-    """
-    gram = normalised @ normalised.mT
-    size = gram.shape[-1]
-    free = gram.detach().diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)  # c
-    gram = gram + (free / size).unsqueeze(-1)
-    factor = cholesky(gram + torch.eye(size, dtype=gram.dtype, device=gram.device))
-    weights = torch.cholesky_solve(normalised @ shift.mT, factor).mT
+    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
+    weights, root, log_det = solve_ensemble_space(
+        normalised @ normalised.mT, normalised @ shift.mT, square_root=square_root
+    )
     mean_weights = weights.mean(-2, keepdim=True)
     # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
     residual = mean_shift - mean_weights @ normalised
     nis = residual.square().sum(-1) + mean_weights.square().sum(-1)
-    transformed = inverse_square_root(gram) @ anomalies if square_root else None
-    return weights @ anomalies, transformed, nis, _log_det(factor) - free.log1p()
+    return weights @ anomalies, None if root is None else root @ anomalies, nis, log_det
 
 
 def _log_det(factor: Tensor) -> Tensor:

@@ -1,0 +1,165 @@
+"""The analysis in ensemble space: one E x E system, and for large states two passes over tiles of columns.
+
+A whole state of 10⁶ components and 32 members is 128 MB; the dozen arrays of that size that a plain formula leaves on
+its way cost more time, in fresh pages and cache misses, than the arithmetic. In tiles that stay in the cache only the
+result is as large as the ensemble.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional.linalg import cholesky, inverse_square_root
+
+#: Elements of an ensemble in one tile: 256 KiB in single precision, which a core's own cache holds several times.
+TILE_ELEMENTS = 2**16
+
+
+def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Solve with I + YYᵀ, E x E.
+
+    YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
+    free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
+
+    Args:
+        gram: YYᵀ, ``[*B, E, E]``; the members' anomalies sum to zero.
+        right: Y shiftᵀ, ``[*B, E, E]`` or ``[*B, E, 1]``.
+        square_root: whether (I + YYᵀ)^-1/2 is wanted.
+
+    Returns:
+        The weights rightᵀ (I + YYᵀ)⁻¹, one row for each column of ``right``; the square root, ``[*B, E, E]``, or
+        ``None``; log det (I + YYᵀ), ``[*B, 1]``.
+
+    Examples:
+        >>> y = torch.tensor([[-1.0], [1.0]])
+        >>> weights, _, log_det = solve_ensemble_space(y @ y.mT, y @ torch.tensor([[3.0]]), square_root=False)
+        >>> weights, log_det.exp()
+        (tensor([[-1.,  1.]]), tensor([3.]))
+    """
+    size = gram.shape[-1]
+    free = gram.detach().diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)  # c
+    gram = gram + (free / size).unsqueeze(-1)
+    factor = cholesky(gram + torch.eye(size, dtype=gram.dtype, device=gram.device))
+    weights = torch.cholesky_solve(right, factor).mT
+    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True) - free.log1p()
+    return weights, inverse_square_root(gram) if square_root else None, log_det
+
+
+def columns_in_a_tile(forecast: Tensor, *others: Tensor | None) -> int | None:
+    """Returns how many components :func:`analyse_in_tiles` takes at a time, ``None`` where it is not to be used.
+
+    Where everything fits in two tiles nothing is gained; a graph for gradients keeps all it saw, in tiles or not;
+    a compiler would unroll the loop over tiles and fuses the plain formulas itself.
+    """
+    columns = TILE_ELEMENTS // forecast[..., 0].numel()
+    widest = max(tensor.shape[-1] for tensor in (forecast, *others) if tensor is not None)
+    if columns < 64 or widest < 2 * columns or torch.compiler.is_compiling():
+        return None
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (forecast, *others)):
+        return None
+    return columns
+
+
+def analyse_in_tiles(
+    forecast: Tensor,
+    predicted: Tensor,
+    observation: Tensor,
+    noise: Tensor,
+    *,
+    scheme: str,
+    columns: int,
+    observed: Tensor | None = None,
+    perturbation: Tensor | None = None,
+    rotation: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What :func:`~torch_denkf.functional.analyse` does in ensemble space, without gradients, in little memory.
+
+    Beside the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
+    ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.
+    """
+    tiles = _Tiles(forecast, predicted, observation, noise, scheme, observed, perturbation)
+    size, dim = predicted.shape[-2:]
+    batch = forecast.shape[:-2]
+    gram = forecast.new_zeros(*batch, size, size)
+    right = forecast.new_zeros(*batch, size, 1 if scheme == "etkf" else size)
+    innovation = torch.empty_like(noise)
+    log_noise = count = forecast.new_zeros(*batch, 1)
+    for start in range(0, dim, columns):
+        part = slice(start, start + columns)
+        normalised, mean_shift, shift = tiles(part, innovation[..., part])
+        gram += normalised @ normalised.mT
+        right += normalised @ shift.mT
+        variance, mask = tiles.noise_and_mask(part)
+        log_noise = log_noise + variance.log().sum(-1, keepdim=True)
+        count = count + (variance.shape[-1] if mask is None else mask.sum(-1, keepdim=True))
+
+    weights, root, log_det = solve_ensemble_space(gram, right, square_root=scheme == "etkf")
+    mean_weights = weights.mean(-2, keepdim=True)
+    # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
+    nis = mean_weights.square().sum(-1)
+    for start in range(0, dim, columns):
+        normalised, mean_shift, _ = tiles(slice(start, start + columns))
+        nis = nis + (mean_shift - mean_weights @ normalised).square().sum(-1)
+
+    if root is not None and rotation is not None:
+        root = rotation @ root
+    seen = (count > 0).unsqueeze(-1)
+    ensemble = torch.empty_like(forecast)
+    for start in range(0, forecast.shape[-1], columns):
+        state = forecast[..., start : start + columns]
+        mean = state.mean(-2, keepdim=True)
+        anomalies = state - mean
+        moved = state + weights @ anomalies if root is None else mean + (weights + root) @ anomalies
+        ensemble[..., start : start + columns] = moved if observed is None else torch.where(seen, moved, state)
+    nis = nis * (size - 1)
+    log_likelihood = -0.5 * (nis + log_det + log_noise + count * math.log(2 * math.pi))
+    return ensemble, innovation, nis, log_likelihood
+
+
+class _Tiles:
+    """Columns of the normalised anomalies Y and of what the gain acts on, made when they are asked for."""
+
+    def __init__(self, forecast, predicted, observation, noise, scheme, observed, perturbation):
+        self.predicted, self.noise, self.observed = predicted, noise, observed
+        self.samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
+        self.scheme, self.perturbation = scheme, perturbation
+        self.size = predicted.shape[-2]
+
+    def noise_and_mask(self, part: slice) -> tuple[Tensor, Tensor | None]:
+        """Variances of these columns, 1 where nothing is observed, and the mask, ``[*B, columns]``."""
+        variance = self.noise[..., part]
+        if self.observed is None:
+            return variance, None
+        mask = self.observed.expand(self.noise.shape)[..., part]
+        return torch.where(mask, variance, 1), mask
+
+    def __call__(self, part: slice, innovation: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Y, the mean's shift and the members', as in ``analyse``; the last only where the innovation is wanted."""
+        predicted, samples = self.predicted[..., part], self.samples[..., part]
+        variance, mask = self.noise_and_mask(part)
+        if mask is not None:
+            members = mask.unsqueeze(-2)
+            predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
+        mean = predicted.mean(-2, keepdim=True)
+        scale = (variance * (self.size - 1)).rsqrt().unsqueeze(-2)
+        normalised = (predicted - mean) * scale
+        difference = samples.mean(-2, keepdim=True) - mean
+        mean_shift = difference * scale
+        if innovation is None:
+            return normalised, mean_shift, None
+        innovation.copy_(difference.squeeze(-2))
+        if self.scheme == "sensor":
+            return normalised, mean_shift, (samples - predicted) * scale
+        if self.scheme == "sakov":
+            return normalised, mean_shift, mean_shift - normalised / 2
+        if self.scheme == "etkf":
+            return normalised, mean_shift, mean_shift
+        given = self.perturbation
+        draws = torch.randn_like(predicted) if given is None else given[..., part]
+        draws = (draws - draws.mean(-2, keepdim=True)) * (math.sqrt(self.size) / (self.size - 1))
+        if mask is not None:
+            draws = torch.where(members, draws, 0)
+        return normalised, mean_shift, mean_shift - normalised + draws
