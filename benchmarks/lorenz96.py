@@ -19,10 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.data.lorenz96 import lorenz96_step
-from torch_denkf.functional import analyse, inflate, letkf, neighbours, random_rotation
+from torch_denkf.functional import analyse, inflate, random_rotation
+from torch_denkf.modules import LocalEnsembleAnalysis
 
 VARIABLES = 40
 SPIN_UP = 1000  # cycles from a random state to the attractor
@@ -32,7 +34,7 @@ SPIN_UP = 1000  # cycles from a random state to the attractor
 class Case:
     """One row of the table: a scheme, its tuning, and what others got with it."""
 
-    scheme: str  # of analyse(), or "letkf"
+    scheme: str  # of analyse(), or "letkf": LocalEnsembleAnalysis
     ensemble_size: int
     inflation: float  # factor on the analysis anomalies, DAPPER's convention
     published: float  # DAPPER's table, which cites the papers
@@ -88,15 +90,21 @@ def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor,
     noise = torch.ones(seeds, VARIABLES, dtype=torch.float64)
     ensemble = truth[0].unsqueeze(1) + random.randn(case.ensemble_size, VARIABLES)
     places = torch.arange(VARIABLES, dtype=torch.float64).unsqueeze(-1)
-    near = neighbours(places, places, RADIUS, period=torch.tensor([float(VARIABLES)]))
+    local = LocalEnsembleAnalysis.around(places, places, RADIUS, period=[float(VARIABLES)], rotate=case.rotate)
     errors, spreads = [], []
     for state, observation in zip(truth[1:], observations[1:], strict=True):
         ensemble = lorenz96_step(ensemble)
         if case.scheme == "letkf":
-            ensemble = letkf(ensemble, ensemble, observation, noise, near)
+            frame = TensorDict(
+                {
+                    "forecast": {"ensemble": ensemble, "observation": ensemble},
+                    "sensor": {"ensemble": observation, "noise": noise},
+                },
+                [seeds],
+            )
             if case.rotate:
-                mean = ensemble.mean(1, keepdim=True)
-                ensemble = mean + random.rotation(case.ensemble_size) @ (ensemble - mean)
+                frame["noise", "analysis"] = random.rotation(case.ensemble_size)
+            ensemble = local(frame)["belief", "ensemble"]
         else:
             ensemble = analyse(
                 ensemble,

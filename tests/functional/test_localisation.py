@@ -5,7 +5,16 @@ import math
 import pytest
 import torch
 
-from torch_denkf.functional import Neighbours, analyse, ensemble_cov, gaspari_cohn, kalman_update, letkf, neighbours
+from torch_denkf.functional import (
+    Neighbours,
+    analyse,
+    ensemble_cov,
+    gaspari_cohn,
+    kalman_update,
+    letkf,
+    neighbours,
+    neighbours_of_taper,
+)
 
 EXACT = {"rtol": 1e-8, "atol": 1e-8}
 
@@ -117,3 +126,12 @@ def test_shapes_that_do_not_fit_are_named():
         letkf(forecast, predicted, observation, noise, everywhere(5, 2))
     with pytest.raises(ValueError, match="noise"):
         letkf(forecast, predicted, observation, noise[:1], everywhere(3, 2))
+
+
+def test_neighbours_of_a_taper_are_its_positive_entries():
+    taper = torch.tensor([[0.0, 0.3, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.1, 0.0]])
+    found = neighbours_of_taper(taper, tile=2)
+    torch.testing.assert_close(torch.zeros(3, 4).scatter_add_(1, found.index, found.taper), taper)
+    assert found.index.shape == (3, 3)
+    with pytest.raises(ValueError, match=r"\[S, O\]"):
+        neighbours_of_taper(taper[0])

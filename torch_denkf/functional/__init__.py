@@ -4,7 +4,7 @@ from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
-from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, letkf, neighbours
+from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, letkf, neighbours, neighbours_of_taper
 from torch_denkf.functional.moments import (
     ensemble_anomalies,
     ensemble_cov,
@@ -65,6 +65,7 @@ __all__ = [
     "gaspari_cohn",
     "letkf",
     "neighbours",
+    "neighbours_of_taper",
     "unicycle_move",
     "unicycle_jacobians",
     "weighted_mean",

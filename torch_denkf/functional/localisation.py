@@ -8,6 +8,7 @@ whole, each component of the state gets an analysis of its own, from the observa
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -85,14 +86,43 @@ def neighbours(
         >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
         [[0, 1, 4], [0, 1, 2], [1, 2, 3], [2, 3, 4], [0, 3, 4]]
     """
-    rows = []
-    for part in states.split(tile):
-        offset = (part.unsqueeze(1) - observations).abs()
-        if period is not None:
-            offset = torch.minimum(offset, period - offset)
-        taper = gaspari_cohn(offset.square().sum(-1).sqrt(), radius)
-        count = max(int((taper > 0).sum(-1).max()), 1)
-        rows.append(taper.topk(count, dim=-1))
+
+    def tapers() -> Iterator[Tensor]:
+        for part in states.split(tile):
+            offset = (part.unsqueeze(1) - observations).abs()
+            if period is not None:
+                offset = torch.minimum(offset, period - offset)
+            yield gaspari_cohn(offset.square().sum(-1).sqrt(), radius)
+
+    return _largest(tapers())
+
+
+def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
+    """The observations that a taper lets count, for each component of a state.
+
+    Args:
+        taper: factors in [0, 1], ``[S, O]``; 0 where an observation is not to count. They need not come from a
+            distance.
+        tile: components to look at in one go.
+
+    Returns:
+        :class:`Neighbours`, with L the largest number that any component has, at least 1.
+
+    Raises:
+        ValueError: if the taper is not a matrix.
+
+    Examples:
+        >>> neighbours_of_taper(torch.tensor([[0.0, 1.0, 0.0], [0.5, 0.0, 0.2]])).index.tolist()
+        [[1, 0], [0, 2]]
+    """
+    if taper.ndim != 2:
+        raise ValueError(f"taper must be [S, O], one row a component of the state, got {list(taper.shape)}")
+    return _largest(taper.split(tile))
+
+
+def _largest(tapers: Iterable[Tensor]) -> Neighbours:
+    """The entries above zero of each row, of matrices that lie below one another."""
+    rows = [part.topk(max(int((part > 0).sum(-1).max()), 1), dim=-1) for part in tapers]
     length = max(row.values.shape[-1] for row in rows)
     pad = [(torch.nn.functional.pad(value, (0, length - value.shape[-1])) for value in row) for row in rows]
     taper, index = (torch.cat(column) for column in zip(*pad, strict=True))

@@ -12,6 +12,7 @@ from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
+from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
@@ -54,6 +55,7 @@ __all__ = [
     "AroundState",
     "FromSensor",
     "EnsembleAnalysis",
+    "LocalEnsembleAnalysis",
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",

@@ -1,0 +1,227 @@
+"""Oracles: the global transform, the scalar Kalman update, torch's Normal, and the truth of a Lorenz-96 run."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.data.lorenz96 import lorenz96_step
+from torch_denkf.filters import DEnKF
+from torch_denkf.functional import Neighbours, gaspari_cohn, relax_to_prior_spread
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    LearnedTransition,
+    LocalEnsembleAnalysis,
+    Select,
+)
+
+E, S = 6, 12
+PLACES = torch.arange(S, dtype=torch.float64).unsqueeze(-1)
+NAMES = ("ensemble", "mean", "var")
+
+
+def inputs(batch=(3,), observations=S):
+    forecast = torch.randn(*batch, E, S)
+    return TensorDict(
+        {
+            "forecast": {"ensemble": forecast, "observation": forecast[..., :observations].clone()},
+            "sensor": {"ensemble": torch.randn(*batch, observations), "noise": 0.3 + torch.rand(*batch, observations)},
+        },
+        batch,
+    )
+
+
+def everywhere(observations=S):
+    return Neighbours(torch.arange(observations).expand(S, observations), torch.ones(S, observations))
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("samples", [False, True])
+def test_where_all_is_near_it_is_the_global_transform(float64, batch, samples):
+    td = inputs(batch)
+    if samples:
+        td["sensor", "ensemble"] = td["sensor", "ensemble"].unsqueeze(-2) + torch.randn(*batch, E, S)
+    expected = EnsembleAnalysis("etkf", inflation=1.1, relaxation=0.2)(td.clone())
+    found = LocalEnsembleAnalysis(everywhere(), inflation=1.1, relaxation=0.2, tile=5)(td.clone())
+    for name in NAMES:
+        torch.testing.assert_close(found["belief", name], expected["belief", name], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found["info", "innovation"], expected["info", "innovation"])
+
+
+def test_a_rotation_is_the_same_for_all_components(float64):
+    module, td = LocalEnsembleAnalysis(everywhere(), rotate=True, ensemble_size=E), inputs()
+    td["noise", "analysis"] = module.draw_noise([3], dtype=torch.float64)
+    expected = EnsembleAnalysis("etkf", rotate=True)(td.clone())["belief", "ensemble"]
+    torch.testing.assert_close(module(td.clone())["belief", "ensemble"], expected, rtol=1e-9, atol=1e-9)
+    drawn = [module(td.exclude("noise"))["belief", "ensemble"] for _ in range(2)]
+    assert not drawn[0].allclose(drawn[1])
+    torch.testing.assert_close(drawn[0].mean(-2), drawn[1].mean(-2))
+    assert LocalEnsembleAnalysis(everywhere(), ensemble_size=E).draw_noise([3]) is None
+
+
+def test_a_taper_is_as_good_as_places(float64):
+    taper = gaspari_cohn((PLACES - PLACES[::2].T).abs(), 1.0)
+    td = inputs(observations=S // 2)
+    first = LocalEnsembleAnalysis.around(PLACES, PLACES[::2], 1.0, tile=5)(td.clone())
+    second = LocalEnsembleAnalysis(taper, tile=7)(td.clone())
+    torch.testing.assert_close(first["belief", "ensemble"], second["belief", "ensemble"], rtol=1e-12, atol=1e-12)
+
+
+def test_an_observation_far_away_changes_nothing(float64):
+    """The reach is 3.65: components 0 to 7 do not see the last observation, 8 to 11 do."""
+    module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0), inputs()
+    other = td.clone()
+    other["sensor", "ensemble"][..., -1] += 5
+    first, second = (module(part)["belief", "ensemble"] for part in (td, other))
+    assert first[..., :8].equal(second[..., :8])
+    assert ((first - second)[..., 8:].abs().amax((0, 1)) > 1e-6).all()
+
+
+def test_alone_each_component_is_its_own_kalman_update(float64):
+    module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 0.2), inputs()
+    out = module(td.clone())
+    mean, var, r = td["forecast", "ensemble"].mean(-2), td["forecast", "ensemble"].var(-2), td["sensor", "noise"]
+    torch.testing.assert_close(out["belief", "mean"], mean + var / (var + r) * (td["sensor", "ensemble"] - mean))
+    torch.testing.assert_close(out["belief", "var"], var * r / (var + r))
+
+
+def test_diagnostics_take_each_observation_by_itself(float64):
+    module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0), inputs()
+    td["observed"] = torch.rand(3, S) < 0.6
+    hidden = ~td["observed"]
+    td["sensor", "ensemble"][hidden] = torch.nan
+    out = module(td.clone())
+    predicted = td["forecast", "observation"]
+    normal = torch.distributions.Normal(predicted.mean(-2), (predicted.var(-2) + td["sensor", "noise"]).sqrt())
+    reading = torch.where(hidden, 0.0, td["sensor", "ensemble"])
+    log_likelihood = normal.log_prob(reading).masked_fill(hidden, 0).sum(-1, keepdim=True)
+    nis = ((reading - normal.mean) / normal.stddev).square().masked_fill(hidden, 0).sum(-1, keepdim=True)
+    torch.testing.assert_close(out["info", "log_likelihood"], log_likelihood)
+    torch.testing.assert_close(out["info", "nis"], nis)
+    torch.testing.assert_close(out["info", "innovation"], (reading - normal.mean).masked_fill(hidden, 0))
+
+
+def test_only_what_an_observation_reaches_is_inflated_and_rotated(float64):
+    """Radius 1: of observations 0 and 1 alone, components from 5 on see nothing; the last row sees nothing at all."""
+    td = inputs()
+    td["observed"] = torch.zeros(3, S, dtype=torch.bool)
+    td["observed"][:2, :2] = True
+    td["sensor", "noise"] = td["sensor", "noise"].masked_fill(~td["observed"], torch.nan)
+    forecast = td["forecast", "ensemble"]
+    plain = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, tile=5)(td.clone())["belief", "ensemble"]
+    inflated = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, tile=5, inflation=1.5)(td.clone())[
+        "belief", "ensemble"
+    ]
+    spread, more = plain.std(-2), inflated.std(-2)
+    torch.testing.assert_close(more[:2, :5], 1.5 * spread[:2, :5])
+    torch.testing.assert_close(inflated[:2, :, 5:], forecast[:2, :, 5:])
+    rotated = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, inflation=1.5, rotate=True)(td.clone())
+    assert rotated["belief", "ensemble"][2].equal(forecast[2])
+    assert not rotated["belief", "ensemble"][0].allclose(forecast[0])
+    relaxed = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, relaxation=0.7)(td.clone())["belief", "ensemble"]
+    torch.testing.assert_close(relaxed[:2], relax_to_prior_spread(plain, forecast, 0.7)[:2])
+
+
+def test_a_mask_of_one_entry_stands_for_all(float64):
+    td = inputs()
+    td["observed"] = torch.tensor([[True], [False], [True]])
+    module = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0, inflation=1.5)
+    one = module(td.clone())["belief", "ensemble"]
+    each = module(td.clone().set("observed", td["observed"].expand(3, S)))["belief", "ensemble"]
+    assert one.equal(each)
+    assert one[1].equal(td["forecast", "ensemble"][1])
+
+
+class Lorenz96(nn.Module):
+    """One step of the true system."""
+
+    def forward(self, state):
+        return lorenz96_step(state)
+
+
+def lorenz_filter(variables, members, **noise):
+    places = torch.arange(float(variables)).unsqueeze(-1)
+    return DEnKF(
+        LearnedTransition(Lorenz96(), residual=False),
+        None,
+        Select(range(variables)),
+        ConstantNoise(torch.ones(variables), in_key="reading", **noise),
+        LocalEnsembleAnalysis.around(
+            places, places, 4.0, period=[float(variables)], inflation=1.04, rotate=True, sensor_key="reading"
+        ),
+        initial=AroundState(torch.ones(variables), ensemble_size=members),
+    )
+
+
+def lorenz_run(variables, batch, steps):
+    """A truth on the attractor, and all of it read with unit noise."""
+    state = 8 + torch.randn(batch, variables)
+    for _ in range(200):
+        state = lorenz96_step(state)
+    states = [state]
+    for _ in range(steps - 1):
+        states.append(lorenz96_step(states[-1]))
+    truth = torch.stack(states, 1)
+    return TensorDict({"state": truth, "reading": truth + torch.randn_like(truth)}, truth.shape[:2])
+
+
+def test_seven_members_follow_forty_variables(float64):
+    """Readings err by 1.0; long runs err by 0.22 (benchmarks/results/lorenz96.md). Without localisation: 4 and more."""
+    run = lorenz_run(40, batch=4, steps=120)
+    with torch.no_grad():
+        out = lorenz_filter(40, members=7).sequence(run.clone())
+    error = (out["belief", "mean"] - run["state"])[:, 60:].square().mean().sqrt()
+    spread = out["belief", "var"][:, 60:].mean().sqrt()
+    assert error < 0.33
+    assert 0.7 < spread / error < 1.5
+    nis = out["info", "nis"][:, 60:].mean() / 40  # by itself each observation is consistent
+    assert 0.85 < nis < 1.15
+
+
+def test_step_equals_sequence(float64):
+    run, filter = lorenz_run(8, batch=2, steps=4), lorenz_filter(8, members=5)
+    run["is_init"] = torch.tensor([[[True], [False], [False], [False]], [[True], [False], [True], [False]]])
+    run["observed"] = torch.rand(2, 4, 8) < 0.7
+    run["noise", "initial"] = torch.randn(2, 4, 5, 8)
+    frames = filter.draw_noise(run)
+    assert frames["noise", "analysis"].shape == (2, 4, 5, 5)
+    sequence = filter.sequence(frames.copy())
+    row = filter.initialise(frames[:, 0].copy())
+    for time in range(4):
+        row = filter(frames[:, time].copy().update(row.select(*filter.carry_keys)))  # a start starts anew
+        for name in NAMES:
+            torch.testing.assert_close(row["belief", name], sequence["belief", name][:, time], rtol=0, atol=1e-12)
+
+
+def test_gradients_equal_finite_differences(float64):
+    """Of the error after three steps with respect to log R, through the module and the dynamics."""
+    run, filter = lorenz_run(6, batch=2, steps=3), lorenz_filter(6, members=4, trainable=True)
+    run["noise", "initial"] = torch.randn(2, 3, 4, 6)
+    run = filter.draw_noise(run)
+    log_variance = filter["noise"].log_variance
+
+    def loss():
+        return (filter.sequence(run.clone())["belief", "mean"] - run["state"]).square().mean()
+
+    (gradient,) = torch.autograd.grad(loss(), log_variance)
+    assert gradient.abs().max() > 1e-4
+    for component in range(6):
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                log_variance[component] += sign * 1e-5
+                values.append(loss())
+                log_variance[component] -= sign * 1e-5
+        # Central differences at 1e-5 in double precision: truncation and rounding below 1e-9.
+        torch.testing.assert_close(gradient[component], (values[0] - values[1]) / 2e-5, rtol=1e-5, atol=1e-8)
+
+
+def test_errors_name_what_is_wrong():
+    with pytest.raises(ValueError, match=r"taper must be \[S, O\]"):
+        LocalEnsembleAnalysis(torch.ones(3))
+    with pytest.raises(ValueError, match=r"near\.index"):
+        LocalEnsembleAnalysis(torch.ones(3, S))(inputs())
+    with pytest.raises(KeyError, match="sensor"):
+        LocalEnsembleAnalysis(torch.ones(S, S))(inputs().exclude("sensor"))

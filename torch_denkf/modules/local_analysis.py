@@ -1,0 +1,189 @@
+"""The local ensemble transform (LETKF) as a TensorDict module: each component learns from the observations near it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import nn
+
+from torch_denkf.functional import (
+    Neighbours,
+    ensemble_mean,
+    ensemble_var,
+    letkf,
+    neighbours,
+    neighbours_of_taper,
+    random_rotation,
+    relax_to_prior_spread,
+)
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["LocalEnsembleAnalysis"]
+
+
+class LocalEnsembleAnalysis(SubModel):
+    """Updates each component of the state from the observations near it; the mathematics is
+    :func:`~torch_denkf.functional.letkf`.
+
+    For fields, where a few members stand for thousands of components: what they show of a covariance far away is
+    chance. It takes the place of :class:`EnsembleAnalysis` and reads and writes the same keys. Nothing of size S x O is
+    kept; S local systems, E x E each, are solved ``tile`` at a time.
+
+    Args:
+        near: which observations count where: :class:`~torch_denkf.functional.Neighbours`, or a taper ``[S, O]``. From
+            places and a radius: :meth:`around`.
+        inflation: factor on the analysis anomalies of the components near which anything is observed; 1 for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
+        rotate: random mean-preserving rotation of the anomalies, the same for all components; rows of which nothing
+            is observed are not rotated.
+        tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch, with L
+            neighbours.
+        ensemble_size: E, needed only to draw rotations for a whole sequence in bulk; a filter sets it.
+        forecast_key: forecast ensemble ``[*B, E, S]``.
+        predicted_key: predicted observations ``[*B, E, O]``.
+        sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is taken.
+        noise_variance_key: variances ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; elsewhere readings and
+            variances may be NaN.
+        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``.
+        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
+            The last two take each observation by itself, with the variance of its own forecast plus R: the
+            correlations that E members show between observations are what localisation does not believe. The
+            expectation of ``nis`` is the number of observations, if the filter is consistent.
+        noise_key: optional rotations ``[*B, E, E]``.
+
+    Raises:
+        ValueError: if a taper is not a matrix, or the sizes do not fit.
+        KeyError: if an entry is missing.
+
+    Source:
+        Hunt, Kostelich & Szunyogh 2007, Physica D 230.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> places = torch.arange(40.0).unsqueeze(-1)
+        >>> analysis = LocalEnsembleAnalysis.around(places, places[::2], radius=4.0, period=[40.0], inflation=1.04)
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": torch.randn(7, 40), "observation": torch.randn(7, 20)},
+        ...     "sensor": {"ensemble": torch.randn(20), "noise": torch.ones(20)},
+        ... })
+        >>> analysis(td)["belief", "mean"].shape
+        torch.Size([40])
+    """
+
+    def __init__(
+        self,
+        near: Neighbours | torch.Tensor,
+        *,
+        inflation: float = 1.0,
+        relaxation: float = 0.0,
+        rotate: bool = False,
+        tile: int = 4096,
+        ensemble_size: int | None = None,
+        forecast_key: NestedKey = ("forecast", "ensemble"),
+        predicted_key: NestedKey = ("forecast", "observation"),
+        sensor_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        belief_key: str = "belief",
+        info_key: str = "info",
+        noise_key: NestedKey = ("noise", "analysis"),
+    ):
+        super().__init__(
+            nn.Identity(),
+            [forecast_key, predicted_key, sensor_key, noise_variance_key],
+            [(belief_key, name) for name in ("ensemble", "mean", "var")]
+            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
+            optional_keys=[observed_key],
+            noise_key=noise_key,
+        )
+        if isinstance(near, torch.Tensor):
+            near = neighbours_of_taper(near, tile=tile)
+        self.register_buffer("index", near.index, persistent=False)
+        self.register_buffer("taper", near.taper, persistent=False)
+        self.inflation, self.relaxation, self.rotate, self.tile = inflation, relaxation, rotate, tile
+        self.ensemble_size = ensemble_size
+
+    @classmethod
+    def around(
+        cls,
+        states: torch.Tensor,
+        observations: torch.Tensor,
+        radius: float,
+        *,
+        period: torch.Tensor | list[float] | None = None,
+        **kwargs,
+    ) -> LocalEnsembleAnalysis:
+        """From places, with Gaspari & Cohn's taper.
+
+        Args:
+            states: places of the components, ``[S, D]``, in any unit.
+            observations: places of the observations, ``[O, D]``.
+            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii.
+            period: ``[D]``, circumferences of those coordinates that are circles, ``inf`` for the others.
+            **kwargs: passed on to the constructor.
+
+        Raises:
+            ValueError: if the radius is not positive.
+        """
+        period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
+        return cls(neighbours(states, observations, radius, period=period), **kwargs)
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+        """Draws rotations; ``None`` without, or where E is unknown."""
+        if not self.rotate or self.ensemble_size is None:
+            return None
+        return random_rotation(self.ensemble_size, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the belief and the diagnostics."""
+        forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
+        observed = tensordict.get(self.optional_keys[0], None)
+        if observation.ndim == forecast.ndim:
+            observation = observation.mean(-2)
+        near = Neighbours(self.index, self.taper)
+        ensemble = letkf(forecast, predicted, observation, variance, near, observed=observed, tile=self.tile)
+        if self.rotate:
+            rotation = self.read_noise(tensordict)
+            if rotation is None:
+                options = {"device": forecast.device, "dtype": forecast.dtype}
+                rotation = random_rotation(forecast.shape[-2], forecast.shape[:-2], **options)
+            mean = ensemble.mean(-2, keepdim=True)
+            ensemble = mean + rotation @ (ensemble - mean)
+        if self.relaxation:
+            ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
+        if self.inflation != 1.0:
+            mean = ensemble.mean(-2, keepdim=True)
+            factor = torch.where(self._reached(observed, variance), self.inflation, 1.0).to(ensemble.dtype)
+            ensemble = mean + factor.unsqueeze(-2) * (ensemble - mean)
+        if observed is not None:
+            ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
+        diagnostics = _diagnostics(predicted, observation, variance, observed)
+        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics)
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
+        """Whether anything is observed near each component, ``[S]`` or ``[*B, S]``."""
+        near = self.taper > 0
+        if observed is None or observed.shape[-1] < variance.shape[-1]:
+            return near.any(-1)
+        parts = zip(self.index.split(self.tile), near.split(self.tile), strict=True)
+        return torch.cat([(observed[..., index] & part).any(-1) for index, part in parts], -1)
+
+
+def _diagnostics(predicted, observation, variance, observed) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Innovation, its normalised square and its log-likelihood, each observation by itself."""
+    if observed is not None:  # before anything is computed, so that a NaN behind the mask spoils no gradient
+        predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
+        observation, variance = torch.where(observed, observation, 0), torch.where(observed, variance, 1)
+    innovation = observation - predicted.mean(-2)
+    spread = predicted.var(-2) + variance
+    nis, log_spread = innovation.square() / spread, spread.log() + math.log(2 * math.pi)
+    if observed is not None:
+        log_spread = torch.where(observed, log_spread, 0)
+    nis = nis.sum(-1, keepdim=True)
+    return innovation, nis, -0.5 * (nis + log_spread.sum(-1, keepdim=True))
