@@ -10,10 +10,13 @@ from tensordict import NestedKey, TensorDictBase
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 
+#: Bytes of a trunk's results at a time, on a CPU: glibc keeps blocks of this size for the next chunk.
+CPU_TRUNK_MEMORY = 32 * 2**20
 #: Table I: (channels, kernel, stride) of each convolution.
 PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
 
@@ -74,18 +77,26 @@ class _Sensor(SubModel):
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         return measurement
 
+    def _encode(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
+        """Features ``[N, F]`` of measurements ``[N, ...]``, of which ``seen`` ``[N, 1, ...]`` were observed."""
+        measurement = self._prepare(measurement)
+        if seen is not None:
+            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
+            measurement = torch.where(seen, measurement, 0.0)
+        return self.module["trunk"](measurement)
+
+    def _features(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
+        return self._encode(measurement, seen)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the learned observations of every member."""
-        measurement = self._prepare(self.read(tensordict, self.in_keys[0]))
+        measurement = self.read(tensordict, self.in_keys[0])
         batch_ndim = measurement.ndim - self.event_ndim
         batch_size, event_shape = measurement.shape[:batch_ndim], measurement.shape[batch_ndim:]
         observed = tensordict.get(self.optional_keys[0], None)
-        if observed is not None:
-            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
-            seen = observed.any(-1).reshape(*batch_size, *(1,) * self.event_ndim)
-            measurement = torch.where(seen, measurement, 0.0)
+        seen = None if observed is None else observed.any(-1).reshape(-1, *(1,) * self.event_ndim)
         # A trunk takes one batch dimension; the tensordict may have none or many.
-        code = self.module["trunk"](measurement.reshape(-1, *event_shape)).reshape(*batch_size, -1)
+        code = self._features(measurement.reshape(-1, *event_shape), seen).reshape(*batch_size, -1)
         head, noise = self.module["head"], self.read_noise(tensordict)
         if noise is None and head.sample:
             noise = self.draw_noise(batch_size, device=code.device, dtype=code.dtype)
@@ -118,11 +129,19 @@ class ImageSensor(_Sensor):
         out_key: learned observations ``[*B, E, O]``.
         encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
             if anywhere.
+        trunk_memory: bytes that the trunk may take for what it computes on its way; frames beyond that follow in
+            further chunks. ``None``: 32 MiB on a CPU, where larger blocks go back to the system after each use, which
+            costs up to half of the time; no limit elsewhere, nor with a batch norm, which reads all frames of a chunk.
+            While gradients are recorded, all chunks stay in memory, unless ``recompute``.
+        recompute: activation checkpointing: what the trunk computes on its way is not kept for the backward pass
+            but computed again there, chunk by chunk, for a third more time.
+        trunk_dtype: precision of the trunk's layers, ``torch.bfloat16`` for half the memory, and on recent
+            processors half the time; parameters and features keep theirs. ``None``: that of the parameters.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; frames of which nothing is observed are not read.
         noise_key: optional noise (see :class:`StochasticMLP`).
 
     Raises:
-        ValueError: if an image does not have ``image_shape``.
+        ValueError: if an image does not have ``image_shape``, or ``trunk_memory`` is not positive.
 
     Example:
         >>> from tensordict import TensorDict
@@ -148,9 +167,14 @@ class ImageSensor(_Sensor):
         in_key: NestedKey = "pixels",
         out_key: NestedKey = ("sensor", "ensemble"),
         encoding_key: NestedKey | None = None,
+        trunk_memory: int | None = None,
+        recompute: bool = False,
+        trunk_dtype: torch.dtype | None = None,
         observed_key: NestedKey = "observed",
         noise_key: NestedKey = ("noise", "sensor"),
     ):
+        if trunk_memory is not None and trunk_memory <= 0:
+            raise ValueError(f"trunk_memory is in bytes and positive; got {trunk_memory}.")
         trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
         trunk = trunk.to(memory_format=torch.channels_last)  # twice as fast on a CPU, and nothing else changes
         with torch.no_grad():
@@ -160,10 +184,28 @@ class ImageSensor(_Sensor):
             trunk, head, ensemble_size, in_key, out_key, encoding_key, noise_key, loc, scale, 3, observed_key
         )
         self.image_shape = tuple(image_shape)
+        self.trunk_memory, self.recompute, self.trunk_dtype = trunk_memory, recompute, trunk_dtype
+        self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
         for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
             channels = torch.as_tensor(default if value is None else value, dtype=torch.get_default_dtype())
             self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
+
+    def _frames_at_once(self, device: torch.device) -> int | None:
+        memory = self.trunk_memory
+        if memory is None:
+            if device.type != "cpu" or couples_frames(self.module["trunk"]):
+                return None
+            memory = CPU_TRUNK_MEMORY
+        return max(memory // self._frame_bytes, 1)
+
+    def _encode(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
+        with reduced_precision(self.trunk_dtype, measurement.device):
+            return super()._encode(measurement, seen).to(self.loc.dtype)
+
+    def _features(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
+        at_once = self._frames_at_once(measurement.device)
+        return in_chunks(self._encode, measurement, seen, at_once=at_once, recompute=self.recompute)
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         if tuple(measurement.shape[-3:]) != self.image_shape:

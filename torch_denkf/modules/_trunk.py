@@ -1,0 +1,89 @@
+"""Runs an image trunk within a memory budget: frames in chunks, activations computed twice, half the bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.checkpoint import checkpoint
+
+__all__ = ["activation_bytes", "couples_frames", "in_chunks", "reduced_precision"]
+
+
+class _Allocations(TorchDispatchMode):
+    """Adds up the bytes of all storages that operations return anew."""
+
+    def __init__(self):
+        super().__init__()
+        self.bytes = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        tensors = (leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor))
+        known = {tensor.untyped_storage().data_ptr() for tensor in tensors}
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, Tensor) and tensor.untyped_storage().data_ptr() not in known:
+                self.bytes += tensor.untyped_storage().nbytes()
+        return out
+
+
+def activation_bytes(trunk: nn.Module, frame: Tensor) -> int:
+    """Returns the bytes of all that ``trunk`` computes on its way from ``frame``, ``[1, *event]``.
+
+    Example:
+        >>> activation_bytes(nn.Sequential(nn.Flatten(), nn.ReLU()), torch.zeros(1, 2, 3, dtype=torch.float32))
+        24
+    """
+    with torch.no_grad(), _Allocations() as seen:
+        trunk(frame)
+    return seen.bytes
+
+
+def couples_frames(trunk: nn.Module) -> bool:
+    """Returns whether a batch norm makes a frame's features depend on what else is in its chunk."""
+    return any(isinstance(module, _BatchNorm) for module in trunk.modules())
+
+
+def reduced_precision(dtype: torch.dtype | None, device: torch.device) -> AbstractContextManager:
+    """Autocast to ``dtype``; nothing for ``None``."""
+    return nullcontext() if dtype is None else torch.autocast(device.type, dtype)
+
+
+def in_chunks(
+    encode: Callable[..., Tensor], frames: Tensor, seen: Tensor | None, *, at_once: int | None, recompute: bool
+) -> Tensor:
+    """Encodes frames some at a time.
+
+    Args:
+        encode: from frames ``[M, *event]`` and their mask ``[M, ...]`` (or ``None``) to features ``[M, F]``.
+        frames: ``[N, *event]``.
+        seen: mask ``[N, ...]`` or ``None``.
+        at_once: the largest M; ``None`` for all.
+        recompute: whether to keep a chunk's input alone for the backward pass, and to compute the rest again there
+            (activation checkpointing).
+
+    Returns:
+        Features ``[N, F]``.
+
+    Example:
+        >>> def encode(frames, seen):
+        ...     return frames.flatten(1) * len(frames)
+        >>> in_chunks(encode, torch.ones(5, 1), None, at_once=2, recompute=False).flatten().tolist()
+        [2.0, 2.0, 2.0, 2.0, 1.0]
+    """
+    if recompute and torch.is_grad_enabled():
+
+        def run(part: Tensor, mask: Tensor | None) -> Tensor:
+            return checkpoint(encode, part, mask, use_reentrant=False)
+    else:
+        run = encode
+    count = len(frames)
+    if at_once is None or count <= at_once:
+        return run(frames, seen)
+    masks = [None] * -(-count // at_once) if seen is None else seen.split(at_once)
+    return torch.cat([run(part, mask) for part, mask in zip(frames.split(at_once), masks, strict=True)])
