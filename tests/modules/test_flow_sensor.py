@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tests.vision.drives_for_tests import rendered_motion
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import FlowSensor, deterministic
-from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
+from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
 
 cv2.setNumThreads(1)
 DT = 0.1
@@ -34,6 +34,23 @@ def known_frame(pitch, distance, turn):
     return TensorDict({"flow": flow, "road": road})
 
 
+def known_travel(pitch, length=0.1):
+    """The flow of a camera that looks up by ``pitch`` from where it travels: away from a focus, near things faster."""
+    rows, columns = ((torch.arange(n) + 0.5) / n * 2 - 1 for n in (25, 79))
+    down, right = torch.meshgrid(rows * 0.2708 - pitch, columns * 0.8625, indexing="ij")
+    return torch.stack([right, down, torch.zeros(25, 79)]) * length * torch.rand(25, 79)
+
+
+def only_the_road(sensor):
+    """Neither the direction of travel nor the turn that comes with it counts; nor does any network."""
+    trunk = sensor.module["trunk"]
+    silence(trunk.road, trunk.gate, sensor.module["head"])
+    with torch.no_grad():
+        trunk.log_pitch_std.fill_(20.0)
+        trunk.gate.bias.fill_(-40.0)
+    return sensor
+
+
 def silence(*modules):
     with torch.no_grad():
         for module in modules:
@@ -43,52 +60,58 @@ def silence(*modules):
 
 @pytest.mark.parametrize(("pitch", "distance", "turn"), [(0.01, 1.5, 0.03), (-0.04, -0.15, -0.01), (-0.005, 0.0, 0.0)])
 def test_geometry_reads_a_known_frame(float64, pitch, distance, turn):
-    sensor = make()
-    trunk, head = sensor.module["trunk"], sensor.module["head"]
-    silence(trunk.road, trunk.pitch, head)
+    sensor = only_the_road(make())
     out = sensor(known_frame(pitch, distance, turn))
     # The peak's share: e^(e^3) = 5e8 against the 896 other cells, which lie at most 3.4 m away.
     share = 896 / np.exp(np.exp(3.0))
     expected = torch.tensor([distance, turn]) / DT
     torch.testing.assert_close(out["sensor", "ensemble"], expected.expand(5, 2), rtol=0, atol=3.4 * share / DT)
-    spread, angle, certain, turned = out["sensor", "encoding"][-4:].tolist()
+    spread, angle, certain, turned, *_ = out["sensor", "encoding"][-7:].tolist()
     assert spread == pytest.approx(1e-3 / 0.2, rel=3.4**2 * share / 1e-6)  # the root of the floor of its square
-    assert angle == pytest.approx(pitch / 0.02, abs=1e-5)
+    assert angle == pytest.approx(pitch / 0.005, abs=1e-4)
     assert certain == pytest.approx((1 - 0.9) / 0.2)
     assert turned == pytest.approx(turn / 0.02)
 
 
 def test_doubt_between_two_distances(float64):
-    """Two equal peaks: their mean, and half their difference as the spread."""
-    sensor = make(layer="none")
-    trunk, head = sensor.module["trunk"], sensor.module["head"]
-    silence(trunk.road, trunk.pitch, head)
+    """Two equal peaks: their mean, and half their difference as the spread; the direction of travel decides."""
+    sensor = only_the_road(make(layer="none"))
+    trunk = sensor.module["trunk"]
     frame = known_frame(0.01, 1.0, 0.0)
     frame["road"][4, np.abs(ROAD_SHIFTS - 2.0).argmin()] = 1.0
     out = sensor(frame)
     assert out["sensor", "ensemble"][0, 0].item() == pytest.approx(1.5 / DT, abs=1e-4)
-    assert out["sensor", "encoding"][-4].item() == pytest.approx((0.25 + 1e-6) ** 0.5 / 0.2, abs=1e-4)
-    assert out["sensor", "encoding"][-3].item() == pytest.approx((0.01 + ROAD_PITCHES[4]) / 2 / 0.02, abs=1e-5)
-    # The flow's preference for a pitch decides: 20 more nats for the row of 0.01.
+    assert out["sensor", "encoding"][-7].item() == pytest.approx((0.25 + 1e-6) ** 0.5 / 0.2, abs=1e-4)
+    assert out["sensor", "encoding"][-6].item() == pytest.approx((0.01 + ROAD_PITCHES[4]) / 2 / 0.005, abs=1e-5)
     with torch.no_grad():
-        trunk.pitch.bias[np.abs(ROAD_PITCHES - 0.01).argmin()] = 20.0
-    assert sensor(frame)["sensor", "ensemble"][0, 0].item() == pytest.approx(1.0 / DT, abs=1e-4)
+        trunk.log_pitch_std.fill_(0.0)
+    for pitch, distance in ((0.01, 1.0), (ROAD_PITCHES[4], 2.0)):
+        frame["flow"] = known_travel(pitch)
+        # The other row is 6 of the 0.005 rad away: 18 nats.
+        assert sensor(frame)["sensor", "ensemble"][0, 0].item() == pytest.approx(distance / DT, abs=1e-2)
 
 
-def test_turn_is_the_median_flow_ahead():
-    sensor, motion = make(layer="none"), rendered_motion("road9")
-    silence(sensor.module["head"])
-    turned = sensor(motion.select("flow", "road"))["sensor", "ensemble"][:, 0, 1].detach().numpy() * DT
-    flow = motion["flow"].float().numpy()
+def test_turn_is_the_median_flow_ahead_or_that_of_the_fit():
+    sensor, motion = only_the_road(make(layer="none")), rendered_motion("road9")
+
+    def turn(motion):
+        return sensor(motion.select("flow", "road"))["sensor", "ensemble"][:, 0, 1].detach().numpy() * DT
+
+    turned, flow = turn(motion), motion["flow"].float().numpy()
     # Rows from 33 to 50 % of the height and as many columns to both sides of the middle one.
     expected = np.median(flow[:, 0, 8:12, 29:50].reshape(len(flow), -1), axis=1)
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-7)
     mirrored = motion.select("flow", "road").clone()
     mirrored["flow"] = mirrored["flow"].flip(-1)
     mirrored["flow"][:, 0] *= -1
-    again = sensor(mirrored)["sensor", "ensemble"][:, 0, 1].detach().numpy() * DT
-    np.testing.assert_allclose(again, -turned, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(turn(mirrored), -turned, rtol=0, atol=1e-7)
     assert np.abs(turned).max() > 0.03
+    with torch.no_grad():
+        sensor.module["trunk"].gate.bias.fill_(40.0)
+    fitted = focus_of_expansion(motion["flow"]).turn[:, 0].numpy()
+    np.testing.assert_allclose(turn(motion), fitted, rtol=0, atol=1e-7)
+    truth = motion["state"][:, 4].numpy() * 0.103
+    assert np.abs(fitted - truth).mean() < np.abs(turned - truth).mean(), "and closer to the truth"
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -238,7 +261,7 @@ def test_keys_can_be_renamed():
 def test_mirrored_drives_turn_the_other_way():
     """The reading before any correction: v stays as it is, and the turn changes its sign."""
     sensor, motion = make(layer="none"), rendered_motion("road9").select("flow", "road")
-    silence(sensor.module["head"], sensor.module["trunk"].pitch)
+    only_the_road(sensor)
     mirrored = motion.clone()
     mirrored["flow"] = motion["flow"].flip(-1) * torch.tensor([-1.0, 1.0, 1.0]).reshape(3, 1, 1)
     out, other = (sensor(frames)["sensor", "ensemble"][:, 0] for frames in (motion, mirrored))

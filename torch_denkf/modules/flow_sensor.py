@@ -11,19 +11,22 @@ from torch import nn
 
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
+from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
 
 __all__ = ["FlowSensor"]
 
 _FLOW_UNIT, _TURN_UNIT = 0.1, 0.02  # tangents and rad a frame: about a standard deviation on KITTI
 _ROAD_LOC, _ROAD_SCALE = 0.9, 0.2  # where correlations of the road lie
+_PITCH_UNIT = 0.005  # rad: about the error of the direction of travel
 
 
 class _MotionTrunk(nn.Module):
     """Distance and turn between two frames by geometry, and features that say how to correct them.
 
     The road's correlations become a distribution over pitch and distance, by a small convolutional network that may
-    look at the neighbours of each and by a preference for pitches that comes from the flow.
+    look at the neighbours of each and by the direction of travel: the road lies along it, so it tells the camera's pitch,
+    which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a network
+    trusts that more, as on an empty motorway.
     """
 
     def __init__(self, features: int, dropout: float):
@@ -46,38 +49,46 @@ class _MotionTrunk(nn.Module):
         self.road = nn.Sequential(
             nn.Conv2d(3, 16, 3, 1, 1), nn.ReLU(), nn.Conv2d(16, 16, 3, 1, 1), nn.ReLU(), nn.Conv2d(16, 1, 3, 1, 1)
         )
-        self.pitch = nn.Linear(features, pitches)
+        self.gate = nn.Linear(features + 2, 1)
+        self.pitch_offset = nn.Parameter(torch.tensor(0.0))  # in _PITCH_UNIT
+        self.log_pitch_std = nn.Parameter(torch.tensor(0.0))
         self.log_sharpness = nn.Parameter(torch.tensor(3.0))
         self.register_buffer("distances", torch.as_tensor(ROAD_SHIFTS, dtype=dtype))
-        self.register_buffer("pitches", torch.as_tensor(ROAD_PITCHES / ROAD_PITCHES.max(), dtype=dtype))
+        self.register_buffer("pitches", torch.as_tensor(ROAD_PITCHES / _PITCH_UNIT, dtype=dtype))
         self.register_buffer("flow_grid", _grid(height, width))
         self.register_buffer("road_grid", _grid(pitches, shifts))
-        self.out_features = features + 4
+        self.out_features = features + 7
 
     def forward(self, flow: torch.Tensor, road: torch.Tensor):
-        count = len(flow)
-        turned = _median_turn(flow)
+        count, expansion = len(flow), focus_of_expansion(flow)
+        pitch, pitch_std = expansion.focus[:, 1] / _PITCH_UNIT, expansion.focus_std[:, 1] / _PITCH_UNIT
         scaled = torch.cat([flow[:, :2] / _FLOW_UNIT, flow[:, 2:]], 1)
         code = self.flow(torch.cat([scaled, self.flow_grid.expand(count, -1, -1, -1)], 1))
         table = ((road - _ROAD_LOC) / _ROAD_SCALE).unsqueeze(1)
         score = self.road(torch.cat([table, self.road_grid.expand(count, -1, -1, -1)], 1)).squeeze(1)
-        score = score + self.log_sharpness.exp() * road + self.pitch(code).unsqueeze(-1)
+        off = (self.pitches - (pitch + self.pitch_offset).unsqueeze(-1)) / self.log_pitch_std.exp()
+        score = score + self.log_sharpness.exp() * road - (off**2 / 2).unsqueeze(-1)
         belief = score.flatten(1).softmax(1).view_as(score)
-        of_distance, of_pitch = belief.sum(1), belief.sum(2)
+        of_distance, of_pitch = belief.sum(1), belief.sum(2) @ self.pitches
         moved = of_distance @ self.distances
         spread = ((of_distance @ self.distances**2 - moved**2).clamp_min(0) + 1e-6).sqrt()
-        facts = [spread / 0.2, of_pitch @ self.pitches, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE]
-        facts = torch.stack([*facts, turned / _TURN_UNIT], 1)
-        return moved, turned, torch.cat([code, facts], 1)
+        ahead, fitted, turn_std = _median_turn(flow), expansion.turn[:, 0], expansion.turn_std[:, 0]
+        doubt = [(turn_std / _TURN_UNIT).log(), pitch_std.log()]
+        trust = self.gate(torch.cat([code, torch.stack(doubt, 1)], 1)).squeeze(-1).sigmoid()
+        turned = torch.lerp(ahead, fitted, trust)
+        facts = [spread / 0.2, of_pitch, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE, turned / _TURN_UNIT]
+        facts += [of_pitch - pitch, *doubt]
+        return moved, turned, torch.cat([code, torch.stack(facts, 1)], 1)
 
 
 class FlowSensor(SubModel):
     """Speed and turn rate of a car from optical flow and the road's correlation, for each ensemble member.
 
-    Geometry gives a first reading: the distance at which the road of two frames agrees (over the camera's pitch,
-    which is unknown), and the median flow far ahead for the turn. A small network weighs the distances, and a
-    stochastic head corrects both readings for each member. What it reads is in angles and metres, so that one sensor
-    serves cameras with other intrinsics and resolutions, and what it learned on rendered drives holds on real ones.
+    Geometry gives a first reading: the distance at which the road of two frames agrees, for the camera's pitch that the
+    flow's focus of expansion tells, and the turn that the same fit gives, or the median flow far ahead. A small network
+    weighs the distances, and a stochastic head corrects both readings for each member. What it reads is in angles and
+    metres, so that one sensor serves cameras with other intrinsics and resolutions, and what it learned on rendered
+    drives holds on real ones.
 
     Args:
         dt: time between frames in s.
@@ -100,7 +111,7 @@ class FlowSensor(SubModel):
 
     Source:
         The paper's sensor (section III, eq. 8) with another trunk; the plane of the road as in Geiger, Ziegler &
-        Stiller 2011, "StereoScan", for monocular scale.
+        Stiller 2011, "StereoScan", for monocular scale; :func:`torch_denkf.vision.focus_of_expansion`.
 
     Example:
         >>> from tensordict import TensorDict
