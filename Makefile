@@ -1,10 +1,10 @@
-# Two commands: `make demo` (watch it work) and `make test` (everything CI runs).
+# `make demo` (watch it work), `make test` (everything CI runs), `make bench` (speed, beside its peers).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint layers unit smoke clean
+.PHONY: demo test lint layers unit smoke bench clean
 
 demo: $(STAMP)
 	$(BIN)/python examples/quickstart.py --out runs/quickstart
@@ -30,6 +30,14 @@ unit: $(STAMP)
 
 smoke: $(STAMP)
 	for example in examples/*.py; do echo "== $$example --smoke" && $(BIN)/python $$example --smoke || exit 1; done
+
+# Python 3.11 or later: jax. Ratios hold on a busy machine, absolute times do not.
+bench: $(VENV)/.bench
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed
+
+$(VENV)/.bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[bench]"
+	touch $@
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info runs

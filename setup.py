@@ -29,6 +29,15 @@ setup(
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
         "lerobot": ["pyarrow>=15", "av>=14"],
         "examples": ["tqdm", "matplotlib", "tensorboard"],
+        # The peers of `make bench`, in the versions that benchmarks/results/speed.md was made with.
+        "bench": [
+            "matplotlib",
+            "filterpy==2.0.0",
+            "dapper==1.7.1",
+            'cuthbert==0.1.1; python_version >= "3.11"',
+            'dynamax==1.0.3; python_version >= "3.11"',
+            'jax==0.10.2; python_version >= "3.11"',
+        ],
         "test": [
             "evo",
             "pyarrow>=15",

@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
+from torch_denkf.functional.random_bits import (
+    dropout_factor,
+    random_bytes,
+    random_keep_mask,
+    random_signs,
+    representable_rate,
+)
 
 
 def binomial_bound(n, p):
@@ -62,3 +68,20 @@ def test_generator_repeats_and_leaves_the_global_one_alone():
 def test_signs_are_fair():
     n = 400_000
     assert abs(random_signs((n,)).sum() - n / 2) < binomial_bound(n, 0.5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_dropout_factor_of_every_byte_at_every_rate(dtype):
+    draws = torch.arange(256, dtype=torch.uint8)
+    for numerator in range(256):
+        rate = numerator / 256
+        kept = torch.tensor(1 / (1 - rate), dtype=dtype)  # exactly this, and exactly zero
+        expected = torch.where(torch.arange(256) >= numerator, kept, 0)
+        assert dropout_factor(draws, rate, dtype).equal(expected), rate
+        assert dropout_factor(torch.arange(256) >= numerator, rate, dtype).equal(expected), rate
+
+
+def test_masks_are_the_bytes_at_or_above_the_threshold():
+    draws = random_bytes((1001,), generator=torch.Generator().manual_seed(4))
+    mask = random_keep_mask((1001,), 0.1, generator=torch.Generator().manual_seed(4))
+    assert mask.equal(draws.int() >= 26)

@@ -11,7 +11,13 @@ from torch_denkf.functional.moments import (
     ensemble_mean,
     ensemble_var,
 )
-from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
+from torch_denkf.functional.random_bits import (
+    dropout_factor,
+    random_bytes,
+    random_keep_mask,
+    random_signs,
+    representable_rate,
+)
 from torch_denkf.functional.resampling import effective_sample_size, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
 from torch_denkf.functional.transport import transport_resample
@@ -51,6 +57,8 @@ __all__ = [
     "crps_ensemble",
     "crps_gaussian",
     "energy_score",
+    "dropout_factor",
+    "random_bytes",
     "random_keep_mask",
     "random_signs",
     "representable_rate",

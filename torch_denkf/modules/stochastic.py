@@ -24,7 +24,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.nn import functional as F
 
-from torch_denkf.functional.random_bits import random_keep_mask, random_signs, representable_rate
+from torch_denkf.functional.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
@@ -107,8 +107,9 @@ class StochasticMLP(nn.Module):
             identity, zero starts it there.
 
     Shapes:
-        input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, a boolean keep mask
-        ``[*, noise_size]``; for flipout, a TensorDict of ``signs`` bool ``[*, noise_size]`` and ``perturbation``
+        input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
+        ``[*, noise_size]``, units are kept where they are at least ``256 * rate``, or a boolean mask of the units to
+        keep; for flipout, a TensorDict of ``signs`` bool ``[*, noise_size]`` and ``perturbation``
         ``[*, P]``, one draw a call, expanded over the batch.
 
     Raises:
@@ -176,13 +177,13 @@ class StochasticMLP(nn.Module):
             generator: source of randomness; torch's global one by default.
 
         Returns:
-            See the class: a mask, a TensorDict, or ``None`` for a deterministic network.
+            See the class: bytes, a TensorDict, or ``None`` for a deterministic network.
         """
         rows = (*batch_size, *members, self.noise_size)
         if not self.noise_size:
             return None
         if self.layer == "dropout":
-            return random_keep_mask(rows, self.rate, device=device, generator=generator)
+            return random_bytes(rows, device=device, generator=generator)
         size = sum(layer.perturbation_size for layer in self.layers)
         # One draw of the weights' perturbation for the call: the expanded batch dimensions take no memory.
         perturbation = torch.randn(size, device=device, dtype=dtype, generator=generator).expand(*batch_size, size)
@@ -211,8 +212,8 @@ class StochasticMLP(nn.Module):
                 hidden = hidden * factor
         return run[-1][0](hidden), hidden
 
-    def _dropout(self, keep: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:
-        factors = (keep.to(dtype) * (1 / (1 - self.rate))).split(self.noise_splits, -1)
+    def _dropout(self, draws: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:
+        factors = dropout_factor(draws, self.rate, dtype).split(self.noise_splits, -1)
         return list(zip(self.layers, (*factors, None), strict=True))
 
     def _flipout(self, noise: TensorDictBase | None, sample: bool) -> list[tuple[Callable, None]]:

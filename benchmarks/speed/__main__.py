@@ -1,0 +1,117 @@
+"""Runs every pair in a process of its own, one after the other, and writes the report.
+
+python -m benchmarks.speed                      # all pairs: benchmarks/results/speed.{md,json}, docs/speed.png
+python -m benchmarks.speed --only against_textbook packaged_step
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+#: Of this package: one file a peer, with rows(seconds) -> list[Row].
+PAIRS = (
+    "tensordict_cost",
+    "against_textbook",
+    "against_cuthbert",
+    "against_dynamax",
+    "against_filterpy",
+    "against_dapper",
+    "against_floor",
+    "packaged_step",
+)
+#: Scripts of benchmarks/ with ratios() -> list[dict].
+SCRIPTS = ("training_step", "transform_cost", "scaling")
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+LIMIT_S = 1500  # for a pair
+
+
+def in_this_process(name: str, seconds: float, out: Path) -> None:
+    """Runs one pair and writes its rows."""
+    import torch
+
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    if name == "machine":
+        from benchmarks.speed.machine import measure
+
+        result = measure()
+    elif name in SCRIPTS:
+        sys.path.insert(0, str(ROOT / "benchmarks"))
+        result = importlib.import_module(name).ratios()
+    else:
+        result = [row.as_dict() for row in importlib.import_module(f"benchmarks.speed.{name}").rows(seconds)]
+    out.write_text(json.dumps(result))
+
+
+def in_own_process(name: str, seconds: float) -> list[dict] | dict:
+    """Runs one pair in a fresh process; where it fails, a row without a ratio says why."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "rows.json"
+        command = [sys.executable, "-m", "benchmarks.speed", "--pair", name, str(out), "--seconds", str(seconds)]
+        process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **ONE_THREAD},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            _, errors = process.communicate(timeout=LIMIT_S)
+        except BaseException as error:  # also Ctrl-C: compilers and workers must not outlive us
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            errors = f"no result after {LIMIT_S} s"
+        if out.exists():
+            return json.loads(out.read_text())
+    reason = next((line for line in reversed(errors.strip().splitlines()) if line.strip()), "no message")
+    return [{"name": name.replace("_", " "), "ratio": None, "target": None, "note": f"not run: {reason.strip()}"}]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=12.0, help="to spend on each comparison (default: 12)")
+    parser.add_argument("--only", nargs="+", default=[*PAIRS, *SCRIPTS], help="run these pairs, keep other rows")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
+    parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "speed.png")
+    parser.add_argument("--pair", nargs=2, metavar=("NAME", "JSON"), help="run one pair in this process")
+    args = parser.parse_args()
+    if args.pair:
+        in_this_process(args.pair[0], args.seconds, Path(args.pair[1]))
+        return
+    from benchmarks.speed.report import number, write
+
+    begun = time.perf_counter()
+    machine = in_own_process("machine", args.seconds)
+    rows: list[dict] = []
+    names = [n for n in args.only if n in PAIRS or (n in SCRIPTS and (ROOT / "benchmarks" / f"{n}.py").exists())]
+    for name in names:
+        print(f"{name} ...", flush=True)
+        for row in in_own_process(name, args.seconds):
+            row["pair"] = name
+            rows.append(row)
+            print(f"  {row['name']}: {number(row['ratio']) or row.get('note')} (target {number(row.get('target'))})")
+    known = args.out / "speed.json"
+    if known.exists():  # rows of pairs that were not run again stay
+        old = [row for row in json.loads(known.read_text()) if row.get("pair") not in names]
+        order = [*PAIRS, *SCRIPTS]
+        rows = sorted(old + rows, key=lambda row: order.index(row["pair"]) if row["pair"] in order else len(order))
+    command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
+    write(rows, machine, command, time.perf_counter() - begun, args.out, args.plot)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""What the machine can do, measured in the same run: matrix peak and memory bandwidth of one thread."""
+
+from __future__ import annotations
+
+import platform
+import time
+from pathlib import Path
+
+import torch
+
+
+def matrix_product(size: int = 768):
+    """A product of two square float32 matrices, and the number of its floating-point operations."""
+    left, right, out = torch.randn(size, size), torch.randn(size, size), torch.empty(size, size)
+    return lambda: torch.mm(left, right, out=out), 2 * size**3
+
+
+def best(call, repeats: int = 40) -> float:
+    """The least processor time of a call, in s."""
+    times = []
+    for _ in range(repeats):
+        begun = time.process_time()
+        call()
+        times.append(time.process_time() - begun)
+    return min(times)
+
+
+def measure() -> dict:
+    """Peak in GFLOP/s (float32, one thread), bandwidth in GB/s (read and write of a copy), and what was run on.
+
+    Both are the best of 40, in processor time.
+    """
+    torch.set_num_threads(1)
+    product, operations = matrix_product()
+    source = torch.randn(2**24)
+    target = torch.empty_like(source)
+    return {
+        "processor": processor(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "peak_gflops": operations / best(product) / 1e9,
+        "bandwidth_gb_s": 2 * source.nbytes / best(lambda: target.copy_(source)) / 1e9,
+    }
+
+
+def processor() -> str:
+    """The processor's name."""
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else []:
+        if line.startswith("model name"):
+            return line.split(":")[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,75 @@
+"""Candidates made of this library: a filter on tensordicts, the same functions without tensordicts, and a sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.speed.workload import MEMBERS, STEPS, make_frames, start
+from torch_denkf.filters import DEnKF
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+
+
+def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
+    """The filter's step as plain functions of tensors: the same networks, noise in bulk, analysis and moments.
+
+    Returns:
+        A function of members ``[*B, E, S]`` and the sensor's samples ``[*B, E, O]`` or reading ``[*B, O]``, to all
+        that the filter writes: noise, forecast, predicted observation, members, mean, variance, diagnostics.
+    """
+    network, observe, noise = (filter[name].module for name in ("transition", "observation", "noise"))
+    variance, floor, scheme = filter["noise"].variance, filter["noise"].floor, filter["analysis"].scheme
+
+    def step(ensemble: Tensor, samples: Tensor) -> tuple[Tensor, ...]:
+        reading = samples.mean(-2) if samples.ndim == ensemble.ndim else samples
+        r = variance * (1 + noise(reading)) ** 2 + floor
+        draws = network.draw_noise(ensemble.shape[:-2], MEMBERS)
+        forecast = ensemble + network(ensemble, draws)
+        predicted = observe(forecast)
+        members, *diagnostics = analyse(forecast, predicted, samples, r, scheme=scheme)
+        return r, forecast, predicted, members, ensemble_mean(members), ensemble_var(members), *diagnostics
+
+    return step
+
+
+def functional_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
+    """A step a call on plain tensors, each from the members of the last."""
+    step, samples = functional_step(filter), make_frames(batch, 1).get(("sensor", "ensemble"))[:, 0]
+    state = [start(filter, batch)]
+
+    def call() -> Tensor:
+        with torch.no_grad():
+            state[0] = step(state[0], samples)[3]
+        return state[0]
+
+    return call
+
+
+def tensordict_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
+    """A step a call on one tensordict, each from the belief of the last."""
+    row = make_frames(batch, 1)[:, 0].set(("belief", "ensemble"), start(filter, batch))
+
+    def call() -> Tensor:
+        with torch.no_grad():
+            filter.step(row)
+        return row
+
+    return call
+
+
+def sequence(filter: DEnKF, batch: int, *, samples: bool = True, backward: bool = False) -> Callable[[], Tensor]:
+    """A whole sequence of STEPS steps a call, one frame more because the first is where it starts."""
+    frames = make_frames(batch, STEPS + 1, samples=samples)
+    parameters = list(filter.parameters())
+
+    def call() -> Tensor:
+        with torch.set_grad_enabled(backward):
+            out = filter.sequence(frames.copy())
+            mean = out.get(("belief", "mean"))
+        if backward:
+            torch.autograd.grad(mean.square().sum(), parameters)
+        return mean
+
+    return call

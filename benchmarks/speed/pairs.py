@@ -1,0 +1,105 @@
+"""Timing of candidates side by side: short interleaved rounds in one process, and the median of the rounds' ratios.
+
+A round times every candidate once, so that what slows the machine for a while slows all of them; which one goes first
+changes from round to round. What is timed is the processor time of the process, all its threads together: other jobs
+on the same cores do not count, and a peer that spreads over two threads pays for both.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from statistics import median
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        name: what is compared, with its size.
+        ratio: ours over theirs; below 1 ours is faster.
+        target: the ratio must not exceed it; ``None`` where there is none to meet.
+        aim: the ratio hoped for.
+        ours_us: microseconds of processor time that ours takes, a step unless the name says otherwise.
+        theirs_us: the same of the other.
+        note: what differs between the two, in a line.
+    """
+
+    name: str
+    ratio: float | None
+    target: float | None = None
+    aim: float | None = None
+    ours_us: float | None = None
+    theirs_us: float | None = None
+    note: str = ""
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the target is met; ``None`` without a target or a measurement."""
+        return None if self.target is None or self.ratio is None else self.ratio <= self.target
+
+    def as_dict(self) -> dict:
+        """What is written to JSON."""
+        return {**asdict(self), "met": self.met}
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds of processor time a call, for each candidate one number a round."""
+
+    rounds: dict[str, list[float]]
+
+    def micro(self, name: str, per: int = 1) -> float:
+        """Median microseconds of a candidate; ``per`` is the number of steps in a call."""
+        return 1e6 * median(self.rounds[name]) / per
+
+    def ratio(self, ours: str, theirs: str) -> float:
+        """Median over the rounds of ours over theirs."""
+        pairs = zip(self.rounds[ours], self.rounds[theirs], strict=True)
+        return median(ours_time / theirs_time for ours_time, theirs_time in pairs)
+
+    def row(self, name: str, ours: str, theirs: str, *, per: int = 1, **fields) -> Row:
+        """The table's line for two of the candidates."""
+        times = {"ours_us": self.micro(ours, per), "theirs_us": self.micro(theirs, per)}
+        return Row(name, self.ratio(ours, theirs), **times, **fields)
+
+
+def interleave(
+    candidates: Mapping[str, Callable[[], object]], *, seconds: float = 8.0, shortest: float = 2e-3, rounds: int = 15
+) -> Timings:
+    """Times ``candidates`` in turn.
+
+    Args:
+        candidates: functions without arguments, by name; each is called a few times beforehand.
+        seconds: wall-clock time to spend; at least ``rounds`` rounds are made all the same.
+        shortest: a measurement repeats a call until it takes this long, in s.
+        rounds: the fewest rounds.
+    """
+    numbers = {}
+    for name, call in candidates.items():
+        for _ in range(3):
+            call()
+        begun = time.process_time()
+        call()
+        numbers[name] = max(1, int(shortest / max(time.process_time() - begun, 1e-7)))
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    names, end, done = list(candidates), time.perf_counter() + seconds, 0
+    gc.collect()
+    gc.disable()
+    try:
+        while done < rounds or time.perf_counter() < end:
+            for name in names[done % len(names) :] + names[: done % len(names)]:
+                call = candidates[name]
+                begun = time.process_time()
+                for _ in range(numbers[name]):
+                    call()
+                times[name].append((time.process_time() - begun) / numbers[name])
+            done += 1
+            if done % 20 == 0:  # autograd leaves cycles behind
+                gc.collect()
+    finally:
+        gc.enable()
+    return Timings(times)

@@ -1,0 +1,71 @@
+"""The table as Markdown, JSON and a picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A ratio or a time, short; empty where there is none."""
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.{digits}f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> str:
+    """The page that is committed."""
+    lines = [
+        "# Speed, side by side",
+        "",
+        f"`{command}`: {seconds / 60:.0f} min on {machine['processor']}, one thread, torch {machine['torch']}, Python",
+        f"{machine['python']}. Measured in the same run: matrix peak {machine['peak_gflops']:.0f} GFLOP/s (float32),",
+        f"bandwidth {machine['bandwidth_gb_s']:.0f} GB/s. Ratios: ours over theirs, below 1 ours is faster; the median",
+        "over interleaved rounds in one process. Times: processor time of a step (S=5, O=2, E=32, Table I without the",
+        "image sensor) unless the row says otherwise.",
+        "",
+        "| what | ratio | target | aim | met | ours, us | theirs, us | what differs |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        met = {True: "yes", False: "**no**", None: ""}[row.get("met")]
+        ratio = number(row["ratio"]) or "not measured"
+        limits = [number(row.get("target")), number(row.get("aim"))]
+        times = [number(row.get("ours_us"), 1), number(row.get("theirs_us"), 1)]
+        lines.append("| " + " | ".join([row["name"], ratio, *limits, met, *times, row.get("note", "")]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def picture(rows: list[dict], path: Path) -> None:
+    """Ratios as bars on a logarithmic axis, with a mark at each target."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rows = [row for row in rows if row["ratio"]][::-1]
+    figure, axes = plt.subplots(figsize=(9, 0.9 + 0.3 * len(rows)))
+    colours = [{True: "tab:green", False: "tab:red"}.get(row.get("met"), "tab:gray") for row in rows]
+    axes.barh(range(len(rows)), [row["ratio"] for row in rows], color=colours, height=0.65)
+    for place, row in enumerate(rows):
+        if row.get("target"):
+            axes.plot([row["target"]] * 2, [place - 0.42, place + 0.42], color="black", linewidth=2)
+        axes.text(row["ratio"] * 1.04, place, number(row["ratio"]), va="center", fontsize=8)
+    axes.axvline(1.0, color="gray", linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
+    axes.set_xlabel("ours / theirs (black: target; green: met)")
+    axes.margins(x=0.12, y=0.01)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def write(rows: list[dict], machine: dict, command: str, seconds: float, results: Path, plot: Path) -> None:
+    """Writes speed.json, speed.md and the picture."""
+    results.mkdir(parents=True, exist_ok=True)
+    (results / "speed.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (results / "speed_machine.json").write_text(json.dumps(machine, indent=1) + "\n")
+    (results / "speed.md").write_text(markdown(rows, machine, command, seconds))
+    picture(rows, plot)

@@ -1,0 +1,41 @@
+"""The filter on a tensordict against its own functional step, where pandas is not installed.
+
+tensordict looks for pandas on some writes, which costs most where there is none: here the search never finds it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+from benchmarks.speed.ours import functional_loop, tensordict_loop
+from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.workload import make_filter
+
+NOTE = "one step each, eager; both draw their noise and compute all outputs; pandas hidden"
+
+
+def without_pandas() -> None:
+    """Makes every search for pandas fail, after looking for a name that is not there either."""
+    search = importlib.util.find_spec
+
+    def find_spec(name: str, package: str | None = None):
+        return search("pandas_that_is_not_installed" if name == "pandas" else name, package)
+
+    importlib.util.find_spec = find_spec
+
+
+def rows(seconds: float) -> list[Row]:
+    without_pandas()
+    out = []
+    for batch, target in ((1, 1.15), (64, 1.05)):
+        filter = make_filter()
+        timings = interleave(
+            {"tensordict": tensordict_loop(filter, batch), "functional": functional_loop(filter, batch)},
+            seconds=seconds,
+        )
+        out.append(
+            timings.row(
+                f"step on a tensordict / its functions, B={batch}", "tensordict", "functional", target=target, note=NOTE
+            )
+        )
+    return out
