@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 
 import torch
@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters.base import submodels, where_rows
+from torch_denkf.transforms._packaged import PackagedRun
 
 __all__ = ["DEnKFTransform"]
 
@@ -47,6 +48,10 @@ class DEnKFTransform(Transform):
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
         check_finite: whether a non-finite observation, forecast or belief raises. Costs one synchronisation a step.
+        packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step`: at B=1 ten
+            times as fast as the filter itself, with the parameters that it had when it was exported, for environments
+            of the batch size of the export, and not inside a worker, because it cannot be pickled. Resets and specs
+            come from ``filter``.
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
@@ -73,6 +78,7 @@ class DEnKFTransform(Transform):
         store_ensemble: bool = True,
         no_grad: bool = True,
         check_finite: bool = True,
+        packaged: Callable[[Mapping[str, torch.Tensor]], Mapping[str, torch.Tensor]] | None = None,
     ):
         if not isinstance(filter, Filter):
             if not isinstance(filter, TensorDictSequential) or initial is None:
@@ -100,6 +106,16 @@ class DEnKFTransform(Transform):
         self._controls = [key for key in reads if key in filter.control_keys]
         optional = [key for part in submodels(filter.module) for key in part.optional_keys]
         self._optional = list(dict.fromkeys(optional))
+        if packaged is not None and not no_grad:
+            raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
+        self._packaged = packaged and PackagedRun(
+            packaged,
+            carry={key: self._names[key] for key in filter.carry_keys},
+            controls=self._controls,
+            frames=self.in_keys,
+            optional=self._optional,
+            keep=self._keep,
+        )
 
     # ----------------------------------------------------------------------------------------- in an environment
 
@@ -107,6 +123,14 @@ class DEnKFTransform(Transform):
         return torch.no_grad() if self.no_grad else nullcontext()
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._packaged is not None:
+            kept = self._packaged(tensordict, next_tensordict)
+            if kept is not None:  # otherwise what follows says what is missing
+                if self.check_finite and not all(torch.isfinite(kept[key]).all() for key in self.filter.carry_keys):
+                    self._assert_finite(next_tensordict.copy().update(kept))
+                for key, name in self._names.items():
+                    next_tensordict.set(name, kept[key])
+                return next_tensordict
         row = next_tensordict.empty()
         for key in self.filter.carry_keys:
             name = self._names[key]

@@ -1,0 +1,127 @@
+"""DEnKFTransform with a packaged step; oracle: the same transform without."""
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv, check_env_specs
+
+from tests.transforms.envs_for_tests import base_env, fixed_filter, random_filter, toy_base_env, toy_filter
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.transforms import DEnKFTransform
+
+BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
+
+
+def one_step(env, filter, without=()):
+    """What a step of ``env`` gives the filter, as an example to export from."""
+    filtered = TransformedEnv(env, DEnKFTransform(filter))
+    start = filtered.rand_action(filtered.reset())
+    example = filtered.step(start)["next"].select(*(key for key in ("observation", "observed") if key not in without))
+    example.update(start.select("action", *filter.carry_keys, strict=False))
+    return example
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory):
+    """Steps of a filter without randomness (for batches [] and [3]) and of one with an action; not compiled: fast."""
+    folder, out = tmp_path_factory.mktemp("packages"), {}
+    cases = {"[]": (base_env, fixed_filter, []), "[3]": (base_env, fixed_filter, [3]), "action": None}
+    cases["action"] = (toy_base_env, lambda: toy_filter(sensor_layer="none", layer="none"), [])
+    for name, (make_env, make_filter, batch) in cases.items():
+        torch.manual_seed(0)
+        filter = make_filter()
+        example = one_step(make_env(seed=0, batch_size=batch), filter)
+        diagnostics = [("info", "nis")]
+        path = export_step(filter, example, folder / f"{name}.pt2", out_keys=diagnostics, compiled=False)
+        out[name] = filter, path, make_env, batch
+    return out
+
+
+def envs(packages, name, **options):
+    """The same environment with and without the package."""
+    filter, path, make_env, batch = packages[name]
+    length = [4, 6, 30] if batch else 4
+    out = []
+    for packaged in (None, load_step(path)):
+        transform = DEnKFTransform(filter, packaged=packaged, diagnostics=[("info", "nis")], **options)
+        out.append(TransformedEnv(make_env(seed=0, batch_size=batch, max_steps=length), transform))
+        out[-1].set_seed(0)
+    return out
+
+
+@pytest.mark.parametrize("name", ["[]", "[3]"])
+@pytest.mark.parametrize("store_ensemble", [True, False])
+def test_rollouts_over_resets_are_the_same(packages, name, store_ensemble):
+    plain, packaged = envs(packages, name, store_ensemble=store_ensemble)
+    rollouts = []
+    for env in (plain, packaged):
+        torch.manual_seed(1)
+        rollouts.append(env.rollout(15, break_when_any_done=False))
+    done = rollouts[0]["next", "done"].squeeze(-1)
+    assert done[..., :-1].any()
+    for key in [*(BELIEF if store_ensemble else BELIEF[1:]), ("info", "nis")]:
+        torch.testing.assert_close(rollouts[1]["next", key], rollouts[0]["next", key], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(rollouts[1][key], rollouts[0][key], rtol=1e-5, atol=1e-6)
+    assert (("belief", "ensemble") in rollouts[1].keys(True)) == store_ensemble
+
+
+def test_the_package_is_what_runs(packages):
+    """A filter whose parameters changed after the export: the belief is that of the parameters exported."""
+    filter = packages["action"][0]
+    plain, packaged = envs(packages, "action")
+    torch.manual_seed(1)
+    expected = plain.rollout(3)
+    with torch.no_grad():
+        before = [parameter.clone() for parameter in filter.parameters()]
+        for parameter in filter.parameters():
+            parameter.mul_(2)
+    torch.manual_seed(1)
+    found = packaged.rollout(3)
+    torch.manual_seed(1)
+    changed = plain.rollout(3)
+    with torch.no_grad():
+        for parameter, value in zip(filter.parameters(), before, strict=True):
+            parameter.copy_(value)
+    torch.testing.assert_close(found["next", "belief", "mean"], expected["next", "belief", "mean"])
+    assert not changed["next", "belief", "mean"].allclose(expected["next", "belief", "mean"], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["[]", "[3]", "action"])
+def test_specs(packages, name):
+    check_env_specs(envs(packages, name)[1])
+
+
+def test_what_went_wrong_is_said(packages, tmp_path):
+    filter, path, _, _ = packages["[]"]
+    step = load_step(path)
+    with pytest.raises(KeyError, match="log_likelihood"):
+        DEnKFTransform(filter, packaged=step, diagnostics=[("info", "log_likelihood")])
+    with pytest.raises(ValueError, match="records no graph"):
+        DEnKFTransform(filter, packaged=step, no_grad=False)
+    with pytest.raises(
+        ValueError, match=r"must be torch.float32 \[2\], got torch.float32 \[3, 2\]"
+    ):  # batch of three, package of one
+        TransformedEnv(base_env(seed=0, batch_size=[3]), DEnKFTransform(filter, packaged=step)).rollout(2)
+    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=step))
+    start = env.rand_action(env.reset().exclude("belief"))
+    with pytest.raises(KeyError, match="carries the belief"):
+        env.step(start)
+
+    blind = export_step(filter, one_step(base_env(seed=0), filter, ["observed"]), tmp_path / "a.pt2", compiled=False)
+    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(blind)))
+    with pytest.raises(ValueError, match="emits 'observed', which the packaged step was exported without"):
+        env.rollout(2)
+
+    noisy = random_filter()
+    example = noisy.draw_noise(one_step(base_env(seed=0), noisy))
+    given = export_step(noisy, example, tmp_path / "b.pt2", compiled=False)
+    with pytest.raises(KeyError, match=r"noise\.transition"):
+        DEnKFTransform(noisy, packaged=load_step(given))
+
+
+def test_nan_is_found(packages):
+    filter, path, _, _ = packages["[]"]
+    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(path)))
+    td = env.rand_action(env.reset())
+    td["belief", "ensemble"][0, 0] = torch.nan
+    with pytest.raises(ValueError, match="the filter diverged"):
+        env.step(td)

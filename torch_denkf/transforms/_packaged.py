@@ -1,0 +1,82 @@
+"""Between an environment's tensordicts and a packaged step, which takes and returns tensors by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+__all__ = ["PackagedRun"]
+
+
+class PackagedRun:
+    """Takes a packaged step's inputs from where an environment's step has them.
+
+    Args:
+        step: from names to tensors and back, with attributes ``inputs`` and ``outputs``, as
+            :func:`torch_denkf.deployment.load_step` returns it; nested keys are written with dots.
+        carry: keys of the belief at t-1, and under what name the tensordict at the root holds them.
+        controls: keys that are read at the root.
+        frames: keys that are read under ``"next"``.
+        optional: keys under ``"next"`` that are read where they are.
+        keep: keys that the step has to return.
+
+    Raises:
+        KeyError: if the step reads what the environment's step cannot give, or does not return what is to be kept.
+    """
+
+    def __init__(
+        self,
+        step: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]],
+        *,
+        carry: Mapping[NestedKey, NestedKey],
+        controls: Sequence[NestedKey],
+        frames: Sequence[NestedKey],
+        optional: Sequence[NestedKey],
+        keep: Sequence[NestedKey],
+    ):
+        self.step = step
+        root = {_name(key): stored for key, stored in carry.items()} | {_name(key): key for key in controls}
+        under_next = {_name(key): key for key in (*frames, *optional)}
+        unknown = [name for name in step.inputs if name not in root and name not in under_next]
+        if unknown:
+            raise KeyError(
+                f"the packaged step reads {unknown}, which the filter does not take from an environment (noise, "
+                "perhaps: then it is to be drawn inside). Export it from an example without these entries."
+            )
+        self._root = [(name, root[name]) for name in step.inputs if name in root]
+        self._next = [(name, under_next[name]) for name in step.inputs if name not in root]
+        self._ignored = [key for key in optional if _name(key) not in step.inputs]
+        self._outputs = {key: _name(key) for key in keep}
+        missing = [key for key, name in self._outputs.items() if name not in step.outputs]
+        if missing:
+            raise KeyError(f"the packaged step does not return {missing}; export it with out_keys={missing}.")
+
+    def __call__(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> dict[NestedKey, Tensor] | None:
+        """Takes a step.
+
+        Returns:
+            what is kept, by key; ``None`` if an input is missing.
+
+        Raises:
+            ValueError: if the environment emits something that the filter would use and the package cannot, or a
+                shape or dtype differs from the package's.
+        """
+        entries = {name: tensordict.get(key, None) for name, key in self._root}
+        for name, key in self._next:
+            entries[name] = next_tensordict.get(key, None)
+        if any(value is None for value in entries.values()):
+            return None
+        for key in self._ignored:
+            if next_tensordict.get(key, None) is not None:
+                raise ValueError(
+                    f"The environment emits {key!r}, which the packaged step was exported without and would ignore. "
+                    "Export it from an example that holds the entry."
+                )
+        out = self.step(entries)
+        return {key: out[name] for key, name in self._outputs.items()}
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(key)
