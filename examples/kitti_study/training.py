@@ -33,7 +33,6 @@ class Budget:
     filter: int = 300
     end_to_end: int = 40
     length: int = 24
-    gain_error: float = 0.02  # of the sensor's speed on a new drive, as the filter is to expect it
 
 
 @torch.no_grad()
@@ -70,6 +69,17 @@ def filter_error(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) 
     return {"crps": float(torch.cat(scores).mean())}
 
 
+def gain_error(fold: Fold, base: SensorOfFold) -> float:
+    """How far off a sensor's speed is over a whole drive that it has not seen: root mean square of the logarithm."""
+    logarithms = []
+    for part, (first, last, _) in zip(fold.tune, base.readings[::2], strict=True):
+        if part.stream.condition == "clean":
+            drive = all_frames(torch.cat([first, last]))[1:]
+            read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
+            logarithms.append((read.sum() / driven.sum()).clamp(0.5, 2.0).log())
+    return float(torch.stack(logarithms).square().mean().sqrt())
+
+
 class EndToEndLoss(nn.Module):
     """The filter's objective, and the sensor's own beside it."""
 
@@ -104,7 +114,7 @@ def train_filter(
     # How wrong the first velocity of a training window is; its pose is right.
     start_std = torch.cat([torch.zeros(3), 0.2 * facts.scale])
     readings = [tune for tune, _, _ in base.readings]
-    windows = ReadingSampler(readings, [share for *_, share in base.readings], budget.length, budget.gain_error)
+    windows = ReadingSampler(readings, [share for *_, share in base.readings], budget.length, gain_error(fold, base))
     frames = FrameSampler(fold.train, cache, kind)
     third = max(budget.end_to_end // 3, 1)
     stages = [

@@ -1,6 +1,7 @@
 """The parts of examples/kitti_odometry.py that a wrong table could come from."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -14,11 +15,11 @@ from kitti_study.evaluation import COLUMNS, errors, hold_last, integrate
 from kitti_study.fold import Fold, Part, Statistics, with_disturbances
 from kitti_study.readings import ReadingSampler, all_frames, lose_frames, take_spans
 from kitti_study.recipes import FILTERS
-from kitti_study.sensors import SENSORS
+from kitti_study.sensors import SENSORS, SensorOfFold
 from kitti_study.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from kitti_study.study import make_fold, read_rows
 from kitti_study.tables import by_drive, markdown, read_csv, write_csv
-from kitti_study.training import run_filter
+from kitti_study.training import gain_error, run_filter
 
 from torch_denkf.metrics import dead_reckoning
 
@@ -125,6 +126,18 @@ def test_errors_of_a_path_that_is_a_tenth_too_fast():
         assert row["rotation_deg_per_m"] == pytest.approx(0.0)
         assert row["rmse_v_m_per_s"] == pytest.approx(1.0)
         assert row["devkit_t_rel_percent"] == pytest.approx(10.1, abs=0.15)  # a segment ends behind 100 m, by a frame
+
+
+def test_gain_error_is_that_of_clean_unseen_drives():
+    """Drives at 7 m/s read as 7 e^0.03 and 7 e^-0.04; what a disturbed one reads does not count."""
+    parts = with_disturbances([Part(stream) for stream in streams("a", "b")])
+    fold = Fold("t", [], parts, [])
+    base = SensorOfFold("flow", None, None, [])
+    for part in parts:
+        off = {"a": 0.03, "b": -0.04}[part.stream.drive] if part.stream.condition == "clean" else 0.5
+        read = readings([[7.0 * math.exp(off), 0.0]] * 20)
+        base.readings += [(read[:12], read[12:], 1.0)] * 2  # as they are, and mirrored
+    assert gain_error(fold, base) == pytest.approx(((0.03**2 + 0.04**2) / 2) ** 0.5, rel=1e-4)
 
 
 def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
