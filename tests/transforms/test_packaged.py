@@ -118,6 +118,19 @@ def test_what_went_wrong_is_said(packages, tmp_path):
         DEnKFTransform(noisy, packaged=load_step(given))
 
 
+def test_actions_may_be_in_double_precision(packages):
+    """dm_control takes them so; the filter casts them, and so does what stands before the package."""
+    both = envs(packages, "action")
+    row = both[1].rand_action(both[1].reset())
+    beliefs = []
+    for env in both:
+        action = row["action"].double()
+        out = env.transform._step(row.copy().set("action", action), row.select("observation", "observed"))
+        beliefs.append(out["belief", "mean"])
+    assert beliefs[1].dtype == torch.float32
+    torch.testing.assert_close(beliefs[1], beliefs[0], rtol=1e-5, atol=1e-6)
+
+
 def test_nan_is_found(packages):
     filter, path, _, _ = packages["[]"]
     env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(path)))

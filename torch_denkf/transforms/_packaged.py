@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -47,6 +48,8 @@ class PackagedRun:
             )
         self._root = [(name, root[name]) for name in step.inputs if name in root]
         self._next = [(name, under_next[name]) for name in step.inputs if name not in root]
+        # Filters cast controls to the state's precision: an environment may take actions in double precision.
+        self._casts = {_name(key): _dtype(step.inputs[_name(key)][1]) for key in controls if _name(key) in step.inputs}
         self._ignored = [key for key in optional if _name(key) not in step.inputs]
         self._outputs = {key: _name(key) for key in keep}
         missing = [key for key, name in self._outputs.items() if name not in step.outputs]
@@ -68,6 +71,8 @@ class PackagedRun:
             entries[name] = next_tensordict.get(key, None)
         if any(value is None for value in entries.values()):
             return None
+        for name, dtype in self._casts.items():
+            entries[name] = entries[name].to(dtype)
         for key in self._ignored:
             if next_tensordict.get(key, None) is not None:
                 raise ValueError(
@@ -76,6 +81,10 @@ class PackagedRun:
                 )
         out = self.step(entries)
         return {key: out[name] for key, name in self._outputs.items()}
+
+
+def _dtype(name: str) -> torch.dtype:
+    return getattr(torch, name.removeprefix("torch."))
 
 
 def _name(key: NestedKey) -> str:
