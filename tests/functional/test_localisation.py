@@ -135,3 +135,38 @@ def test_neighbours_of_a_taper_are_its_positive_entries():
     assert found.index.shape == (3, 3)
     with pytest.raises(ValueError, match=r"\[S, O\]"):
         neighbours_of_taper(taper[0])
+
+
+@pytest.mark.parametrize("period", [None, (10.0, math.inf), (10.0, 7.0)])
+@pytest.mark.parametrize(("tile", "pairs"), [(16, 40), (1000, 2**24)])
+def test_neighbours_on_a_plane_are_those_of_all_pairs(monkeypatch, period, tile, pairs):
+    monkeypatch.setattr("torch_denkf.functional.localisation._PAIRS", pairs)
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([10.0, 7.0], dtype=torch.float64)
+    states, observations = (size * torch.rand(n, 2, generator=generator, dtype=torch.float64) for n in (300, 90))
+    period = None if period is None else torch.tensor(period, dtype=torch.float64)
+    found = neighbours(states, observations, 0.3, period=period, tile=tile)
+    offset = (states[:, None] - observations).abs()
+    if period is not None:
+        offset = torch.minimum(offset, period - offset)
+    expected = gaspari_cohn(offset.square().sum(-1).sqrt(), 0.3)
+    dense = torch.zeros_like(expected).scatter_add_(1, found.index, found.taper)
+    torch.testing.assert_close(dense, expected, rtol=0, atol=1e-15)
+    assert found.index.shape[1] == int((expected > 0).sum(1).max())
+    assert int((expected > 0).sum(1).min()) == 0  # some see nothing
+
+
+def test_neighbours_of_a_long_line_compare_few_pairs(monkeypatch):
+    """30,000 components: all pairs would be 900 million; those within reach of a tile are below a hundredth of it."""
+    counts = []
+
+    def counted(distance, radius):
+        counts.append(distance.numel())
+        return gaspari_cohn(distance, radius)
+
+    monkeypatch.setattr("torch_denkf.functional.localisation.gaspari_cohn", counted)
+    places = torch.arange(30_000.0).unsqueeze(-1)
+    found = neighbours(places, places, 4.0, period=torch.tensor([30_000.0]), tile=256)
+    assert sum(counts) < 30_000 * 300
+    assert found.index.shape == (30_000, 29)
+    assert found.index[0].sort().values.tolist() == [*range(15), *range(29_986, 30_000)]

@@ -52,6 +52,9 @@ def gaspari_cohn(distance: Tensor, radius: float) -> Tensor:
     return torch.where(z < 1, near, torch.where(z < 2, far, 0.0)).clamp(0, 1)
 
 
+_PAIRS = 2**24  # distances at a time, in neighbours()
+
+
 class Neighbours(NamedTuple):
     """The observations near each component of a state.
 
@@ -74,10 +77,14 @@ def neighbours(
         observations: places of the observations, ``[O, D]``.
         radius: see :func:`gaspari_cohn`, in the same unit.
         period: ``[D]``, where a coordinate is a circle, its circumference (``inf`` where it is not).
-        tile: components to look at in one go; memory is ``tile * O``.
+        tile: components to look at in one go. They are sorted by their first coordinate, and compared with the
+            observations within reach of a tile's range of it, 2²⁴ pairs at a time at most.
 
     Returns:
         :class:`Neighbours`, with L the largest number that any component has, at least 1.
+
+    Raises:
+        ValueError: if the radius is not positive.
 
     Examples:
         Five places on a circle, each sees its neighbours:
@@ -86,15 +93,28 @@ def neighbours(
         >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
         [[0, 1, 4], [0, 1, 2], [1, 2, 3], [2, 3, 4], [0, 3, 4]]
     """
+    if not radius > 0:
+        raise ValueError(f"radius must be positive, got {radius}")
+    reach = 2 * math.sqrt(10 / 3) * radius
 
-    def tapers() -> Iterator[Tensor]:
-        for part in states.split(tile):
-            offset = (part.unsqueeze(1) - observations).abs()
-            if period is not None:
-                offset = torch.minimum(offset, period - offset)
-            yield gaspari_cohn(offset.square().sum(-1).sqrt(), radius)
+    def around(offset: Tensor, circle: Tensor | None) -> Tensor:
+        offset = offset.abs()
+        return offset if circle is None else torch.minimum(offset, circle - offset)
 
-    return _largest(tapers())
+    def tapers(order: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        first, circle = observations[:, 0], None if period is None else period[0]
+        for rows in order.split(tile):
+            low, high = states[rows[0], 0], states[rows[-1], 0]
+            close = around(first - (low + high) / 2, circle) <= (high - low) / 2 * (1 + 1e-5) + reach
+            near = close.nonzero().squeeze(-1) if bool(close.any()) else close.new_zeros(1, dtype=torch.int64)
+            for part in rows.split(max(_PAIRS // len(near), 1)):
+                offset = around(states[part].unsqueeze(1) - observations[near], period)
+                yield gaspari_cohn(offset.square().sum(-1).sqrt(), radius), near
+
+    order = states[:, 0].argsort()
+    found = _largest(tapers(order))
+    back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    return Neighbours(found.index[back], found.taper[back])
 
 
 def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
@@ -117,16 +137,19 @@ def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
     """
     if taper.ndim != 2:
         raise ValueError(f"taper must be [S, O], one row a component of the state, got {list(taper.shape)}")
-    return _largest(taper.split(tile))
+    columns = torch.arange(taper.shape[1], device=taper.device)
+    return _largest((part, columns) for part in taper.split(tile))
 
 
-def _largest(tapers: Iterable[Tensor]) -> Neighbours:
-    """The entries above zero of each row, of matrices that lie below one another."""
-    rows = [part.topk(max(int((part > 0).sum(-1).max()), 1), dim=-1) for part in tapers]
-    length = max(row.values.shape[-1] for row in rows)
+def _largest(tapers: Iterable[tuple[Tensor, Tensor]]) -> Neighbours:
+    """The entries above zero of each row, of matrices that lie below one another, with the numbers of their columns."""
+    rows = []
+    for taper, columns in tapers:
+        values, places = taper.topk(max(int((taper > 0).sum(-1).max()), 1), dim=-1)
+        rows.append((columns[places], values))
+    length = max(values.shape[-1] for _, values in rows)
     pad = [(torch.nn.functional.pad(value, (0, length - value.shape[-1])) for value in row) for row in rows]
-    taper, index = (torch.cat(column) for column in zip(*pad, strict=True))
-    return Neighbours(index, taper)
+    return Neighbours(*(torch.cat(column) for column in zip(*pad, strict=True)))
 
 
 def letkf(
