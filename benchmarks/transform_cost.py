@@ -207,8 +207,8 @@ def table(found: dict[str, dict[str, list[float]]], command: str, elapsed: float
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[2]:.1f}"
     lines += [
         "",
-        "Where other work shares the cores, caches are cold at every turn, and all of these times grow, also as processor",
-        f"time: {load}. `{command}`: {elapsed:.0f} s; torch {torch.__version__}.",
+        "Where other work shares the cores, caches are cold at every turn, and all of these times grow, also as",
+        f"processor time: {load}. `{command}`: {elapsed:.0f} s; torch {torch.__version__}.",
     ]
     return "\n".join(lines) + "\n"
 
