@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torch_denkf.functional._checks import check_ensemble, check_shape
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
+from torch_denkf.functional._small_system import LARGEST, solve_written_out
 from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -185,12 +186,15 @@ def _observation_space(
     gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
     if taper is not None:
         gram, cross = gram * taper[1], cross * taper[0].mT
-    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
-    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
-    increment = shift @ torch.cholesky_solve(cross, factor)
     transformed = None
     if square_root:
         transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
+    if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
+        increment, square, log_det = solve_written_out(gram, cross, shift, mean_shift)
+        return increment, transformed, square, log_det
+    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
+    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
+    increment = shift @ torch.cholesky_solve(cross, factor)
     return increment, transformed, whitened.square().sum(-2), _log_det(factor)
 
 
