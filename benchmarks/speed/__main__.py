@@ -87,30 +87,34 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[*PAIRS, *SCRIPTS], help="run these pairs, keep other rows")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
     parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "speed.png")
+    parser.add_argument(
+        "--no-compile", action="store_true", help="leave out compiled sequences: minutes each to compile"
+    )
     parser.add_argument("--pair", nargs=2, metavar=("NAME", "JSON"), help="run one pair in this process")
     args = parser.parse_args()
     if args.pair:
         in_this_process(args.pair[0], args.seconds, Path(args.pair[1]))
         return
+    if args.no_compile:
+        os.environ["SPEED_COMPILE"] = "0"
     from benchmarks.speed.report import number, write
 
     begun = time.perf_counter()
     machine = in_own_process("machine", args.seconds)
-    rows: list[dict] = []
     names = [n for n in args.only if n in PAIRS or (n in SCRIPTS and (ROOT / "benchmarks" / f"{n}.py").exists())]
+    command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
+    command += " --no-compile" * args.no_compile
+    known, order = args.out / "speed.json", [*PAIRS, *SCRIPTS]
     for name in names:
         print(f"{name} ...", flush=True)
-        for row in in_own_process(name, args.seconds):
-            row["pair"] = name
-            rows.append(row)
+        new = [{**row, "pair": name} for row in in_own_process(name, args.seconds)]
+        for row in new:
             print(f"  {row['name']}: {number(row['ratio']) or row.get('note')} (target {number(row.get('target'))})")
-    known = args.out / "speed.json"
-    if known.exists():  # rows of pairs that were not run again stay
-        old = [row for row in json.loads(known.read_text()) if row.get("pair") not in names]
-        order = [*PAIRS, *SCRIPTS]
-        rows = sorted(old + rows, key=lambda row: order.index(row["pair"]) if row["pair"] in order else len(order))
-    command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
-    write(rows, machine, command, time.perf_counter() - begun, args.out, args.plot)
+        # Rows of pairs that were not run again stay, and a run that is stopped leaves what it has measured.
+        old = json.loads(known.read_text()) if known.exists() else []
+        rows = [row for row in old if row.get("pair") != name] + new
+        rows.sort(key=lambda row: order.index(row["pair"]) if row.get("pair") in order else len(order))
+        write(rows, machine, command, time.perf_counter() - begun, args.out, args.plot)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from benchmarks.speed.jax_networks import jax, jnp, mlp
-from benchmarks.speed.ours import sequence
+from benchmarks.speed.ours import sequences
 from benchmarks.speed.pairs import Row, interleave
 from benchmarks.speed.workload import MEMBERS, STATE, STEPS, make_filter, make_frames, noise_floor, weights
 
@@ -68,11 +68,9 @@ def rows(seconds: float) -> list[Row]:
     same_networks()
     out = []
     for (batch, backward), (target, aim) in LIMITS.items():
-        candidates = {
-            "ours": sequence(make_filter("perturbed"), batch, samples=False, backward=backward),
-            "cuthbert": cuthbert_sequence(batch, backward),
-        }
-        timings = interleave(candidates, seconds=seconds)
-        name = f"sequence / cuthbert, {'gradients, ' * backward}B={batch}"
-        out.append(timings.row(name, "ours", "cuthbert", per=STEPS, target=target, aim=aim, note=NOTE))
+        ours = sequences(batch, scheme="perturbed", backward=backward)
+        timings = interleave({**ours, "cuthbert": cuthbert_sequence(batch, backward)}, seconds=seconds)
+        for kind in ours:
+            name = f"{kind} sequence / cuthbert, {'gradients, ' * backward}B={batch}"
+            out.append(timings.row(name, kind, "cuthbert", per=STEPS, target=target, aim=aim, note=NOTE))
     return out

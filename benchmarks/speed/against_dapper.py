@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from functools import partial
+
 import torch
 
 from benchmarks.speed.pairs import Row, interleave
 from torch_denkf.data.lorenz96 import lorenz96_step
-from torch_denkf.functional import analyse, inflate
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var, inflate
 
 CYCLES, SETTLED = 400, 100  # the error is averaged over the cycles after these
 SCHEMES = {"perturbed": ("PertObs", 40, 1.06), "sakov": ("DEnKF", 40, 1.01)}
 
 
-def our_run(scheme: str, size: int, inflation: float, truth: torch.Tensor, observations: torch.Tensor):
+def make_cycle(scheme: str, inflation: float) -> Callable:
+    """Forecast, analysis, inflation; error of the mean and spread."""
+
+    def cycle(ensemble, state, observation, noise, draws):
+        ensemble = lorenz96_step(ensemble)
+        perturbation = draws if scheme == "perturbed" else None
+        analysis = analyse(ensemble, ensemble, observation, noise, scheme=scheme, perturbation=perturbation).ensemble
+        analysis = inflate(analysis, inflation)
+        mean = ensemble_mean(analysis)
+        return analysis, (mean - state).square().mean().sqrt(), ensemble_var(analysis, mean).mean().sqrt()
+
+    return cycle
+
+
+def our_run(cycle: Callable, size: int, truth: torch.Tensor, observations: torch.Tensor):
     """Cycles with their error and spread, both ``[cycles]``; double precision, as theirs."""
     ensemble = truth[0] + 0.03 * torch.randn(size, truth.shape[-1], dtype=truth.dtype)
     noise = torch.ones_like(truth[0])
+    draws = torch.randn(len(observations), *ensemble.shape, dtype=truth.dtype)
     errors, spreads = [], []
-    for state, observation in zip(truth[1:], observations, strict=True):
-        ensemble = lorenz96_step(ensemble)
-        ensemble = inflate(analyse(ensemble, ensemble, observation, noise, scheme=scheme).ensemble, inflation)
-        errors.append((ensemble.mean(0) - state).square().mean().sqrt())
-        spreads.append(ensemble.var(0).mean().sqrt())
+    for now in zip(truth[1:].unbind(), observations.unbind(), draws.unbind(), strict=True):
+        ensemble, error, spread = cycle(ensemble, *now[:2], noise, now[2])
+        errors.append(error)
+        spreads.append(spread)
     return torch.stack(errors), torch.stack(spreads)
 
 
@@ -42,21 +60,26 @@ def rows(seconds: float) -> list[Row]:
     out = []
     for scheme, (name, size, inflation) in SCHEMES.items():
         theirs, ours_error = methods.EnKF(name, N=size, infl=inflation), []
+        cycles = {"eager": make_cycle(scheme, inflation)}
+        if os.environ.get("SPEED_COMPILE") != "0":
+            cycles["compiled"] = torch.compile(make_cycle(scheme, inflation), fullgraph=True, dynamic=False)
 
         def dapper_call(theirs=theirs):
             theirs.assimilate(HMM, xx, yy)
 
-        def our_call(scheme=scheme, size=size, inflation=inflation, ours_error=ours_error):
+        def our_call(cycle, size=size, ours_error=ours_error):
             with torch.no_grad():
-                error, _ = our_run(scheme, size, inflation, truth, observations)
+                error, _ = our_run(cycle, size, truth, observations)
             ours_error.append(float(error[SETTLED:].mean()))
 
-        timings = interleave({"ours": our_call, "dapper": dapper_call}, seconds=seconds, rounds=7)
+        candidates = {kind: partial(our_call, cycle) for kind, cycle in cycles.items()}
+        timings = interleave({**candidates, "dapper": dapper_call}, seconds=seconds, rounds=7)
         their_error = float(theirs.stats.err.rms.a[SETTLED:].mean())
         note = (
             f"E={size}, inflation {inflation}, float64; RMSE {sum(ours_error) / len(ours_error):.3f} and "
             f"{their_error:.3f}; theirs keeps errors alone (its least), ours errors and spread"
         )
         fields = {"per": len(observations), "target": 0.4, "note": note}
-        out.append(timings.row(f"Lorenz-96 cycle / DAPPER {name}, E={size}", "ours", "dapper", **fields))
+        for kind in cycles:
+            out.append(timings.row(f"{kind} Lorenz-96 cycle / DAPPER {name}, E={size}", kind, "dapper", **fields))
     return out

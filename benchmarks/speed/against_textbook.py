@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from benchmarks.speed.ours import sequence
+from benchmarks.speed.ours import sequences
 from benchmarks.speed.pairs import Row, interleave
 from benchmarks.speed.textbook import Textbook
 from benchmarks.speed.workload import STEPS, make_filter, make_frames, start
@@ -35,11 +35,9 @@ def textbook(batch: int, backward: bool) -> Callable[[], object]:
 def rows(seconds: float) -> list[Row]:
     out = []
     for (batch, backward), (target, aim) in LIMITS.items():
-        candidates = {
-            "ours": sequence(make_filter(), batch, backward=backward),
-            "textbook": textbook(batch, backward),
-        }
-        timings = interleave(candidates, seconds=seconds)
-        name = f"sequence / textbook torch, {'forward and backward, ' * backward}B={batch}"
-        out.append(timings.row(name, "ours", "textbook", per=STEPS, target=target, aim=aim, note=NOTE))
+        ours = sequences(batch, backward=backward)
+        timings = interleave({**ours, "textbook": textbook(batch, backward)}, seconds=seconds)
+        for kind in ours:
+            name = f"{kind} sequence / textbook torch, {'forward and backward, ' * backward}B={batch}"
+            out.append(timings.row(name, kind, "textbook", per=STEPS, target=target, aim=aim, note=NOTE))
     return out

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from benchmarks.speed.workload import MEMBERS, STEPS, make_frames, start
+from benchmarks.speed.workload import MEMBERS, STEPS, make_filter, make_frames, start
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+
+CHUNK = 4  # steps in one compiled graph
+
+
+def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
+    """The sequence eagerly and, unless SPEED_COMPILE=0, compiled in chunks; names for the table."""
+    fields = {"samples": scheme == "sensor", "backward": backward}
+    out = {"eager": sequence(make_filter(scheme), batch, **fields)}
+    if os.environ.get("SPEED_COMPILE") != "0":
+        out["compiled"] = sequence(make_filter(scheme).compile(chunk=CHUNK), batch, **fields)
+    return out
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
@@ -20,16 +32,18 @@ def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, .
         that the filter writes: noise, forecast, predicted observation, members, mean, variance, diagnostics.
     """
     network, observe, noise = (filter[name].module for name in ("transition", "observation", "noise"))
-    variance, floor, scheme = filter["noise"].variance, filter["noise"].floor, filter["analysis"].scheme
+    variance, floor, loc, scale = (getattr(filter["noise"], name) for name in ("variance", "floor", "loc", "scale"))
+    scheme = filter["analysis"].scheme
 
     def step(ensemble: Tensor, samples: Tensor) -> tuple[Tensor, ...]:
         reading = samples.mean(-2) if samples.ndim == ensemble.ndim else samples
-        r = variance * (1 + noise(reading)) ** 2 + floor
+        r = variance * (1 + noise((reading - loc) / scale)) ** 2 + floor
         draws = network.draw_noise(ensemble.shape[:-2], MEMBERS)
         forecast = ensemble + network(ensemble, draws)
         predicted = observe(forecast)
         members, *diagnostics = analyse(forecast, predicted, samples, r, scheme=scheme)
-        return r, forecast, predicted, members, ensemble_mean(members), ensemble_var(members), *diagnostics
+        mean = ensemble_mean(members)
+        return r, forecast, predicted, members, mean, ensemble_var(members, mean), *diagnostics
 
     return step
 

@@ -22,7 +22,7 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
         f"{machine['python']}. Measured in the same run: matrix peak {machine['peak_gflops']:.0f} GFLOP/s (float32),",
         f"bandwidth {machine['bandwidth_gb_s']:.0f} GB/s. Ratios: ours over theirs, below 1 ours is faster; the median",
         "over interleaved rounds in one process. Times: processor time of a step (S=5, O=2, E=32, Table I without the",
-        "image sensor) unless the row says otherwise.",
+        "image sensor) unless the row says otherwise. Pairs that this command leaves out were measured before.",
         "",
         "| what | ratio | target | aim | met | ours, us | theirs, us | what differs |",
         "|---|---|---|---|---|---|---|---|",

@@ -16,13 +16,15 @@ from collections.abc import Iterable, Sequence
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from tensordict.utils import expand_as_right
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf.filters._compiled import CompiledSteps
+from torch_denkf.filters._recursion import Recursion, run, where_rows
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
 from torch_denkf.modules import SubModel
+from torch_denkf.modules._row import Row, RowPlan, on_rows
 
 __all__ = ["Filter", "submodels", "where_rows"]
 
@@ -87,6 +89,8 @@ class Filter(TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.update_at_reset = update_at_reset
+        self._plan: RowPlan | None = None
+        self._compiled: CompiledSteps | None = None
         self._sort_modules()
 
     def _sort_modules(self) -> None:
@@ -177,8 +181,9 @@ class Filter(TensorDictSequential):
             tensordict = self.step(tensordict)
         else:
             self._check_carry(tensordict)
-            tensordict = self._run(self.frame_modules, tensordict)
-            tensordict = self._advance(tensordict, is_init, self._initial_of(tensordict), self.update_at_reset)
+            tensordict = run(self.frame_modules, tensordict)
+            recursion, starts = self._make_recursion(self.update_at_reset), self._initial_of(tensordict)
+            tensordict = recursion.advance(tensordict, is_init, starts)
         for key in self.carry_keys:
             tensordict.set(("next", key) if isinstance(key, str) else ("next", *key), tensordict.get(key))
         return tensordict
@@ -189,19 +194,53 @@ class Filter(TensorDictSequential):
         Raises:
             KeyError: if the carry is missing.
         """
-        self._check_carry(tensordict)
-        return self._run(self._module_iter(), tensordict)
+        plan = on_rows(self.module._modules.values(), self._plan) if type(tensordict) is TensorDict else None
+        if plan is None:
+            self._check_carry(tensordict)
+            return run(self._module_iter(), tensordict)
+        self._plan, row = plan, Row.of(tensordict, plan.reads)
+        self._check_carry(row)
+        if self._compiled is None:
+            row = run(plan.modules, row)
+        else:
+            row = self._compiled.step(plan, row, row.get(self.carry_keys[0]).dtype)
+        return row.write(tensordict, plan.writes)
+
+    def compile(self, *, chunk: int = 4, **options) -> Filter:
+        """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
+
+        The first call of each kind (chunk, batch size, with or without gradients) compiles for up to minutes, later
+        ones reuse that; copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it
+        gives eagerly, up to rounding. Filters with a part that needs a TensorDict (see ``SubModel.runs_on_rows``) and
+        noise that is not a tensor (flipout) stay eager.
+
+        Args:
+            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step.
+                0 goes back to eager.
+            **options: of ``torch.compile``.
+
+        Returns:
+            This filter.
+
+        Raises:
+            RuntimeError: if there is no C++ compiler, which processors need.
+            ValueError: if ``chunk`` is negative.
+        """
+        if chunk < 0:
+            raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
+        self._compiled = CompiledSteps(chunk, options) if chunk else None
+        return self
 
     def initialise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
         frame_outputs = {unravel_key(key) for module in self.frame_modules for key in module.out_keys}
         if self.update_at_reset or not frame_outputs.isdisjoint(map(unravel_key, self.initial.in_keys)):
-            tensordict = self._run(self.frame_modules, tensordict)
+            tensordict = run(self.frame_modules, tensordict)
         tensordict = self.initial(tensordict)
         if self.update_at_reset:
             for key, forecast_key in self._forecast_of.items():
                 tensordict.set(forecast_key, tensordict.get(key))
-            tensordict = self._run(self.update_modules, tensordict)
+            tensordict = run(self.update_modules, tensordict)
         return tensordict
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -215,7 +254,7 @@ class Filter(TensorDictSequential):
                 tensordict.set(key, _SUMMARIES[kind][key[-1]](*values))
         return tensordict
 
-    def _check_carry(self, tensordict: TensorDictBase) -> None:
+    def _check_carry(self, tensordict: TensorDictBase | Row) -> None:
         for key in self.carry_keys:
             if tensordict.get(key, None) is None:
                 raise KeyError(
@@ -225,29 +264,20 @@ class Filter(TensorDictSequential):
                     "part of the policy."
                 )
 
-    @staticmethod
-    def _run(modules: Iterable[TensorDictModuleBase], tensordict: TensorDictBase) -> TensorDictBase:
-        for module in modules:
-            tensordict = module(tensordict)
-        return tensordict
-
     def _initial_of(self, frames: TensorDictBase) -> TensorDictBase:
         """The initial belief for every element of ``frames``, which is left as it is."""
         return self.initial(frames.copy()).select(*self.belief_keys, *self.carry_keys)
 
-    def _advance(self, row, reset, start, update_at_reset: bool) -> TensorDictBase:
-        """One step of the recursion, except that rows in ``reset`` forecast their ``start``, and believe it."""
-        row = self.transition_module(row)
-        for key, forecast_key in self._forecast_of.items():
-            row.set(forecast_key, where_rows(reset, start.get(key), row.get(forecast_key)))
-        for key in self.carry_keys:
-            if key not in self._forecast_of:
-                row.set(key, where_rows(reset, start.get(key), row.get(key)))
-        row = self._run(self.update_modules, row)
-        if not update_at_reset:
-            for key in self.belief_keys:
-                row.set(key, where_rows(reset, start.get(key), row.get(key)))
-        return row
+    def _make_recursion(self, update_at_reset: bool) -> Recursion:
+        modules = list(self._module_iter())
+        return Recursion(
+            [modules[index] for index in self._recursion],
+            carry_keys=self.carry_keys,
+            belief_keys=self.belief_keys,
+            forecast_of=self._forecast_of,
+            out_keys=self.recursion_out_keys,
+            update_at_reset=update_at_reset,
+        )
 
     # --------------------------------------------------------------------------------------------- a sequence
 
@@ -281,42 +311,43 @@ class Filter(TensorDictSequential):
         """
         if not tensordict.ndim:
             raise ValueError("A sequence has time as its last batch dimension; this tensordict has batch_size [].")
-        time, steps = tensordict.ndim - 1, tensordict.shape[-1]
-        work = self._run(self.frame_modules, self.draw_noise(tensordict.copy()))
+        work = run(self.frame_modules, self.draw_noise(tensordict.copy()))
         is_init = self._starts(tensordict)
         stored = all(tensordict.get(key, None) is not None for key in self.belief_keys)
         if stored:  # these have seen their frame
             starts = tensordict.select(*self.belief_keys, *self.carry_keys)
         else:  # where only the first element starts, only its initial belief is needed
             starts = self._initial_of(work if is_init is not None else work[..., :1])
-        update_at_reset = self.update_at_reset and not stored
-        starts, resets = starts.unbind(time), None if is_init is None else is_init.unbind(time)
-        inputs = {key: work.get(key).unbind(time) for key in self._recursion_inputs(work)}
-
-        outputs, belief = [], None
-        for t in range(steps):
-            now = {key: values[max(t - 1, 0) if key in self.control_keys else t] for key, values in inputs.items()}
-            row = TensorDict({}, batch_size=work.batch_size[:-1], device=work.device).update(now)
-            if t == 0:
-                for key in self.carry_keys:
-                    row.set(key, starts[0].get(key))
-                for key, forecast_key in self._forecast_of.items():
-                    row.set(forecast_key, starts[0].get(key))
-                row = self._run(self.update_modules, row)
-                if not update_at_reset:
-                    row.update(starts[0])
-            else:
-                if detach_every and t % detach_every == 0:
-                    belief = belief.detach()
-                row.update(belief)
-                if resets is None:
-                    row = self._run((self.transition_module, *self.update_modules), row)
-                else:
-                    row = self._advance(row, resets[t], starts[t], update_at_reset)
-            belief = row.select(*self.carry_keys)
-            outputs.append(row.select(*self.recursion_out_keys))
+        recursion = self._make_recursion(self.update_at_reset and not stored)
+        inputs = {key: work.get(key) for key in self._recursion_inputs(work)}
+        if recursion.on_rows and self._compiled is not None and self._compiled.takes(inputs):
+            outputs = self._compiled.sequence(recursion, self.control_keys, inputs, is_init, starts, detach_every)
+        else:
+            outputs = self._eager_sequence(recursion, inputs, is_init, starts, work, detach_every)
         frame_keys = [key for module in self.frame_modules for key in module.out_keys]
-        return tensordict.update(work.select(*frame_keys)).update(torch.stack(outputs, time))
+        tensordict.update(work.select(*frame_keys))
+        for key, value in outputs.items():
+            tensordict.set(key, value)
+        return tensordict
+
+    def _eager_sequence(self, recursion, inputs, is_init, starts, work, detach_every) -> dict[NestedKey, torch.Tensor]:
+        """All outputs of the recursion, ``[*B, T, ...]`` each."""
+        time, steps = work.ndim - 1, work.shape[-1]
+        values = {key: value.unbind(time) for key, value in inputs.items()}
+        resets, starts = None if is_init is None else is_init.unbind(time), starts.unbind(time)
+        rows = []
+        for t in range(steps):
+            now = {key: value[max(t - 1, 0) if key in self.control_keys else t] for key, value in values.items()}
+            if recursion.on_rows:
+                rows.append(Row(now, work.batch_size[:-1], work.device))
+            else:
+                rows.append(TensorDict({}, batch_size=work.batch_size[:-1], device=work.device).update(now))
+        first = recursion.first(rows[0], starts[0])
+        cuts = [bool(detach_every) and t % detach_every == 0 for t in range(1, steps)]
+        belief = first.select(*self.carry_keys)
+        _, later = recursion.roll(belief, rows[1:], None if resets is None else resets[1:], starts[1:], cuts)
+        outputs = [first.select(*recursion.out_keys), *later]
+        return {key: torch.stack([output.get(key) for output in outputs], time) for key in recursion.out_keys}
 
     def _starts(self, tensordict: TensorDictBase) -> torch.Tensor | None:
         """Marks the first elements of episodes or slices: ``is_init``, or what follows a ``("next", "done")``."""
@@ -341,8 +372,3 @@ class Filter(TensorDictSequential):
 def submodels(module: torch.nn.Module) -> list[SubModel]:
     """Returns the sub-models inside ``module``, also those inside a nested sequence."""
     return [part for part in module.modules() if isinstance(part, SubModel)]
-
-
-def where_rows(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
-    """Takes ``new`` in the rows that ``mask`` ``[*B]`` or ``[*B, 1]`` marks, ``old`` ``[*B, ...]`` in the others."""
-    return torch.where(expand_as_right(mask, old), new, old)

@@ -23,6 +23,9 @@ class SubModel(TensorDictModule):
     :meth:`draw_noise`; when the tensordict holds ``noise_key``, that noise is used instead of fresh one. This is
     what makes a step equal a sequence, and lets a filter draw the noise of a whole sequence at once.
 
+    A sub-class whose ``forward`` uses nothing of its tensordict but ``get``, ``set``, ``batch_size``, ``ndim`` and
+    ``device`` says ``runs_on_rows = True`` beside that ``forward``: a filter then spares it the TensorDict.
+
     Args:
         network: the module that holds the parameters.
         in_keys: entries that must be there.
@@ -43,6 +46,8 @@ class SubModel(TensorDictModule):
         super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
         self.optional_keys = [unravel_key(key) for key in optional_keys]
         self.noise_key = None if noise_key is None else unravel_key(noise_key)
+
+    runs_on_rows = False
 
     # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would hide our buffers.
     __getattr__ = nn.Module.__getattr__

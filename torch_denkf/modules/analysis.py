@@ -105,6 +105,8 @@ class EnsembleAnalysis(SubModel):
             return torch.randn(shape, device=device, dtype=dtype, generator=generator)
         return None
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""
         forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
@@ -132,7 +134,8 @@ class EnsembleAnalysis(SubModel):
             if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
                 inflated = torch.where(observed.any(-1)[..., None, None], inflated, ensemble)
             ensemble = inflated
-        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), innovation, nis, log_likelihood)
+        mean = ensemble_mean(ensemble)
+        values = (ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood)
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
         return tensordict

@@ -77,6 +77,8 @@ class DiagonalNoise(SubModel):
         self.register_buffer("loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype))
         self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the variances."""
         features = self.read(tensordict, self.in_keys[0])
@@ -123,6 +125,8 @@ class ConstantNoise(SubModel):
             self.log_variance = nn.Parameter(log_variance)
         else:
             self.register_buffer("log_variance", log_variance)
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the variances."""

@@ -28,6 +28,8 @@ class _Observation(SubModel):
         """Returns :math:`h` of states ``[*, S]``, as ``[*, O]``."""
         return self.module(state)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the predicted observations."""
         return tensordict.set(self.out_keys[0], self.observe(self.read(tensordict, self.in_keys[0])))

@@ -88,6 +88,8 @@ class _Sensor(SubModel):
     def _features(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
         return self._encode(measurement, seen)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the learned observations of every member."""
         measurement = self.read(tensordict, self.in_keys[0])

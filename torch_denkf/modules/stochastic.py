@@ -28,6 +28,8 @@ from torch_denkf.functional.random_bits import dropout_factor, random_bytes, ran
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
+_RELU = partial(nn.ReLU, inplace=True)  # a layer's output is nobody else's, and need not be kept for the gradient
+
 
 class FlipoutLinear(nn.Module):
     r"""A linear layer with Gaussian weights, sampled by flipout.
@@ -102,7 +104,7 @@ class StochasticMLP(nn.Module):
             (deterministic, the paper's ``fc``).
         rate: probability of dropping a hidden unit (``"dropout"``), rounded to a multiple of 1/256.
         posterior_std: initial standard deviation of the weights (``"flipout"``).
-        activation: the non-linearity of hidden layers.
+        activation: the non-linearity of hidden layers, ReLU by default.
         output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
             identity, zero starts it there.
 
@@ -131,7 +133,7 @@ class StochasticMLP(nn.Module):
         layer: Literal["dropout", "flipout", "none"] = "dropout",
         rate: float = 0.1,
         posterior_std: float = 0.05,
-        activation: Callable[[], nn.Module] = nn.ReLU,
+        activation: Callable[[], nn.Module] = _RELU,
         output_gain: float = 1.0,
     ):
         super().__init__()

@@ -87,6 +87,8 @@ class LearnedTransition(StochasticTransition):
             "scale", None if scale is None else torch.as_tensor(scale, dtype=torch.get_default_dtype())
         )
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble."""
         state = self.read(tensordict, self.in_keys[0])

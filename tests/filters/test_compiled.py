@@ -1,0 +1,94 @@
+"""Compiled steps and chunks: the oracle is the same filter, eager, on the same noise."""
+
+import pickle
+import shutil
+
+import pytest
+import torch
+
+from tests.filters.factories import toy_denkf, toy_frames
+from torch_denkf.filters import _compiled
+
+#: float32: a few roundings through eight steps; float64 likewise.
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
+
+
+def assert_close(ours, theirs, keys, dtype):
+    for key in keys:
+        torch.testing.assert_close(ours.get(key), theirs.get(key), rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_compiled_is_eager_forward_and_backward(dtype):
+    filter = toy_denkf("perturbed").to(dtype)
+    frames = toy_frames((2, 5), masks=2)  # the start and two chunks of the same kind
+    frames["measurement"], frames["action"] = frames["measurement"].to(dtype), frames["action"].to(dtype)
+    filter.draw_noise(frames)
+    eager = filter.sequence(frames.copy(), detach_every=2)
+    eager_step = filter.step(eager[:, 2].copy())
+    gradients = torch.autograd.grad(eager["belief", "mean"].square().sum(), list(filter.parameters()))
+    filter.compile(chunk=2, backend="eager")
+    compiled = filter.sequence(frames.copy(), detach_every=2)
+    compiled_step = filter.step(eager[:, 2].copy())
+    assert sorted(facts[0] for facts in filter._compiled._functions) == ["chunk", "first", "step"]
+    assert_close(compiled, eager, filter.out_keys, dtype)
+    assert_close(compiled_step, eager_step, filter.out_keys, dtype)
+    ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
+    for value, expected in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(value, expected, rtol=10 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype])
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler, g++")
+def test_inductor_gives_the_eager_sequence_for_a_seed():
+    filter, frames, out = toy_denkf(action=False), toy_frames((2, 2), masks=0, resets=False), []
+    with torch.no_grad():
+        for chunk in (0, 1):
+            torch.manual_seed(1)
+            out.append(filter.compile(chunk=chunk).sequence(frames.copy()))
+    assert_close(out[1], out[0], filter.out_keys, torch.float32)
+
+
+def test_a_compiled_step_draws_its_noise_outside_and_anew():
+    filter = toy_denkf("perturbed").compile(chunk=1, backend="eager")
+    td = filter.initialise(toy_frames((2,), masks=0, resets=False))
+    means: list[torch.Tensor] = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        means.append(filter.step(td.copy())["belief", "mean"])
+    assert means[0].equal(means[1])
+    assert not means[0].equal(means[2])
+    assert len(filter._compiled._functions) == 1
+
+
+def test_flipout_stays_eager_and_0_goes_back():
+    filter = toy_denkf(layer="flipout")
+    frames = filter.draw_noise(toy_frames((2, 4)))
+    eager = filter.sequence(frames.copy())
+    filter.compile(chunk=3, backend="eager")
+    assert filter.sequence(frames.copy())["belief", "ensemble"].equal(eager["belief", "ensemble"])
+    assert not filter._compiled._functions
+    assert filter.compile(chunk=0)._compiled is None
+    with pytest.raises(ValueError, match="number of steps"):
+        filter.compile(chunk=-1)
+
+
+def test_pickles_without_what_was_compiled():
+    filter = toy_denkf().compile(chunk=3, backend="eager")
+    filter._compiled._functions["something"] = lambda: None
+    other = pickle.loads(pickle.dumps(filter))
+    assert other._compiled.chunk == 3
+    assert other._compiled._functions == {}
+
+
+def test_without_a_compiler_it_says_what_to_install(monkeypatch):
+    from torch._inductor import cpp_builder
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    def none():
+        raise InvalidCxxCompiler
+
+    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", none)
+    with pytest.raises(RuntimeError, match="apt install g"):
+        toy_denkf().compile()
+    with pytest.raises(RuntimeError, match="C\\+\\+ compiler"):
+        _compiled.need_compiler()

@@ -1,0 +1,172 @@
+"""Steps and chunks of sequences through ``torch.compile``, kept for the next call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import FunctionType
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torch_denkf.filters._recursion import Recursion, run
+from torch_denkf.modules._row import Row, RowPlan
+
+__all__ = ["CompiledSteps", "need_compiler"]
+
+
+class CompiledSteps:
+    """Compiled functions of one filter, one for each kind of call: entries, batch size, number of steps.
+
+    Neither pickled nor copied with the filter: a worker compiles its own.
+
+    Args:
+        chunk: steps of a sequence in one graph.
+        options: of ``torch.compile``.
+    """
+
+    def __init__(self, chunk: int, options: Mapping[str, Any]):
+        need_compiler()
+        self.chunk, self.options = chunk, dict(options)
+        self._functions: dict[tuple, Callable] = {}
+
+    def __getstate__(self) -> dict:
+        return {"chunk": self.chunk, "options": self.options, "_functions": {}}
+
+    @staticmethod
+    def takes(entries: Mapping[NestedKey, Any]) -> bool:
+        """Whether all entries are tensors; flipout's noise is none."""
+        return all(isinstance(value, Tensor) for value in entries.values())
+
+    def step(self, plan: RowPlan, row: Row, dtype: torch.dtype) -> Row:
+        """Takes one step on a row; noise is drawn here, as a sequence draws it."""
+        for module in plan.modules:
+            key = module.noise_key
+            if key is not None and key not in row.entries:
+                noise = module.draw_noise(row.batch_size, device=row.device, dtype=dtype)
+                if noise is not None:
+                    row.set(key, noise)
+        if not self.takes(row.entries):
+            return run(plan.modules, row)
+        keys = tuple(row.entries)
+        function = self._function(
+            ("step", keys, row.batch_size, row.device),
+            plan.modules,
+            lambda: _step(plan.modules, keys, tuple(plan.writes), row.batch_size, row.device),
+        )
+        return row.update(dict(zip(plan.writes, function(*row.entries.values()), strict=True)))
+
+    def sequence(
+        self,
+        recursion: Recursion,
+        control_keys: Sequence[NestedKey],
+        inputs: dict[NestedKey, Tensor],
+        is_init: Tensor | None,
+        starts: TensorDictBase,
+        detach_every: int | None,
+    ) -> dict[NestedKey, Tensor]:
+        """What the recursion writes on a sequence ``[*B, T]``, in chunks.
+
+        Args:
+            recursion: of the filter.
+            control_keys: inputs that are read one step earlier.
+            inputs: entries ``[*B, T, ...]``.
+            is_init: ``[*B, T, 1]``, or ``None``.
+            starts: initial beliefs ``[*B, T]``, or ``[*B, 1]`` where ``is_init`` is ``None``.
+            detach_every: the belief is detached every so many steps.
+        """
+        some = next(iter(inputs.values()))
+        batch, device, time = starts.batch_size[:-1], starts.device, starts.ndim - 1
+        steps = some.shape[time]
+        keys = tuple(inputs)
+        start_keys = tuple(dict.fromkeys((*recursion.belief_keys, *recursion.carry_keys)))
+        start = tuple(starts.get(key) for key in start_keys)
+
+        def function(kind: str, count: int, cuts: tuple[bool, ...]) -> Callable:
+            resets = is_init is not None and kind != "first"
+            facts = (kind, keys, start_keys, batch, device, count, cuts, resets, recursion.update_at_reset)
+            make = lambda: _chunk(recursion, keys, start_keys, batch, device, time, cuts, kind == "first")  # noqa: E731
+            return self._function(facts, recursion.modules, make)
+
+        def part(begin: int, count: int) -> tuple[Tensor, ...]:
+            before = max(begin - 1, 0)
+            return tuple(inputs[key].narrow(time, before if key in control_keys else begin, count) for key in keys)
+
+        first = tuple(value.narrow(time, 0, 1) for value in start)
+        carry, values = function("first", 1, ())((), part(0, 1), None, first)
+        outputs = [values]
+        begin = 1
+        while begin < steps:
+            count = self.chunk if steps - begin >= self.chunk else 1
+            cuts = tuple(bool(detach_every) and t % detach_every == 0 for t in range(begin, begin + count))
+            reset = None if is_init is None else is_init.narrow(time, begin, count)
+            now = () if is_init is None else tuple(value.narrow(time, begin, count) for value in start)
+            carry, values = function("chunk", count, cuts)(carry, part(begin, count), reset, now)
+            outputs.append(values)
+            begin += count
+        return {
+            key: torch.cat(values, time)
+            for key, values in zip(recursion.out_keys, zip(*outputs, strict=True), strict=True)
+        }
+
+    def _function(self, facts: tuple, modules: tuple, make: Callable[[], Callable]) -> Callable:
+        facts = (*facts, modules)  # a part of the filter may be replaced
+        if facts not in self._functions:
+            function = make()
+            # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
+            code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
+            own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
+            self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **self.options)
+        return self._functions[facts]
+
+
+def _step(modules: tuple, keys: tuple, writes: tuple, batch, device) -> Callable:
+    def step(*values: Tensor) -> tuple[Tensor, ...]:
+        row = run(modules, Row(dict(zip(keys, values, strict=True)), batch, device))
+        return tuple(row.get(key) for key in writes)
+
+    return step
+
+
+def _chunk(recursion: Recursion, keys, start_keys, batch, device, time: int, cuts: tuple, first: bool) -> Callable:
+    def rows(names: tuple, values: tuple[Tensor, ...], count: int) -> list[Row]:
+        columns = [value.unbind(time) for value in values]
+        return [
+            Row(dict(zip(names, [column[t] for column in columns], strict=True)), batch, device) for t in range(count)
+        ]
+
+    def chunk(carry: tuple, inputs: tuple, resets: Tensor | None, starts: tuple) -> tuple[tuple, tuple]:
+        if first:
+            outputs = [recursion.first(rows(keys, inputs, 1)[0], rows(start_keys, starts, 1)[0])]
+            belief = outputs[0]
+        else:
+            belief, outputs = recursion.roll(
+                Row(dict(zip(recursion.carry_keys, carry, strict=True)), batch, device),
+                rows(keys, inputs, len(cuts)),
+                None if resets is None else resets.unbind(time),
+                [] if resets is None else rows(start_keys, starts, len(cuts)),
+                cuts,
+            )
+        stacked = tuple(torch.stack([output.get(key) for output in outputs], time) for key in recursion.out_keys)
+        return tuple(belief.get(key) for key in recursion.carry_keys), stacked
+
+    return chunk
+
+
+def need_compiler() -> None:
+    """Checks that inductor finds a C++ compiler.
+
+    Raises:
+        RuntimeError: if it does not; the message says what to install.
+    """
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        raise RuntimeError(
+            "Compiling a filter needs a C++ compiler (Debian: apt install g++; or set CXX to one); without, leave out "
+            "filter.compile()."
+        ) from error
