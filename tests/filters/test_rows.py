@@ -10,7 +10,17 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from tests.filters.factories import E, S, toy_denkf, toy_frames
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import LearnedObservation, Select
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    LearnedObservation,
+    Select,
+    StochasticMLP,
+    UnicycleMotion,
+    UnicycleTransition,
+    WithHistory,
+)
 from torch_denkf.modules._row import Row, on_rows
 
 
@@ -117,3 +127,26 @@ def test_a_filter_that_has_run_is_copied_and_pickled():
     assert filter.step(td.copy())["belief", "mean"].equal(expected)
     assert expected.shape == (2, S)
     assert td["belief", "ensemble"].shape == (2, E, S)
+
+
+def test_a_vehicle_with_history_is_the_same_on_rows():
+    filter = DEnKF(
+        transition=UnicycleTransition(StochasticMLP(2, 2, (8,)), dt=0.1, history_key=("belief", "history")),
+        sensor=None,
+        observation=Select([3, 4]),
+        noise=ConstantNoise([0.3, 0.1], in_key="reading"),
+        analysis=TensorDictSequential(
+            EnsembleAnalysis("sakov", sensor_key="reading", belief_key="analysis"), UnicycleMotion(0.1)
+        ),
+        initial=WithHistory(AroundState([0.1, 0.1, 0.1, 1.0, 0.2], ensemble_size=6), lags=2),
+    )
+    frames = TensorDict({"reading": torch.randn(2, 6, 2), "state": torch.randn(2, 6, 5)}, [2, 6])
+    filter.draw_noise(frames)
+    assert filter._make_recursion(False).on_rows
+    ours = filter.sequence(frames.copy())
+    handle = filter["observation"].register_forward_hook(lambda *_: None)
+    assert not filter._make_recursion(False).on_rows
+    theirs = filter.sequence(frames.copy())
+    handle.remove()
+    for key in filter.out_keys:
+        assert ours.get(key).equal(theirs.get(key)), key

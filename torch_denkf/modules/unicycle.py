@@ -75,6 +75,8 @@ class UnicycleTransition(StochasticTransition):
         self.register_buffer("loc", torch.as_tensor(loc, dtype=torch.get_default_dtype()))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.get_default_dtype()))
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble."""
         state = self.read(tensordict, self.in_keys[0])
@@ -151,6 +153,8 @@ class UnicycleMotion(SubModel):
         optional_keys = [steps_key] if histories else []
         super().__init__(nn.Identity(), [before_key, analysis_key, *histories], out_keys, optional_keys=optional_keys)
         self.dt, self.history_key, self.smooth = dt, history_key, smooth
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief."""
