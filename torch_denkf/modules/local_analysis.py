@@ -137,6 +137,8 @@ class LocalEnsembleAnalysis(SubModel):
             return None
         return random_rotation(self.ensemble_size, tuple(batch_size), device=device, dtype=dtype, generator=generator)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""
         forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
