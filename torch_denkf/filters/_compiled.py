@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import FunctionType
 from typing import Any
 
@@ -53,7 +54,7 @@ class CompiledSteps:
         function = self._function(
             ("step", keys, row.batch_size, row.device),
             plan.modules,
-            lambda: _step(plan.modules, keys, tuple(plan.writes), row.batch_size, row.device),
+            partial(_step, plan.modules, keys, tuple(plan.writes), row.batch_size, row.device),
         )
         return row.update(dict(zip(plan.writes, function(*row.entries.values()), strict=True)))
 
@@ -86,7 +87,7 @@ class CompiledSteps:
         def function(kind: str, count: int, cuts: tuple[bool, ...]) -> Callable:
             resets = is_init is not None and kind != "first"
             facts = (kind, keys, start_keys, batch, device, count, cuts, resets, recursion.update_at_reset)
-            make = lambda: _chunk(recursion, keys, start_keys, batch, device, time, cuts, kind == "first")  # noqa: E731
+            make = partial(_chunk, recursion, keys, start_keys, batch, device, time, cuts, kind == "first")
             return self._function(facts, recursion.modules, make)
 
         def part(begin: int, count: int) -> tuple[Tensor, ...]:
