@@ -177,14 +177,14 @@ def test_learned_likelihood_takes_the_mean_of_members():
     torch.testing.assert_close(model(td)["forecast", "log_likelihood"], model(mean)["forecast", "log_likelihood"])
 
 
-def test_learned_likelihood_sees_the_reading():
-    """By hand: the encoding, the mean reading and the prediction, both standardised alike; nothing where not observed."""
-    loc, scale = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
-    model = LearnedLikelihood(F, OBS, num_cells=(8,), loc=loc, scale=scale, reading_key=("sensor", "ensemble"))
+def test_learned_likelihood_sees_the_innovation():
+    """By hand: the encoding, and the compressed innovation of the mean reading; nothing where not observed."""
+    scale = torch.tensor([0.5, 3.0])
+    model = LearnedLikelihood(F, OBS, num_cells=(8,), scale=scale, reading_key=("sensor", "ensemble"))
     td = reading((4,), members=3)
-    own, predicted = ((td[key] - loc) / scale for key in (("sensor", "ensemble"), ("forecast", "observation")))
-    features = torch.cat([td["sensor", "encoding"], own.mean(-2)], -1).unsqueeze(-2).expand(-1, E, -1)
-    value = model.module(torch.cat([features, predicted], -1))[..., 0]
+    innovation = (td["sensor", "ensemble"].mean(-2, keepdim=True) - td["forecast", "observation"]) / scale
+    features = td["sensor", "encoding"].unsqueeze(-2).expand(-1, E, -1)
+    value = model.module(torch.cat([features, innovation.sign() * (1 + innovation.abs()).log()], -1))[..., 0]
     expected = (0.004 + 0.996 * value.sigmoid()).log()
     torch.testing.assert_close(model(td.copy())["forecast", "log_likelihood"], expected)
     td["observed"] = torch.tensor([[True], [False], [True], [True]])
@@ -192,6 +192,11 @@ def test_learned_likelihood_sees_the_reading():
     out = model(td)["forecast", "log_likelihood"]
     torch.testing.assert_close(out[[0, 2, 3]], expected[[0, 2, 3]])
     assert (out[1] == 0).all()
+
+
+def test_learned_likelihood_of_an_innovation_has_no_loc():
+    with pytest.raises(ValueError, match="scale alone"):
+        LearnedLikelihood(F, OBS, loc=[0.0, 0.0], reading_key=("sensor", "ensemble"))
 
 
 SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), reading_key=("sensor", "ensemble"))

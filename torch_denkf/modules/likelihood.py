@@ -89,27 +89,35 @@ class LearnedLikelihood(SubModel):
     particles. Where nothing is observed it is zero for all particles; where some dimensions are, the network sees the
     mean of the others in place of the particle's.
 
+    So it is in the papers, where the encoding must say what was read. A network that is trained on few recordings does
+    not find that in the encodings of new ones. Where a trained sensor is at hand, ``reading_key`` tells it the
+    innovation instead:
+
+    .. math:: \log l^i = b(g(e \oplus \mathrm{sign}(d^i) \log(1 + |d^i|))), \quad d^i = (y - h(x^i)) / s
+
+    whose logarithm resolves the near particles and keeps the far ones in range.
+
     Args:
         encoding_dim: F, size of the encoding.
         observation_dim: O.
         num_cells: hidden layers; both papers have (128, 128).
         bound: ``"scaled"``, :math:`\log(0.004 + 0.996\, \mathrm{sigmoid}(g))` (Jonschkowski et al. 2018), or
             ``"clipped"``, :math:`\max(\log \mathrm{sigmoid}(g), -20)` (the limit of Kloss et al. 2021).
-        loc: mean m of each observation dimension ``[O]``; zero by default.
-        scale: standard deviation s of each observation dimension ``[O]``; one by default.
-        network: maps ``[*, F + O]`` (with a ``reading_key`` ``[*, F + 2 O]``) to ``[*, 1]``; a multi-layer perceptron
-            with ``num_cells`` by default.
+        loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``reading_key``.
+        scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``reading_key`` what a good
+            reading errs by; one by default.
+        network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
-        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used: the network sees it,
-            too, and need not find it in the encoding. Nothing by default, as in the papers.
+        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by default, as
+            in the papers.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
             be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
     Raises:
-        ValueError: on an unknown ``bound``.
+        ValueError: on an unknown ``bound``, or with both ``loc`` and ``reading_key``.
         KeyError: if an entry is missing.
 
     Reference:
@@ -142,9 +150,10 @@ class LearnedLikelihood(SubModel):
     ):
         if bound not in ("scaled", "clipped"):
             raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
+        if loc is not None and reading_key is not None:
+            raise ValueError("with a reading_key the network sees the innovation, which has no loc; pass scale alone.")
         if network is None:
-            seen_dim = encoding_dim + (0 if reading_key is None else observation_dim)
-            network = StochasticMLP(seen_dim + observation_dim, 1, num_cells, layer="none")
+            network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
         in_keys = [key for key in (encoding_key, predicted_key, reading_key) if key is not None]
         super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
         self.bound, self.observation_dim = bound, observation_dim
@@ -157,23 +166,26 @@ class LearnedLikelihood(SubModel):
         """Writes the log-likelihoods."""
         encoding, predicted, *readings = (self.read(tensordict, key) for key in self.in_keys)
         encoding = _mean_of_members(encoding, tensordict)
-        predicted = (predicted - self.loc) / self.scale
-        readings = [(_mean_of_members(reading, tensordict) - self.loc) / self.scale for reading in readings]
+        if readings:
+            difference = _mean_of_members(readings[0], tensordict).unsqueeze(-2) - predicted
+        else:
+            difference = predicted - self.loc
+        seen = difference / self.scale
         observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
-            seen = observed.any(-1, keepdim=True)
-            encoding = torch.where(seen, encoding, 0.0)
-            predicted = torch.where(observed.unsqueeze(-2), predicted, 0.0)
-            readings = [torch.where(observed, reading, 0.0) for reading in readings]
-        encoding = torch.cat([encoding, *readings], -1)
-        encoding = encoding.unsqueeze(-2).expand(*predicted.shape[:-1], encoding.shape[-1])
-        value = self.module(torch.cat([encoding, predicted], -1)).squeeze(-1)
+            anything = observed.any(-1, keepdim=True)
+            encoding = torch.where(anything, encoding, 0.0)
+            seen = torch.where(observed.unsqueeze(-2), seen, 0.0)
+        if readings:
+            seen = seen.sign() * seen.abs().log1p()
+        encoding = encoding.unsqueeze(-2).expand(*seen.shape[:-1], encoding.shape[-1])
+        value = self.module(torch.cat([encoding, seen], -1)).squeeze(-1)
         if self.bound == "scaled":
             value = (_SMALLEST_LIKELIHOOD + (1 - _SMALLEST_LIKELIHOOD) * value.sigmoid()).log()
         else:
             value = nn.functional.logsigmoid(value).clamp(min=_SMALLEST_LOG_LIKELIHOOD)
         if observed is not None:
-            value = torch.where(seen, value, 0.0)
+            value = torch.where(anything, value, 0.0)
         return tensordict.set(self.out_keys[0], value)
 
 

@@ -54,8 +54,7 @@ class _Particles(Recipe):
                 self.encoding,
                 2,
                 bound=self.learned,
-                loc=facts.loc,
-                scale=facts.scale,
+                scale=facts.unit,
                 reading_key=("sensor", "ensemble"),
                 **keys,
             )

@@ -38,13 +38,11 @@ class _Particles(Recipe):
         modules["transition"] = ResampledTransition(noisy, self.resampling)
         modules["near"] = NearForecast(self.preset)
         if self.learned:
-            loc, scale = self.facts.loc, self.facts.scale
             likelihood = LearnedLikelihood(
                 self.encoding,
                 STATE,
                 bound=self.learned,
-                loc=loc,
-                scale=scale,
+                scale=ERRORS,
                 reading_key=NEAR,
             )
         else:
