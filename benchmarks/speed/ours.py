@@ -12,7 +12,7 @@ from benchmarks.speed.workload import MEMBERS, STEPS, make_filter, make_frames, 
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 
-CHUNK = 4  # steps in one compiled graph
+CHUNK = 10  # steps in one compiled graph
 
 
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:

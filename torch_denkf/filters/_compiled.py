@@ -24,7 +24,7 @@ class CompiledSteps:
 
     Args:
         chunk: steps of a sequence in one graph.
-        options: of ``torch.compile``.
+        options: of ``torch.compile``; on a processor, if there are none, inductor's calls are C++, too.
     """
 
     def __init__(self, chunk: int, options: Mapping[str, Any]):
@@ -54,6 +54,7 @@ class CompiledSteps:
         function = self._function(
             ("step", keys, row.batch_size, row.device),
             plan.modules,
+            next(iter(row.entries.values())).device,
             partial(_step, plan.modules, keys, tuple(plan.writes), row.batch_size, row.device),
         )
         return row.update(dict(zip(plan.writes, function(*row.entries.values()), strict=True)))
@@ -88,7 +89,7 @@ class CompiledSteps:
             resets = is_init is not None and kind != "first"
             facts = (kind, keys, start_keys, batch, device, count, cuts, resets, recursion.update_at_reset)
             make = partial(_chunk, recursion, keys, start_keys, batch, device, time, cuts, kind == "first")
-            return self._function(facts, recursion.modules, make)
+            return self._function(facts, recursion.modules, some.device, make)
 
         def part(begin: int, count: int) -> tuple[Tensor, ...]:
             before = max(begin - 1, 0)
@@ -111,14 +112,16 @@ class CompiledSteps:
             for key, values in zip(recursion.out_keys, zip(*outputs, strict=True), strict=True)
         }
 
-    def _function(self, facts: tuple, modules: tuple, make: Callable[[], Callable]) -> Callable:
-        facts = (*facts, modules)  # a part of the filter may be replaced
+    def _function(self, facts: tuple, modules: tuple, device: torch.device, make: Callable[[], Callable]) -> Callable:
+        facts = (*facts, modules, device)  # a part of the filter may be replaced
         if facts not in self._functions:
             function = make()
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
             own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
-            self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **self.options)
+            # A step is thirty kernels of a few microseconds, and calling one from Python takes another.
+            options = self.options or ({"options": {"cpp_wrapper": True}} if device.type == "cpu" else {})
+            self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **options)
         return self._functions[facts]
 
 

@@ -1,6 +1,7 @@
 """The mathematics: tensors in, tensors out, no state, any leading batch dimensions."""
 
 from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
+from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
@@ -58,6 +59,7 @@ __all__ = [
     "crps_gaussian",
     "energy_score",
     "dropout_factor",
+    "dropped_relu",
     "random_bytes",
     "random_keep_mask",
     "random_signs",

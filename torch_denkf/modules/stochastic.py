@@ -24,6 +24,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.nn import functional as F
 
+from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
@@ -209,9 +210,12 @@ class StochasticMLP(nn.Module):
             run = [(layer, None) for layer in self.layers]
         hidden = x
         for layer, factor in run[:-1]:
-            hidden = self.activation(layer(hidden))
-            if factor is not None:
-                hidden = hidden * factor
+            hidden = layer(hidden)
+            if factor is not None and isinstance(self.activation, nn.ReLU):
+                hidden = dropped_relu(hidden, factor, self.rate)
+            else:
+                hidden = self.activation(hidden)
+                hidden = hidden if factor is None else hidden * factor
         return run[-1][0](hidden), hidden
 
     def _dropout(self, draws: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:
