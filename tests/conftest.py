@@ -1,7 +1,12 @@
-"""Every test starts from the same seed; ``float64`` makes double the default type of what it builds."""
+"""Every test starts from the same seed; ``float64`` makes double the default type of what it builds.
+
+``pytest tests/filters/test_kalman.py --compiled`` puts all filters through ``torch.compile``.
+"""
 
 import pytest
 import torch
+
+from torch_denkf.filters import Filter
 
 
 @pytest.fixture(autouse=True)
@@ -15,3 +20,21 @@ def float64():
     torch.set_default_dtype(torch.float64)
     yield torch.float64
     torch.set_default_dtype(before)
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--compiled", action="store_true", help="filters compile themselves: oracles must hold all the same"
+    )
+
+
+@pytest.fixture(autouse=True)
+def compiled(request, monkeypatch):
+    if request.config.getoption("--compiled"):
+        plain = Filter.__init__
+
+        def compile_too(self, *args, **kwargs):
+            plain(self, *args, **kwargs)
+            self.compile(chunk=4)
+
+        monkeypatch.setattr(Filter, "__init__", compile_too)

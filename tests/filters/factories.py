@@ -71,6 +71,8 @@ class NoisyLinear(SubModel):
         shape = (*batch_size, self.ensemble_size, self.matrix.shape[0])
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
+    runs_on_rows = True
+
     def forward(self, tensordict):
         state = self.read(tensordict, self.in_keys[0])
         out = state @ self.matrix.mT

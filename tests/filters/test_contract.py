@@ -1,7 +1,7 @@
 """What every filter promises, whatever its belief: one table of filters, one list of promises.
 
 The oracles are the filter's own: another way to compute the same, which must agree. That the numbers are right is
-shown in each filter's own file, against a Kalman filter. Compiled steps: test_ekf.py, test_particle.py, test_base.py.
+shown in each filter's own file, against a Kalman filter.
 """
 
 import pickle
@@ -17,7 +17,7 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import LSTMFilter, ParticleFilter
+from torch_denkf.filters import LSTMFilter, ParticleFilter, _recursion, base
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
 from torch_denkf.transforms import DEnKFTransform
 
@@ -108,6 +108,41 @@ def test_steps_are_the_sequence(float64, name, width):
     assert_same(torch.stack(rows, 1), expected, filter.belief_keys, atol=1e-10)
     with set_recurrent_mode(True):
         assert_same(filter(frames.copy()), expected, filter.belief_keys)
+
+
+@every_filter
+def test_rows_are_tensordicts_bit_for_bit(float64, name, monkeypatch):
+    filter, frames = FILTERS[name](), readings(3, 9, width=2)
+    assert filter._make_recursion(False).on_rows
+    filter.draw_noise(frames)
+    on_rows = filter.sequence(frames.copy())
+    step_on_rows = filter.step(on_rows[:, 4].copy())
+    for module in (base, _recursion):
+        monkeypatch.setattr(module, "on_rows", lambda *_: None)
+    assert not filter._make_recursion(False).on_rows
+    assert_same(on_rows, filter.sequence(frames.copy()), filter.out_keys)
+    assert_same(step_on_rows, filter.step(on_rows[:, 4].copy()), filter.out_keys)
+
+
+@every_filter
+def test_compiled_is_eager(float64, name):
+    """Forward and backward. What inductor makes of a graph is tested in test_compiled.py."""
+    filter, frames = FILTERS[name](), readings(3, 5, width=2)
+    filter.draw_noise(frames)
+    frames["observation"].requires_grad_()
+    outs = []
+    for chunk in (0, 2):
+        out = filter.compile(chunk=chunk, backend="eager").sequence(frames.copy())
+        torch.manual_seed(0)
+        step = filter.step(out[:, 3].select(*filter.carry_keys, *frames.keys()).exclude("noise"))
+        gradient = torch.autograd.grad(out["belief", "mean"].square().sum(), frames["observation"])
+        outs.append((out, step, gradient[0]))
+    assert {facts[0] for facts in filter._compiled._functions} == {"first", "chunk", "step"}
+    for eager, compiled in zip(*outs, strict=True):
+        if isinstance(eager, torch.Tensor):
+            torch.testing.assert_close(compiled, eager, rtol=0, atol=1e-11)
+        else:
+            assert_same(compiled, eager, filter.out_keys, atol=1e-11)
 
 
 @every_filter

@@ -42,7 +42,7 @@ class CompiledSteps:
 
     def step(self, plan: RowPlan, row: Row, dtype: torch.dtype) -> Row:
         """Takes one step on a row; noise is drawn here, as a sequence draws it."""
-        for module in plan.modules:
+        for module in plan.parts:
             key = module.noise_key
             if key is not None and key not in row.entries:
                 noise = module.draw_noise(row.batch_size, device=row.device, dtype=dtype)

@@ -35,6 +35,8 @@ class GaussianTransition(SubModel):
         self.process_noise = process_noise
         self.ensemble_key, self.forecast_ensemble_key = ensemble_key, forecast_ensemble_key
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast."""
         mean, cov = (self.read(tensordict, key) for key in self.in_keys[:2])
@@ -80,6 +82,8 @@ class GaussianAnalysis(SubModel):
         super().__init__(observation, in_keys, out_keys, optional_keys=[observed_key])
         self.inflation, self.angles = inflation, list(angles)
         self.ensemble_key, self.predicted_key = ensemble_key, predicted_key
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""

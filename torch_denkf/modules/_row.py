@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
@@ -56,14 +56,21 @@ class Row:
     def write(self, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> TensorDictBase:
         """Sets the entries ``keys`` in a tensordict, which checks only what does not fit at first sight."""
         size, device, entries = self.batch_size, self.device, self.entries
-        ndim = len(size)
+        ndim, owners = len(size), {}
         for key in keys:
             value = entries[key]
             fits = (
                 isinstance(value, Tensor) and value.shape[:ndim] == size and (device is None or device == value.device)
             )
-            nested = (key,) if isinstance(key, str) else key
-            tensordict._set_tuple(nested, value, inplace=False, validated=fits)
+            path, name = ((), key) if isinstance(key, str) else (key[:-1], key[-1])
+            owner = owners.get(path)
+            if owner is None:
+                owner = owners[path] = tensordict.get(path, None) if path else tensordict
+            if type(owner) is TensorDict:
+                owner._set_str(name, value, inplace=False, validated=fits)
+            else:  # not there yet, or something else
+                del owners[path]
+                tensordict._set_tuple((*path, name), value, inplace=False, validated=fits)
         return tensordict
 
     @property
@@ -89,6 +96,15 @@ class Row:
         """A row of some of the entries."""
         return Row({key: self.entries[key] for key in keys}, self.batch_size, self.device)
 
+    def copy(self) -> Row:
+        """Another row of the same entries."""
+        return Row(dict(self.entries), self.batch_size, self.device, self.source)
+
+    def expand(self, *shape: int) -> Row:
+        """A row of the entries, each ``[*shape, ...]`` in place of ``[*B, ...]``."""
+        entries = {key: value.expand(*shape, *value.shape[self.ndim :]) for key, value in self.entries.items()}
+        return Row(entries, torch.Size(shape), self.device)
+
     def detach(self) -> Row:
         """A row of the entries without their history."""
         entries = {key: value.detach() for key, value in self.entries.items()}
@@ -108,19 +124,22 @@ class RowPlan(NamedTuple):
         modules: the sub-models to run, in order; sequences among ``given`` are opened.
         reads: entries that they may read before they write them.
         writes: entries that they write.
+        parts: all sub-models, also those inside others, outer ones first: the order in which they draw noise.
     """
 
     given: tuple[TensorDictModuleBase, ...]
     modules: tuple[SubModel, ...]
     reads: list[NestedKey]
     writes: list[NestedKey]
+    parts: tuple[SubModel, ...]
 
 
 def on_rows(modules: Iterable[TensorDictModuleBase], known: RowPlan | None = None) -> RowPlan | None:
     """A plan to run all modules on a :class:`Row` if they can; otherwise ``None``.
 
     A sub-model can if the class that defines its ``forward`` says ``runs_on_rows = True``, so a sub-class with its own
-    ``forward`` gets a TensorDict unless it says so, too; and if nobody has hooked into it.
+    ``forward`` gets a TensorDict unless it says so, too; if all modules of tensordicts inside it can; and if nobody has
+    hooked into it.
 
     Args:
         modules: in order.
@@ -135,13 +154,17 @@ def on_rows(modules: Iterable[TensorDictModuleBase], known: RowPlan | None = Non
             return None
         reads: dict[NestedKey, None] = {}
         writes: dict[NestedKey, None] = {}
+        parts: list[SubModel] = []
         for module in flat:
-            keys = (*module.in_keys, *module.optional_keys, module.noise_key)
-            reads.update(dict.fromkeys(key for key in keys if key is not None and key not in writes))
+            inner = [part for part in module.modules() if isinstance(part, SubModel)]
+            for part in inner:
+                keys = (*part.in_keys, *part.optional_keys, part.noise_key)
+                reads.update(dict.fromkeys(key for key in keys if key is not None and key not in writes))
+            parts += inner
             writes.update(dict.fromkeys(module.out_keys))
-        known = RowPlan(given, tuple(flat), list(reads), list(writes))
-    for module in known.modules:
-        if module._forward_hooks or module._forward_pre_hooks:
+        known = RowPlan(given, tuple(flat), list(reads), list(writes), tuple(parts))
+    for part in known.parts:
+        if part._forward_hooks or part._forward_pre_hooks:
             return None
     return known
 
@@ -156,5 +179,7 @@ def _opened(modules: Iterable[TensorDictModuleBase]) -> list[TensorDictModuleBas
 
 
 def _runs_on_rows(module: TensorDictModuleBase) -> bool:
-    owner = next(kind for kind in type(module).__mro__ if "forward" in vars(kind))
-    return isinstance(module, SubModel) and vars(owner).get("runs_on_rows", False)
+    parts = [part for part in module.modules() if isinstance(part, TensorDictModuleBase)]
+    owners = [next(kind for kind in type(part).__mro__ if "forward" in vars(kind)) for part in parts]
+    flags = [vars(owner).get("runs_on_rows", False) for owner in owners]
+    return all(flags) and all(isinstance(part, SubModel) for part in parts)

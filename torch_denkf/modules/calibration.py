@@ -63,6 +63,8 @@ class MemberGain(SubModel):
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the samples."""
         samples = self.read(tensordict, self.in_keys[0])

@@ -139,6 +139,8 @@ class LinearTransition(SubModel):
         else:
             self.register_buffer("noise", _matrix(noise))
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast."""
         mean, cov = (self.read(tensordict, key) for key in self.in_keys[:2])
@@ -212,6 +214,8 @@ class KalmanAnalysis(SubModel):
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""
         return state @ self.matrix.mT
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""

@@ -60,6 +60,8 @@ class GaussianLikelihood(SubModel):
             nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the log-likelihoods."""
         predicted, reading, variance = (self.read(tensordict, key) for key in self.in_keys)
@@ -161,6 +163,8 @@ class LearnedLikelihood(SubModel):
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
             value = torch.as_tensor(default if value is None else value, dtype=dtype)
             self.register_buffer(name, value.expand(observation_dim).clone())
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the log-likelihoods."""

@@ -81,6 +81,8 @@ class NoisyTransition(SubModel):
         shape = (*batch_size, self.ensemble_size, len(self.dims))
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble."""
         key, out_key = self.in_keys[0], self.out_keys[0]

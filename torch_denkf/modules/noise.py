@@ -165,6 +165,8 @@ class ScaledNoise(SubModel):
         super().__init__(noise, noise.in_keys, noise.out_keys)
         self.factor = factor
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the scaled variances or covariance."""
         out, key = self.module(tensordict), self.out_keys[0]

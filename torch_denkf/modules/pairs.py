@@ -120,6 +120,8 @@ class PairObservation(SubModel):
         self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
         self.observation_dim = 2
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the predicted observations, the ensemble that the analysis is to update, and the mask."""
         forecast, *history = (self.read(tensordict, key) for key in self.in_keys)
@@ -203,6 +205,8 @@ class ClonedTransition(SubModel):
         in_keys = [key for key in transition.in_keys if unravel_key(key) != self_made]
         super().__init__(transition, in_keys, transition.out_keys)
         self.history_key = self_made
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble."""

@@ -137,6 +137,8 @@ class ResampledTransition(SubModel):
             return None
         return torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast ensemble and its weights."""
         (key, weight_key), (_, out_weight_key) = self.in_keys[:2], self.out_keys[:2]
@@ -221,6 +223,8 @@ class ParticleAnalysis(SubModel):
             + [(info_key, name) for name in ("ess", "log_likelihood")],
         )
         self.tempering = tempering
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the belief and the diagnostics."""

@@ -95,6 +95,8 @@ class CholeskyNoise(SubModel):
         self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the covariance."""
         features = self.read(tensordict, self.in_keys[0])
@@ -155,6 +157,8 @@ class MappedNoise(_MappedNoise):
         super().__init__(noise, [])
         self.register_buffer("matrix", torch.as_tensor(matrix, dtype=torch.get_default_dtype()))
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the covariance."""
         return self._write(tensordict, self.matrix)
@@ -198,6 +202,8 @@ class UnicycleNoise(_MappedNoise):
     ):
         super().__init__(noise, [belief_key, forecast_key])
         self.belief_key, self.forecast_key, self.dt = belief_key, forecast_key, dt
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the covariance."""

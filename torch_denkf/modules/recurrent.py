@@ -81,6 +81,8 @@ class LSTMTransition(SubModel):
         in_keys, out_keys = ([(key, name) for name in names] for key in (belief_key, forecast_key))
         super().__init__(nn.Identity(), in_keys, out_keys)
 
+    runs_on_rows = True
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the forecast."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
@@ -191,6 +193,8 @@ class LSTMUpdate(SubModel):
         ):
             value = torch.as_tensor(default if value is None else value, dtype=dtype)
             self.register_buffer(name, value.expand(size).clone())
+
+    runs_on_rows = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the memory and the belief."""
