@@ -27,6 +27,7 @@ layers: $(STAMP)
 
 unit: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 tests/filters/test_kalman.py --compiled
 
 smoke: $(STAMP)
 	for example in examples/*.py; do echo "== $$example --smoke" && $(BIN)/python $$example --smoke || exit 1; done

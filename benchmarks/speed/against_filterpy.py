@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.speed.ours import tensordict_loop
+from benchmarks.speed.ours import steps
 from benchmarks.speed.pairs import Row, interleave
 from benchmarks.speed.workload import MEMBERS, OBSERVATION, RATE, STATE, make_filter, make_frames, noise_floor, weights
 
@@ -60,5 +60,6 @@ def rows(seconds: float) -> list[Row]:
         rtol=1e-4,
         atol=1e-5,
     )
-    timings = interleave({"ours": tensordict_loop(filter, 1), "filterpy": filterpy_loop()}, seconds=seconds)
-    return [timings.row("step / filterpy, B=1", "ours", "filterpy", target=0.3, note=NOTE)]
+    ours = steps(1)
+    timings = interleave({**ours, "filterpy": filterpy_loop()}, seconds=seconds)
+    return [timings.row(f"{kind} step / filterpy, B=1", kind, "filterpy", target=0.3, note=NOTE) for kind in ours]

@@ -18,10 +18,18 @@ CHUNK = 10  # steps in one compiled graph
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
     """The sequence eagerly and, unless SPEED_COMPILE=0, compiled in chunks; names for the table."""
     fields = {"samples": scheme == "sensor", "backward": backward}
-    out = {"eager": sequence(make_filter(scheme), batch, **fields)}
-    if os.environ.get("SPEED_COMPILE") != "0":
-        out["compiled"] = sequence(make_filter(scheme).compile(chunk=CHUNK), batch, **fields)
-    return out
+    return {kind: sequence(filter, batch, **fields) for kind, filter in filters(scheme).items()}
+
+
+def steps(batch: int) -> dict[str, Callable[[], Tensor]]:
+    """A step on a tensordict, eagerly and compiled likewise."""
+    return {kind: tensordict_loop(filter, batch) for kind, filter in filters("sensor").items()}
+
+
+def filters(scheme: str) -> dict[str, DEnKF]:
+    """An eager filter and, unless SPEED_COMPILE=0, a compiled one."""
+    compiled = {} if os.environ.get("SPEED_COMPILE") == "0" else {"compiled": make_filter(scheme).compile(chunk=CHUNK)}
+    return {"eager": make_filter(scheme), **compiled}
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:

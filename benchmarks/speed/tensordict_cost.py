@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import importlib.util
 
-from benchmarks.speed.ours import functional_loop, tensordict_loop
+from benchmarks.speed.ours import functional_loop, steps
 from benchmarks.speed.pairs import Row, interleave
 from benchmarks.speed.workload import make_filter
 
-NOTE = "one step each, eager; both draw their noise and compute all outputs; pandas hidden"
+NOTE = "one step each, the functions eager; both draw their noise and compute all outputs; pandas hidden"
 
 
 def without_pandas() -> None:
@@ -28,14 +28,9 @@ def rows(seconds: float) -> list[Row]:
     without_pandas()
     out = []
     for batch, target in ((1, 1.15), (64, 1.05)):
-        filter = make_filter()
-        timings = interleave(
-            {"tensordict": tensordict_loop(filter, batch), "functional": functional_loop(filter, batch)},
-            seconds=seconds,
-        )
-        out.append(
-            timings.row(
-                f"step on a tensordict / its functions, B={batch}", "tensordict", "functional", target=target, note=NOTE
-            )
-        )
+        ours = steps(batch)
+        timings = interleave({**ours, "functional": functional_loop(make_filter(), batch)}, seconds=seconds)
+        for kind in ours:
+            name = f"{kind} step on a tensordict / its functions, B={batch}"
+            out.append(timings.row(name, kind, "functional", target=target, note=NOTE))
     return out

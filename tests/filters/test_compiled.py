@@ -39,13 +39,20 @@ def test_compiled_is_eager_forward_and_backward(dtype):
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler, g++")
-def test_inductor_gives_the_eager_sequence_for_a_seed():
-    filter, frames, out = toy_denkf(action=False), toy_frames((2, 2), masks=0, resets=False), []
-    with torch.no_grad():
-        for chunk in (0, 1):
-            torch.manual_seed(1)
-            out.append(filter.compile(chunk=chunk).sequence(frames.copy()))
-    assert_close(out[1], out[0], filter.out_keys, torch.float32)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
+    filter, frames, out = toy_denkf(action=False).to(dtype), toy_frames((2, 2), masks=0, resets=False), []
+    frames["measurement"] = frames["measurement"].to(dtype)
+    for chunk in (0, 1):
+        torch.manual_seed(1)
+        sequence = filter.compile(chunk=chunk).sequence(frames.copy())
+        loss = sequence["belief", "mean"].square().sum()
+        out.append((sequence, torch.autograd.grad(loss, list(filter.parameters()))))
+    (eager, gradients), (compiled, ours) = out
+    assert_close(compiled, eager, filter.out_keys, dtype)
+    assert any((gradient != 0).any() for gradient in gradients)
+    for value, expected in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(value, expected, rtol=10 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype])
 
 
 def test_a_compiled_step_draws_its_noise_outside_and_anew():
