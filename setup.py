@@ -29,6 +29,8 @@ setup(
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
         "lerobot": ["pyarrow>=15", "av>=14"],
         "examples": ["tqdm", "matplotlib", "tensorboard"],
+        # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
+        "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/results/speed.md was made with.
         "bench": [
             "matplotlib",

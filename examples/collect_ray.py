@@ -1,7 +1,7 @@
 """Learn a filter while several processes, or machines, collect for it: torchrl's RayCollector.
 
-    pip install ray && python examples/collect_ray.py --collectors 2    # processes on this machine
-    python examples/collect_ray.py                                      # no ray: one collector in this process
+    pip install "torch_denkf[ray]" && python examples/collect_ray.py --collectors 2    # processes on this machine
+    python examples/collect_ray.py                                                     # no ray: in this process
 
 The arm is that of append_to_env.py: reacher with noisy encoders and hidden joint velocities. Filter and actor are one
 policy, so that the collector sends the filter's new weights to all of its workers like any policy's.
@@ -10,7 +10,10 @@ For many machines: ``ray start --head`` on one and ``ray start --address HEAD:63
 ``--address auto --collectors N`` here. Each collector takes one core (``remote_configs``); the workers need this
 package installed, and get the folder ``examples/`` from here (``working_dir``). ``--smoke``, which CI runs, goes
 without ray where it is not installed. (ray 2.60 gives up where its agents take more than half a minute to start, as
-they do on two busy cores; the part with ray has not been run for that reason.)
+they do where all cores are busy: RAY_agent_register_timeout_ms=200000 lets it wait.)
+
+Velocities that the filter believes while it collects, RMSE of the first and of the thirtieth batch: 24.1 and 0.30 rad/s
+with two collectors of ray 2.60 (2 min on two cores), 19.6 and 0.31 rad/s without ray.
 """
 
 from __future__ import annotations
@@ -25,8 +28,8 @@ from append_to_env import NOISE, make_env
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import Composite
-from torchrl.envs import EnvBase, InitTracker, Transform
+from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
+from torchrl.envs import EnvBase, InitTracker, StepCounter, Transform
 from tqdm import tqdm
 
 from torch_denkf.filters import DEnKF
@@ -34,6 +37,7 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, Lea
 from torch_denkf.objectives import DEnKFLoss
 
 WINDOW = 25  # steps that are back-propagated through
+EPISODE = 200  # steps; a filter that has learned little goes astray in long ones
 
 
 class LastAction(Transform):
@@ -72,7 +76,7 @@ def make_filter(states: torch.Tensor) -> DEnKF:
 def policy_env(denkf: DEnKF) -> EnvBase:
     """Reacher as the policy needs it: the last action, a mark at resets, room for the belief. Runs in the worker."""
     env = make_env(int(torch.randint(2**31, ())))
-    for transform in (LastAction(), InitTracker(), denkf.make_tensordict_primer()):
+    for transform in (LastAction(), StepCounter(EPISODE), InitTracker(), denkf.make_tensordict_primer()):
         env.append_transform(transform)
     return env
 
@@ -117,11 +121,11 @@ def main() -> None:
     parser.add_argument("--address", help="of a ray cluster, e.g. auto; without it ray starts on this machine")
     parser.add_argument("--frames", type=int, default=2000, help="a batch, over all collectors (multiple of 25 each)")
     parser.add_argument("--iterations", type=int, default=30, help="batches")
-    parser.add_argument("--epochs", type=int, default=10, help="updates with each batch")
+    parser.add_argument("--updates", type=int, default=20, help="updates after each batch")
     parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs; without ray, too")
     args = parser.parse_args()
     if args.smoke:
-        args.frames, args.iterations, args.epochs = 200, 2, 1
+        args.frames, args.iterations, args.updates = 200, 2, 1
         args.collectors = max(args.collectors, 2)
     if args.collectors > 1 and importlib.util.find_spec("ray") is None:
         message = "ray is not installed (pip install ray)"
@@ -139,24 +143,25 @@ def main() -> None:
     optimiser = torch.optim.Adam(denkf.parameters(), lr=2e-3)
     collector, count = make_collector(denkf, args)
     print(f"{count} collector(s), {args.frames} frames a batch")
-    first = None
+    buffer = ReplayBuffer(storage=LazyTensorStorage(args.iterations * args.frames // WINDOW), batch_size=64)
+    errors = []
+    collector.update_policy_weights_()  # ray's wants it before the first batch, too
     try:
         for data in (bar := tqdm(collector, total=args.iterations, unit="batch", disable=None)):
-            batch = windows(data)
-            for _ in range(args.epochs):
-                total = sum(loss(batch).values())
+            buffer.extend(windows(data))
+            for _ in range(args.updates):
+                total = sum(loss(buffer.sample()).values())
                 optimiser.zero_grad()
                 total.backward()
                 torch.nn.utils.clip_grad_norm_(denkf.parameters(), 1.0)
                 optimiser.step()
             collector.update_policy_weights_()  # to every worker, wherever it is
-            error = (data["belief", "mean"] - data["state"])[..., 2:].square().mean().sqrt()
-            first = error if first is None else first
-            text = f"crps {total.item():.4f}, velocities while collecting: RMSE {error:.3f} rad/s"
+            errors.append((data["belief", "mean"] - data["state"])[..., 2:].square().mean().sqrt())
+            text = f"crps {total.item():.4f}, velocities while collecting: RMSE {errors[-1]:.3f} rad/s"
             bar.set_postfix_str(text)
     finally:
         collector.shutdown()
-    print(f"{text} (first batch: {first:.3f})")
+    print(f"{text} (first batch: {errors[0]:.3f})")
 
 
 if __name__ == "__main__":
