@@ -130,3 +130,23 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
         initial=FixedEnsemble(members) if initial is None else initial,
         **kwargs,
     )
+
+
+def assert_equal(first, second, keys, *, atol=0.0):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def stepwise(filter, frames):
+    """The same as ``filter.sequence(frames)``, by single steps as in an environment."""
+    time = frames.ndim - 1
+    rows, out = frames.unbind(time), []
+    for t, row in enumerate(rows):
+        row = row.copy()
+        if row.get("action", None) is not None:
+            row["action"] = rows[max(t - 1, 0)]["action"]
+        carry = out[-1] if out else filter.initialise(row.copy())
+        for key in filter.carry_keys:
+            row[key] = carry[key]
+        out.append(filter(row))
+    return torch.stack([row.exclude("action", "next") for row in out], time)
