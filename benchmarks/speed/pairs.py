@@ -85,6 +85,7 @@ def interleave(
         begun = time.process_time()
         call()
         numbers[name] = max(1, int(shortest / max(time.process_time() - begun, 1e-7)))
+    settle()
     times: dict[str, list[float]] = {name: [] for name in candidates}
     names, end, done = list(candidates), time.perf_counter() + seconds, 0
     gc.collect()
@@ -103,3 +104,13 @@ def interleave(
     finally:
         gc.enable()
     return Timings(times)
+
+
+def settle(limit: float = 30.0) -> None:
+    """Waits until this process stands still, at most ``limit`` seconds: inductor's threads go on after compiling."""
+    end = time.perf_counter() + limit
+    while time.perf_counter() < end:
+        begun = time.process_time()
+        time.sleep(0.5)
+        if time.process_time() - begun < 0.005:
+            return
