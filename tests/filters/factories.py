@@ -150,3 +150,14 @@ def stepwise(filter, frames):
             row[key] = carry[key]
         out.append(filter(row))
     return torch.stack([row.exclude("action", "next") for row in out], time)
+
+
+def make_dyadic(module):
+    """Rounds weights to multiples of 1/16, so that sums of their products with such numbers are exact.
+
+    A frame module runs on [B, T] frames in a sequence and on [B] in a step, and a matrix product may sum in another
+    order for another number of rows. Sums without rounding do not depend on the order.
+    """
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_((parameter * 16).round() / 16)

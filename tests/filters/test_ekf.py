@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 
-from tests.filters.factories import linear_kalman, linear_system
+from tests.filters.factories import assert_equal, linear_kalman, linear_system, stepwise
 from tests.filters.gaussian_for_tests import (
     BELIEF,
     CONTROL,
@@ -19,7 +19,6 @@ from tests.filters.gaussian_for_tests import (
     linear_frames,
     prior,
 )
-from tests.filters.test_base import assert_equal, stepwise
 from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.modules import (
     CholeskyNoise,

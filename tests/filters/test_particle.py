@@ -7,9 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.differences_for_tests import central_difference
-from tests.filters.factories import OBS, NoisyLinear, linear_system, toy_frames
+from tests.filters.factories import OBS, NoisyLinear, assert_equal, linear_system, make_dyadic, stepwise, toy_frames
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
-from tests.filters.test_base import assert_equal, make_dyadic, stepwise
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, LinearObservation
 

@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 from torchrl.modules import set_recurrent_mode
 
-from tests.filters.test_base import stepwise
+from tests.filters.factories import stepwise
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.metrics import dead_reckoning

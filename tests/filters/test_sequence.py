@@ -14,6 +14,7 @@ from tests.filters.factories import (
     assert_equal,
     linear_denkf,
     linear_system,
+    make_dyadic,
     stepwise,
     toy_denkf,
     toy_frames,
@@ -29,17 +30,6 @@ from torch_denkf.modules import (
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
-
-
-def make_dyadic(module):
-    """Rounds weights to multiples of 1/16, so that sums of their products with such numbers are exact.
-
-    A frame module runs on [B, T] frames in a sequence and on [B] in a step, and a matrix product may sum in another
-    order for another number of rows. Sums without rounding do not depend on the order.
-    """
-    with torch.no_grad():
-        for parameter in module.parameters():
-            parameter.copy_((parameter * 16).round() / 16)
 
 
 # ------------------------------------------------------------------------------------------ step equals sequence

@@ -5,9 +5,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.filters.factories import linear_kalman
+from tests.filters.factories import assert_equal, linear_kalman
 from tests.filters.gaussian_for_tests import BELIEF, INFO, linear_filter, linear_frames
-from tests.filters.test_base import assert_equal
 from torch_denkf.filters import EKF, UKF
 from torch_denkf.modules import (
     CholeskyNoise,

@@ -179,7 +179,11 @@ def _opened(modules: Iterable[TensorDictModuleBase]) -> list[TensorDictModuleBas
 
 
 def _runs_on_rows(module: TensorDictModuleBase) -> bool:
-    parts = [part for part in module.modules() if isinstance(part, TensorDictModuleBase)]
-    owners = [next(kind for kind in type(part).__mro__ if "forward" in vars(kind)) for part in parts]
-    flags = [vars(owner).get("runs_on_rows", False) for owner in owners]
-    return all(flags) and all(isinstance(part, SubModel) for part in parts)
+    if not isinstance(module, SubModel):
+        return False
+    for part in module.modules():
+        if isinstance(part, TensorDictModuleBase):
+            owner = next(kind for kind in type(part).__mro__ if "forward" in vars(kind))
+            if not isinstance(part, SubModel) or not vars(owner).get("runs_on_rows", False):
+                return False
+    return True
