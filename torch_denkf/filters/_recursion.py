@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 
-from torch_denkf.modules._row import Row, on_rows
+from torch_denkf.modules._row import Row, RowPlan, on_rows
 
 __all__ = ["Recursion", "run", "where_rows"]
 
@@ -39,6 +39,7 @@ class Recursion:
         forecast_of: the forecast of each carried entry.
         out_keys: all that the modules write.
         update_at_reset: whether an initial belief is updated with its frame.
+        plans: of the transition and of the update, from an earlier recursion of the same modules.
 
     Attributes:
         on_rows: whether all modules run on a :class:`~torch_denkf.modules._row.Row`; if not, they need a TensorDict.
@@ -53,9 +54,10 @@ class Recursion:
         forecast_of: dict[NestedKey, NestedKey],
         out_keys: Sequence[NestedKey],
         update_at_reset: bool,
+        plans: tuple[RowPlan | None, RowPlan | None] = (None, None),
     ):
         self.modules = tuple(modules)
-        transition, update = on_rows(modules[:1]), on_rows(modules[1:])
+        transition, update = self.plans = on_rows(modules[:1], plans[0]), on_rows(modules[1:], plans[1])
         self.on_rows = transition is not None and update is not None
         self.transition = transition.modules if self.on_rows else tuple(modules[:1])
         self.update = update.modules if self.on_rows else tuple(modules[1:])

@@ -12,6 +12,8 @@ At a reset the forecast is the initial belief, and so is the belief unless ``upd
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -90,6 +92,7 @@ class Filter(TensorDictSequential):
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.update_at_reset = update_at_reset
         self._plan: RowPlan | None = None
+        self._known: _Known | None = None
         self._compiled: CompiledSteps | None = None
         self._sort_modules()
 
@@ -269,16 +272,32 @@ class Filter(TensorDictSequential):
         """The initial belief for every element of ``frames``, which is left as it is."""
         return self.initial(frames.copy()).select(*self.belief_keys, *self.carry_keys)
 
+    def _lookup(self) -> _Known:
+        """What follows from the modules alone, looked up anew when one of them is another."""
+        modules = (*self.module._modules.values(), self.initial)
+        if self._known is None or self._known.modules != modules:
+            recursion = (self.transition_module, *self.update_modules)
+            keys = [key for module in recursion for key in module.in_keys]
+            for part in (part for module in recursion for part in submodels(module)):
+                keys += [*part.optional_keys, *([] if part.noise_key is None else [part.noise_key])]
+            own = {*self.recursion_out_keys, *self.carry_keys}
+            inputs = [key for key in dict.fromkeys(map(unravel_key, keys)) if key not in own]
+            self._known = _Known(modules, tuple(submodels(self)), inputs)
+        return self._known
+
     def _make_recursion(self, update_at_reset: bool) -> Recursion:
-        modules = list(self._module_iter())
-        return Recursion(
+        modules, known = list(self._module_iter()), self._lookup()
+        recursion = Recursion(
             [modules[index] for index in self._recursion],
+            plans=known.plans,
             carry_keys=self.carry_keys,
             belief_keys=self.belief_keys,
             forecast_of=self._forecast_of,
             out_keys=self.recursion_out_keys,
             update_at_reset=update_at_reset,
         )
+        known.plans = recursion.plans
+        return recursion
 
     # --------------------------------------------------------------------------------------------- a sequence
 
@@ -287,8 +306,8 @@ class Filter(TensorDictSequential):
 
         Noise that is there already is kept.
         """
-        dtype = next((p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()), None)
-        for module in submodels(self):
+        dtype = next((p.dtype for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
+        for module in self._lookup().parts:
             key = module.noise_key
             if key is not None and tensordict.get(key, None) is None:
                 size, device = tensordict.batch_size, tensordict.device
@@ -361,13 +380,24 @@ class Filter(TensorDictSequential):
 
     def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
         """The entries of ``tensordict`` that the recursion reads and does not write."""
-        modules = (self.transition_module, *self.update_modules)
-        keys = [key for module in modules for key in module.in_keys]
-        for part in (part for module in modules for part in submodels(module)):
-            keys += [*part.optional_keys, *([] if part.noise_key is None else [part.noise_key])]
-        own = {*self.recursion_out_keys, *self.carry_keys}
-        keys = [key for key in dict.fromkeys(map(unravel_key, keys)) if key not in own]
-        return [key for key in keys if tensordict.get(key, None) is not None]
+        return [key for key in self._lookup().inputs if tensordict.get(key, None) is not None]
+
+
+@dataclass
+class _Known:
+    """What a filter's modules say, so that a sequence need not walk through them.
+
+    Attributes:
+        modules: those that it was looked up for, and the initial belief.
+        parts: all sub-models.
+        inputs: entries that the recursion reads and does not write.
+        plans: of the last recursion, see :class:`Recursion`.
+    """
+
+    modules: tuple[TensorDictModuleBase, ...]
+    parts: tuple[SubModel, ...]
+    inputs: list[NestedKey]
+    plans: tuple[RowPlan | None, RowPlan | None] = (None, None)
 
 
 def submodels(module: torch.nn.Module) -> list[SubModel]:
