@@ -5,6 +5,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.filters._compiled import need_compiler
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules import (
     ConstantNoise,
@@ -161,3 +162,12 @@ def make_dyadic(module):
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.copy_((parameter * 16).round() / 16)
+
+
+def has_compiler():
+    """Whether inductor finds a C++ compiler."""
+    try:
+        need_compiler()
+    except RuntimeError:
+        return False
+    return True

@@ -1,7 +1,6 @@
 """A filter as a composition: its parts, copies, precisions, compiled steps, inside a policy."""
 
 import pickle
-import shutil
 from copy import deepcopy
 
 import pytest
@@ -20,6 +19,7 @@ from tests.filters.factories import (
     NoisyLinear,
     S,
     assert_equal,
+    has_compiler,
     linear_denkf,
     linear_kalman,
     linear_system,
@@ -202,7 +202,7 @@ def test_float32_agrees_with_float64(float64):
 # ------------------------------------------------------------------------------------------------ compilation
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler")
+@pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
 @pytest.mark.parametrize("layer", ["dropout", "flipout"])
 def test_compiled_step_equals_eager(float64, layer):
     filter = toy_denkf("sensor", layer)

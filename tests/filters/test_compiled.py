@@ -1,12 +1,11 @@
 """Compiled steps and chunks: the oracle is the same filter, eager, on the same noise."""
 
 import pickle
-import shutil
 
 import pytest
 import torch
 
-from tests.filters.factories import toy_denkf, toy_frames
+from tests.filters.factories import has_compiler, toy_denkf, toy_frames
 from torch_denkf.filters import _compiled
 
 #: float32: a few roundings through eight steps; float64 likewise.
@@ -38,7 +37,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
         torch.testing.assert_close(value, expected, rtol=10 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype])
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler, g++")
+@pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
     filter, frames, out = toy_denkf(action=False).to(dtype), toy_frames((2, 2), masks=0, resets=False), []

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_denkf.deployment.package import FACTS
 from torch_denkf.filters import Filter
-from torch_denkf.filters.base import submodels
+from torch_denkf.filters._parts import submodels
 
 
 class _FlatStep(nn.Module):

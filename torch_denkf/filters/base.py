@@ -12,7 +12,6 @@ At a reset the forecast is the initial belief, and so is the belief unless ``upd
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import chain
 
 import torch
@@ -23,9 +22,9 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torch_denkf.filters._compiled import CompiledSteps
+from torch_denkf.filters._parts import Known, inputs_of, submodels
 from torch_denkf.filters._recursion import Recursion, run, where_rows
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules import SubModel
 from torch_denkf.modules._row import Row, RowPlan, on_rows
 
 __all__ = ["Filter", "submodels", "where_rows"]
@@ -92,7 +91,7 @@ class Filter(TensorDictSequential):
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.update_at_reset = update_at_reset
         self._plan: RowPlan | None = None
-        self._known: _Known | None = None
+        self._known: Known | None = None
         self._compiled: CompiledSteps | None = None
         self._sort_modules()
 
@@ -272,17 +271,13 @@ class Filter(TensorDictSequential):
         """The initial belief for every element of ``frames``, which is left as it is."""
         return self.initial(frames.copy()).select(*self.belief_keys, *self.carry_keys)
 
-    def _lookup(self) -> _Known:
+    def _lookup(self) -> Known:
         """What follows from the modules alone, looked up anew when one of them is another."""
         modules = (*self.module._modules.values(), self.initial)
         if self._known is None or self._known.modules != modules:
             recursion = (self.transition_module, *self.update_modules)
-            keys = [key for module in recursion for key in module.in_keys]
-            for part in (part for module in recursion for part in submodels(module)):
-                keys += [*part.optional_keys, *([] if part.noise_key is None else [part.noise_key])]
-            own = {*self.recursion_out_keys, *self.carry_keys}
-            inputs = [key for key in dict.fromkeys(map(unravel_key, keys)) if key not in own]
-            self._known = _Known(modules, tuple(submodels(self)), inputs)
+            inputs = inputs_of(recursion, {*self.recursion_out_keys, *self.carry_keys})
+            self._known = Known(modules, tuple(submodels(self)), inputs)
         return self._known
 
     def _make_recursion(self, update_at_reset: bool) -> Recursion:
@@ -381,25 +376,3 @@ class Filter(TensorDictSequential):
     def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
         """The entries of ``tensordict`` that the recursion reads and does not write."""
         return [key for key in self._lookup().inputs if tensordict.get(key, None) is not None]
-
-
-@dataclass
-class _Known:
-    """What a filter's modules say, so that a sequence need not walk through them.
-
-    Attributes:
-        modules: those that it was looked up for, and the initial belief.
-        parts: all sub-models.
-        inputs: entries that the recursion reads and does not write.
-        plans: of the last recursion, see :class:`Recursion`.
-    """
-
-    modules: tuple[TensorDictModuleBase, ...]
-    parts: tuple[SubModel, ...]
-    inputs: list[NestedKey]
-    plans: tuple[RowPlan | None, RowPlan | None] = (None, None)
-
-
-def submodels(module: torch.nn.Module) -> list[SubModel]:
-    """Returns the sub-models inside ``module``, also those inside a nested sequence."""
-    return [part for part in module.modules() if isinstance(part, SubModel)]

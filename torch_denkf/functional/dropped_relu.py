@@ -12,8 +12,8 @@ def dropped_relu(x: Tensor, factor: Tensor, rate: float) -> Tensor:
     """ReLU, then dropout: ``relu(x) * factor``.
 
     What is neither cut off nor dropped is the result where it is positive, and its derivative is 1 / (1 - rate). The
-    next layer keeps the result anyway, so that no masks are kept for the backward pass; storing those costs a compiled
-    chunk more than its products of matrices (the vectors of torch 2.13 write booleans one by one).
+    next layer keeps the result anyway, so that no masks are kept for the backward pass; storing those costs a chunk
+    that inductor compiled (torch 2.13, on a processor) more than its products of matrices.
 
     Args:
         x: output of a linear layer, any shape.

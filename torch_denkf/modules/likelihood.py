@@ -171,14 +171,13 @@ class LearnedLikelihood(SubModel):
         encoding, predicted, *readings = (self.read(tensordict, key) for key in self.in_keys)
         encoding = _mean_of_members(encoding, tensordict)
         if readings:
-            difference = _mean_of_members(readings[0], tensordict).unsqueeze(-2) - predicted
+            seen = (_mean_of_members(readings[0], tensordict).unsqueeze(-2) - predicted) / self.scale
         else:
-            difference = predicted - self.loc
-        seen = difference / self.scale
+            seen = (predicted - self.loc) / self.scale
         observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
-            anything = observed.any(-1, keepdim=True)
-            encoding = torch.where(anything, encoding, 0.0)
+            any_observed = observed.any(-1, keepdim=True)
+            encoding = torch.where(any_observed, encoding, 0.0)
             seen = torch.where(observed.unsqueeze(-2), seen, 0.0)
         if readings:
             seen = seen.sign() * seen.abs().log1p()
@@ -189,7 +188,7 @@ class LearnedLikelihood(SubModel):
         else:
             value = nn.functional.logsigmoid(value).clamp(min=_SMALLEST_LOG_LIKELIHOOD)
         if observed is not None:
-            value = torch.where(anything, value, 0.0)
+            value = torch.where(any_observed, value, 0.0)
         return tensordict.set(self.out_keys[0], value)
 
 

@@ -211,11 +211,12 @@ class StochasticMLP(nn.Module):
         hidden = x
         for layer, factor in run[:-1]:
             hidden = layer(hidden)
-            if factor is not None and isinstance(self.activation, nn.ReLU):
+            if factor is None:
+                hidden = self.activation(hidden)
+            elif isinstance(self.activation, nn.ReLU):
                 hidden = dropped_relu(hidden, factor, self.rate)
             else:
-                hidden = self.activation(hidden)
-                hidden = hidden if factor is None else hidden * factor
+                hidden = self.activation(hidden) * factor
         return run[-1][0](hidden), hidden
 
     def _dropout(self, draws: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:

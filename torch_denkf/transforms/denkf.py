@@ -13,7 +13,8 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters.base import submodels, where_rows
+from torch_denkf.filters._parts import submodels
+from torch_denkf.filters._recursion import where_rows
 from torch_denkf.transforms._packaged import PackagedRun
 
 __all__ = ["DEnKFTransform"]
