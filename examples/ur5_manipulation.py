@@ -4,7 +4,7 @@
     python examples/ur5_manipulation.py --out runs/ur5             # collects what is missing, trains, tests: table.md
     python examples/ur5_manipulation.py --filters denkf --sensors glimpse --trainings sim
 
-A sensor is trained on 8 frames each of many demos; a motion on true states; then each filter on the readings that the
+A sensor is trained on 16 frames each of many demos; a motion on true states; then each filter on the readings that the
 frozen sensor makes of whole demos it has not seen, and at last together with the sensor's head. ``real_like`` is a
 stand-in for a real arm: there the study compares 20 demos alone, the simulator's weights as they are, and these
 fine-tuned on the 20. What is broken off goes on where it stopped. Beliefs of some test demos are left in --out/beliefs.
@@ -40,7 +40,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--sensors", nargs="+", default=["glimpse", "paper"], choices=sorted(SENSORS))
     parser.add_argument("--trainings", nargs="+", default=list(TRAININGS), choices=TRAININGS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--size", type=int, default=112, help="side of the pictures in pixels")
+    parser.add_argument("--size", type=int, default=224, help="side of the pictures in pixels")
     parser.add_argument("--demos", type=int, default=2000, help="in the simulator, few frames each")
     parser.add_argument("--sequences", type=int, default=220, help="of these, whole")
     parser.add_argument("--real", type=int, default=130, help="demos of real_like, whole")
@@ -72,7 +72,7 @@ def main() -> None:
     )
     collections, begun = replace(collections, **extra), time.time()
     try:
-        collections.collect(args.processes)
+        collections.collect(args.processes, real=args.command == "collect" or args.trainings != ["sim"])
     except (ImportError, RuntimeError) as error:
         if not args.smoke:
             raise

@@ -40,9 +40,9 @@ class Collections:
 
     root: Path
     cache: Path
-    size: int = 112
+    size: int = 224
     demos: int = 2000
-    frames: int = 8
+    frames: int = 16
     sequences: int = 220
     tune: int = 80
     validation: int = 16
@@ -50,12 +50,13 @@ class Collections:
     real_train: int = 20
     steps: int = 350
 
-    def collect(self, processes: int = 1) -> None:
-        """Collects what is missing."""
+    def collect(self, processes: int = 1, *, real: bool = True) -> None:
+        """Collects what is missing, of ``real_like`` only if asked to."""
         common = {"size": (self.size, self.size), "processes": processes, "max_steps": self.steps}
         collect_ur5_demos(self.root / "sim-frames", self.demos, frames=self.frames, **common)
         collect_ur5_demos(self.root / "sim-sequences", self.sequences, **common)
-        collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
+        if real:
+            collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
 
     def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
         """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""

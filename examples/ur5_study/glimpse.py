@@ -10,7 +10,8 @@ from torch_denkf.modules import KeypointTrunk
 
 # Nominal calibration, m from the table's centre: only where the first looks go follows from it.
 CAMERA, TARGET, FIELD = (1.4, 0.0, 0.85), (-0.18, 0.02, 0.27), 33.0
-PATCH, REACH, RAISE = 32, 0.29, 0.1  # pixels; half a patch's side and its shift upwards, in half pictures
+REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half pictures: hand and wrist
+COARSE = 112  # pixels: the side of the picture that the first look gets
 
 
 def project(places: Tensor) -> Tensor:
@@ -27,11 +28,12 @@ def project(places: Tensor) -> Tensor:
 class GlimpseTrunk(nn.Module):
     """A coarse trunk, and convolutions on a patch of the full resolution around the gripper.
 
-    The gripper is a dozen pixels wide: what its opening and its turn look like is lost in maps of a sixteenth of the
-    picture's width.
+    The gripper is a dozen pixels wide in a picture of 112: what its opening and its turn look like is lost in maps of
+    a sixteenth of that. The patch costs as much as the whole picture at a third of its resolution.
 
     Args:
         coarse: sees the whole picture, ``[N, 3, H, W]`` to ``[N, F]``.
+        picture: H and W in pixels.
         size: F.
         features: width of the output.
 
@@ -39,16 +41,17 @@ class GlimpseTrunk(nn.Module):
         ``[N, 3, H, W]`` to ``[N, features]``.
     """
 
-    def __init__(self, coarse: nn.Module, size: int = 192, features: int = 192):
+    def __init__(self, coarse: nn.Module, picture: int, size: int = 256, features: int = 256):
         super().__init__()
         self.coarse = coarse
         self.centre = nn.Linear(size, 2)
         self.close = nn.Sequential(
-            *_block(5, 24, 1), *_block(24, 48, 2), *_block(48, 48, 1), *_block(48, 64, 2), nn.Flatten()
+            *_block(5, 32, 5, 2), *_block(32, 48, 3, 2), *_block(48, 64, 3, 1), *_block(64, 96, 3, 2), nn.Flatten()
         )
-        self.squeeze = nn.Sequential(nn.Linear(64 * (PATCH // 4) ** 2, 128), nn.ReLU())
-        self.mix = nn.Sequential(nn.Linear(size + 128 + 2, features), nn.ReLU())
-        side = torch.linspace(-1, 1, PATCH)
+        patch = 8 * max(round(REACH * picture / 8), 1)  # about a pixel of the picture each
+        self.squeeze = nn.Sequential(nn.Linear(96 * (patch // 8) ** 2, 192), nn.ReLU())
+        self.mix = nn.Sequential(nn.Linear(size + 192 + 2, features), nn.ReLU())
+        side = torch.linspace(-1, 1, patch)
         self.register_buffer("grid", torch.stack(torch.meshgrid(side, side, indexing="xy"), -1), persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -74,10 +77,19 @@ class GlimpseTrunk(nn.Module):
         return float((self.centre(code) - goal).abs().mean()) * images.shape[-1] / 2
 
 
-def _block(before: int, after: int, stride: int) -> tuple[nn.Module, ...]:
-    return nn.Conv2d(before, after, 3, stride, 1), nn.GroupNorm(8, after), nn.ReLU()
+def _block(before: int, after: int, side: int, stride: int) -> tuple[nn.Module, ...]:
+    return nn.Conv2d(before, after, side, stride, side // 2), nn.GroupNorm(8, after), nn.ReLU()
 
 
-def keypoint_trunk() -> KeypointTrunk:
+class Shrink(nn.Module):
+    """Averages pixels until a picture is at most :data:`COARSE` wide."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Pictures ``[N, 3, H / n, W / n]``."""
+        times = images.shape[-1] // COARSE
+        return nn.functional.avg_pool2d(images, times) if times > 1 else images
+
+
+def keypoint_trunk() -> nn.Module:
     """The coarse trunk of both presets."""
-    return KeypointTrunk(3, channels=(24, 32, 64, 96), keypoints=48, features=192)
+    return nn.Sequential(Shrink(), KeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=256))

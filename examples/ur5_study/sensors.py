@@ -106,7 +106,7 @@ def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """The same with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
-    return _sensor(facts, GlimpseTrunk(keypoint_trunk()), samples, layer="flipout")
+    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, layer="flipout")
 
 
 def _sensor(facts: Statistics, trunk: nn.Module, samples: int, **kwargs) -> ImageSensor:

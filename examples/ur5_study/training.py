@@ -28,7 +28,7 @@ INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75)
 class Budget:
     """Updates of each stage; steps of the filter's windows."""
 
-    sensor: int = 4000
+    sensor: int = 5000
     fine_tuning: int = 600  # of the simulator's sensor, on the other domain
     motion: int = 3000
     filter: int = 500

@@ -85,26 +85,33 @@ class CompiledSteps:
         start_keys = tuple(dict.fromkeys((*recursion.belief_keys, *recursion.carry_keys)))
         start = tuple(starts.get(key) for key in start_keys)
 
-        def function(kind: str, count: int, cuts: tuple[bool, ...]) -> Callable:
-            resets = is_init is not None and kind != "first"
-            facts = (kind, keys, start_keys, batch, device, count, cuts, resets, recursion.update_at_reset)
-            make = partial(_chunk, recursion, keys, start_keys, batch, device, time, cuts, kind == "first")
-            return self._function(facts, recursion.modules, some.device, make)
-
-        def part(begin: int, count: int) -> tuple[Tensor, ...]:
-            before = max(begin - 1, 0)
-            return tuple(inputs[key].narrow(time, before if key in control_keys else begin, count) for key in keys)
-
-        first = tuple(value.narrow(time, 0, 1) for value in start)
-        carry, values = function("first", 1, ())((), part(0, 1), None, first)
-        outputs = [values]
-        begin = 1
+        carry, outputs, begin = (), [], 0
         while begin < steps:
-            count = self.chunk if steps - begin >= self.chunk else 1
-            cuts = tuple(bool(detach_every) and t % detach_every == 0 for t in range(begin, begin + count))
-            reset = None if is_init is None else is_init.narrow(time, begin, count)
-            now = () if is_init is None else tuple(value.narrow(time, begin, count) for value in start)
-            carry, values = function("chunk", count, cuts)(carry, part(begin, count), reset, now)
+            first = begin == 0
+            ahead = steps - begin - first
+            moves = self.chunk if ahead >= self.chunk else int(not first)
+            cuts = tuple(bool(detach_every) and (begin + first + t) % detach_every == 0 for t in range(moves))
+            facts = (
+                "first" if first else "chunk",
+                keys,
+                start_keys,
+                batch,
+                device,
+                cuts,
+                is_init is not None,
+                recursion.update_at_reset,
+            )
+            make = partial(_chunk, recursion, keys, set(control_keys), start_keys, batch, device, time, cuts, first)
+            function, count = self._function(facts, recursion.modules, some.device, make), first + moves
+            before = max(begin - 1, 0)
+            carry, values = function(
+                carry,
+                tuple(inputs[key].narrow(time, before if key in control_keys else begin, count) for key in keys),
+                None if is_init is None else is_init.narrow(time, begin, count),
+                tuple(value.narrow(time, begin, count if is_init is not None else 1) for value in start)
+                if first or is_init is not None
+                else (),
+            )
             outputs.append(values)
             begin += count
         return {
@@ -120,9 +127,32 @@ class CompiledSteps:
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
             own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
             # A step is thirty kernels of a few microseconds, and calling one from Python takes another.
-            options = self.options or ({"options": {"cpp_wrapper": True}} if device.type == "cpu" else {})
-            self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **options)
+            arguments = self.options or ({"options": {"cpp_wrapper": True}} if device.type == "cpu" else {})
+            if "mode" not in arguments:  # torch.compile takes one of the two
+                options = {"guard_filter_fn": _worth_checking, **arguments.get("options", {})}
+                arguments = {**arguments, "options": options}
+            self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **arguments)
         return self._functions[facts]
+
+
+def _worth_checking(guards: Sequence) -> list[bool]:
+    """What torch.compile checks before each call: all that a user may change. The rest takes longer than two steps.
+
+    Tensors (also parameters: their type, whether they are trained), types, numbers and names that modules hold stay.
+    What this package and torch define, keys (part of what a function is kept under) and hooks do not.
+    """
+
+    def may_change(guard) -> bool:
+        if guard.is_global:
+            return not guard.name.startswith(("G['torch", "G['__import_torch", "G['__builtins", "G['___unnamed"))
+        never = ("EMPTY_NN_MODULE_HOOKS_DICT", "NOT_PRESENT_IN_GENERIC_DICT", "DICT_NOT_CONTAINS")
+        return guard.guard_type not in never and "keys" not in guard.name and guard.name.split("[")[0] not in _OWN
+
+    return [may_change(guard) for guard in guards]
+
+
+#: What the functions below close over, and never changes.
+_OWN = ("writes", "batch", "device", "time", "cuts", "first")
 
 
 def _step(modules: tuple, keys: tuple, writes: tuple, batch, device) -> Callable:
@@ -133,25 +163,27 @@ def _step(modules: tuple, keys: tuple, writes: tuple, batch, device) -> Callable
     return step
 
 
-def _chunk(recursion: Recursion, keys, start_keys, batch, device, time: int, cuts: tuple, first: bool) -> Callable:
+def _chunk(
+    recursion: Recursion, keys, control_keys: set, start_keys, batch, device, time: int, cuts: tuple, first: bool
+) -> Callable:
     def rows(names: tuple, values: tuple[Tensor, ...], count: int) -> list[Row]:
-        columns = [value.unbind(time) for value in values]
-        return [
-            Row(dict(zip(names, [column[t] for column in columns], strict=True)), batch, device) for t in range(count)
-        ]
+        columns = {name: value.unbind(time) for name, value in zip(names, values, strict=True)}
+        if first:  # the second step reads what drives it where the first one, which does not move, could have
+            for name in control_keys.intersection(names):
+                columns[name] = (columns[name][0], *columns[name])
+        return [Row({name: column[t] for name, column in columns.items()}, batch, device) for t in range(count)]
 
     def chunk(carry: tuple, inputs: tuple, resets: Tensor | None, starts: tuple) -> tuple[tuple, tuple]:
+        now = rows(keys, inputs, first + len(cuts))
+        begins = rows(start_keys, starts, starts[0].shape[time]) if starts else []
         if first:
-            outputs = [recursion.first(rows(keys, inputs, 1)[0], rows(start_keys, starts, 1)[0])]
-            belief = outputs[0]
+            outputs = [recursion.first(now[0], begins[0])]
+            belief = outputs[0].select(*recursion.carry_keys)
         else:
-            belief, outputs = recursion.roll(
-                Row(dict(zip(recursion.carry_keys, carry, strict=True)), batch, device),
-                rows(keys, inputs, len(cuts)),
-                None if resets is None else resets.unbind(time),
-                [] if resets is None else rows(start_keys, starts, len(cuts)),
-                cuts,
-            )
+            outputs, belief = [], Row(dict(zip(recursion.carry_keys, carry, strict=True)), batch, device)
+        resets = None if resets is None else resets.unbind(time)[first:]
+        belief, later = recursion.roll(belief, now[first:], resets, begins[first:], cuts)
+        outputs += later
         stacked = tuple(torch.stack([output.get(key) for output in outputs], time) for key in recursion.out_keys)
         return tuple(belief.get(key) for key in recursion.carry_keys), stacked
 
