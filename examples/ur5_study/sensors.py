@@ -17,7 +17,8 @@ from torch_denkf.transforms import Brightness, SaltAndPepper
 from ur5_study.demos import STATE, FramePool
 from ur5_study.glimpse import GlimpseTrunk, keypoint_trunk
 
-SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
+SAMPLES = 32  # of a sensor while it is trained
+MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
 WRIST = 5  # J6, which turns the gripper
 NEAR = ("sensor", "near")  # readings as states, see NearForecast
 # What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.

@@ -21,7 +21,7 @@ from ur5_study.evaluation import conditions_of, filter_rows, save_beliefs, senso
 from ur5_study.motion import ArmMotion, train_motion
 from ur5_study.readings import read_all, read_codes
 from ur5_study.recipes import FILTERS, Recipe
-from ur5_study.sensors import SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
+from ur5_study.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
 from ur5_study.training import Budget, train_filter
 
 TRAININGS = ("sim", "real_like", "fine_tuned")
@@ -132,7 +132,7 @@ class Base:
         data = collections.replay(f"{domain}-sequences", "test" if role == "test" else "train")
         return read_codes(self.sensor, data, demos, condition=condition, file=file)
 
-    def recipe(self, name: str, size: int = SAMPLES) -> Recipe:
+    def recipe(self, name: str, size: int = MEMBERS) -> Recipe:
         """A filter's recipe, with a sensor of its own."""
         kind = FILTERS[name]
         motion, error = self.motion(kind.actions), self.error()
@@ -140,7 +140,7 @@ class Base:
 
     def error(self) -> Tensor:
         """Root mean square error of the sensor on the validation demos, ``[10]``."""
-        reading = read_all(self.sensor, self.codes("validation"), SAMPLES)
+        reading = read_all(self.sensor, self.codes("validation"), MEMBERS)
         truth = reading["state"]
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
@@ -157,7 +157,7 @@ class Base:
     def readings(self, sensor: ImageSensor, domain: str) -> dict[str, TensorDict]:
         """What a sensor reads of the test demos, in all conditions."""
         clean, salted = (self.codes("test", condition, domain) for condition in ("clean", "salt_and_pepper"))
-        return conditions_of(read_all(sensor, clean, SAMPLES), read_all(sensor, salted, SAMPLES))
+        return conditions_of(read_all(sensor, clean, MEMBERS), read_all(sensor, salted, MEMBERS))
 
 
 def run_jobs(
@@ -179,7 +179,7 @@ def run_jobs(
         own = {**names, "domain": domain}
         _once(study, f"sensor-{base.name}-{domain}", partial(_sensor, base, own))
         for name in filters if domain == base.domain else set(filters) & {"denkf"}:
-            size = 100 if "pf" in name else 1 if name in SINGLE else SAMPLES
+            size = 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
             _once(
                 study,
                 f"{name}-{base.name}-{domain}",
@@ -222,7 +222,7 @@ def _filter(base: Base, names: dict) -> list[dict]:
 def _sizes(base: Base, names: dict) -> list[dict]:
     recipe, _, out = base.train(names["filter"])
     saved = read_checkpoint(out / "filter.pt")
-    sizes = [size for size in base.study.sizes if size != SAMPLES]  # that one is in the table
+    sizes = [size for size in base.study.sizes if size != MEMBERS]  # that one is in the table
     make = partial(base.recipe, names["filter"])
     return size_rows(make, recipe.sensor, base.codes("test"), sizes, saved["model"], saved["inflation"], names)
 

@@ -19,7 +19,7 @@ from ur5_study.demos import JOINTS, STATE
 from ur5_study.motion import ERRORS
 from ur5_study.readings import Windows, fail, read_all, read_head, with_hint
 from ur5_study.recipes import Recipe
-from ur5_study.sensors import SAMPLES, Preset, unit_of
+from ur5_study.sensors import MEMBERS, Preset, unit_of
 
 INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75)
 
@@ -75,7 +75,7 @@ class WithHead(nn.Module):
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
         """All terms, of windows ``[B, T]`` of features."""
-        windows = read_head(self.sensor, codes, SAMPLES)
+        windows = read_head(self.sensor, codes, MEMBERS)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}
 
@@ -117,11 +117,11 @@ def train_filter(
         return model
     share, rate = (1, 1.0) if begin is None else (3, 0.2)
     windows = Windows(tune, budget.length, recipe.start_std)
-    frozen = Windows([read_all(sensor, part, SAMPLES, seed + 1) for part in tune], budget.length, recipe.start_std)
-    clean = read_all(sensor, validation, SAMPLES)
+    frozen = Windows([read_all(sensor, part, MEMBERS, seed + 1) for part in tune], budget.length, recipe.start_std)
+    clean = read_all(sensor, validation, MEMBERS)
 
     def check(readings: TensorDict | None = None) -> dict[str, float]:
-        readings = read_all(sensor, validation, SAMPLES) if readings is None else readings
+        readings = read_all(sensor, validation, MEMBERS) if readings is None else readings
         return filter_error(recipe, model, [readings, fail(readings, "missing", seed=1)])
 
     objective = recipe.loss(recipe.behind(model, training=True))
@@ -157,7 +157,7 @@ def train_filter(
         seed=seed,
         device="cpu",
     ).fit()
-    inflation = calibrate(recipe, model, read_all(sensor, validation, SAMPLES))
+    inflation = calibrate(recipe, model, read_all(sensor, validation, MEMBERS))
     write_checkpoint(done, {"model": model.state_dict(), "inflation": inflation})
     return model
 

@@ -13,7 +13,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
 from ur5_study.demos import JOINTS, STATE
 from ur5_study.motion import ERRORS, FADING, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
-from ur5_study.sensors import SAMPLES, BlackIsMissing, NearForecast, Preset, Statistics
+from ur5_study.sensors import MEMBERS, BlackIsMissing, NearForecast, Preset, Statistics
 
 WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
 FILTERS: dict[str, type[Recipe]] = {}
@@ -50,7 +50,7 @@ class Recipe:
         facts: Statistics,
         motion: ArmMotion,
         error: Tensor,
-        ensemble_size: int = SAMPLES,
+        ensemble_size: int = MEMBERS,
     ):
         self.sensor, self.preset, self.facts, self.motion = sensor, preset, facts, deepcopy(motion)
         self.ensemble_size, self.error = ensemble_size, error
