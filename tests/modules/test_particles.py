@@ -31,7 +31,7 @@ from torch_denkf.modules import (
     WithWeights,
 )
 
-E, S, OBS, F = 7, 3, 2, 5
+E, S, OBS = 7, 3, 2
 BATCHES = [(), (4,), (2, 3)]
 
 
