@@ -3,6 +3,7 @@
     python examples/ur5_manipulation.py collect --processes 2      # demos into --root, by default runs/ur5-demos
     python examples/ur5_manipulation.py --out runs/ur5             # collects what is missing, trains, tests: table.md
     python examples/ur5_manipulation.py --filters denkf --sensors glimpse --trainings sim
+    python examples/ur5_manipulation.py pictures --out runs/ur5    # videos with ghosts, joints, paths, ensemble sizes
 
 A sensor is trained on 16 frames each of many demos; a motion on true states; then each filter on the readings that the
 frozen sensor makes of whole demos it has not seen, and at last together with the sensor's head. ``real_like`` is a
@@ -24,6 +25,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))  # the parts of this example, wherever it is started from
 
 from ur5_study.demos import Collections
+from ur5_study.gallery import draw_all
 from ur5_study.recipes import FILTERS
 from ur5_study.sensors import SENSORS
 from ur5_study.study import TRAININGS, Study, read_rows, run_jobs
@@ -33,7 +35,7 @@ from ur5_study.training import Budget
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", nargs="?", choices=["collect", "table"], default="table")
+    parser.add_argument("command", nargs="?", choices=["collect", "table", "pictures"], default="table")
     parser.add_argument("--root", type=Path, default=Path("runs/ur5-demos"), help="folder of the demos")
     parser.add_argument("--out", type=Path, default=Path("runs/ur5"), help="checkpoints, logs, table, beliefs")
     parser.add_argument("--filters", nargs="+", default=sorted(FILTERS), choices=sorted(FILTERS))
@@ -66,6 +68,10 @@ def smoke(args: argparse.Namespace) -> dict:
 def main() -> None:
     args = parse()
     torch.set_num_threads(1)  # of small matrices
+    if args.command == "pictures" and not args.smoke:
+        for file in draw_all(args.out):
+            print(file)
+        return
     extra = smoke(args) if args.smoke else {}
     collections = Collections(
         args.root, args.out / "cache", args.size, args.demos, sequences=args.sequences, real=args.real
@@ -94,6 +100,8 @@ def main() -> None:
     header = f"`{' '.join(['python', *sys.argv])}`: {(time.time() - begun) / 60:.0f} min"
     (args.out / "table.md").write_text(markdown(rows, header))
     print((args.out / "table.md").read_text())
+    if args.smoke:
+        print(*draw_all(args.out))
 
 
 if __name__ == "__main__":
