@@ -87,31 +87,19 @@ class CompiledSteps:
 
         carry, outputs, begin = (), [], 0
         while begin < steps:
-            first = begin == 0
-            ahead = steps - begin - first
-            moves = self.chunk if ahead >= self.chunk else int(not first)
-            cuts = tuple(bool(detach_every) and (begin + first + t) % detach_every == 0 for t in range(moves))
-            facts = (
-                "first" if first else "chunk",
-                keys,
-                start_keys,
-                batch,
-                device,
-                cuts,
-                is_init is not None,
-                recursion.update_at_reset,
-            )
+            first = begin == 0  # which also takes the first chunk's steps, if there are as many
+            moves = self.chunk if steps - begin - first >= self.chunk else int(not first)
+            count, before = first + moves, max(begin - 1, 0)
+            cuts = tuple(bool(detach_every) and t % detach_every == 0 for t in range(begin + first, begin + count))
+            now = tuple(inputs[key].narrow(time, before if key in control_keys else begin, count) for key in keys)
+            resets, begins = None, tuple(value.narrow(time, 0, 1) for value in start) if first else ()
+            if is_init is not None:
+                resets = is_init.narrow(time, begin, count)
+                begins = tuple(value.narrow(time, begin, count) for value in start)
+            kind = "first" if first else "chunk", is_init is not None, recursion.update_at_reset
+            facts = (*kind, keys, tuple(control_keys), start_keys, batch, device, cuts)
             make = partial(_chunk, recursion, keys, set(control_keys), start_keys, batch, device, time, cuts, first)
-            function, count = self._function(facts, recursion.modules, some.device, make), first + moves
-            before = max(begin - 1, 0)
-            carry, values = function(
-                carry,
-                tuple(inputs[key].narrow(time, before if key in control_keys else begin, count) for key in keys),
-                None if is_init is None else is_init.narrow(time, begin, count),
-                tuple(value.narrow(time, begin, count if is_init is not None else 1) for value in start)
-                if first or is_init is not None
-                else (),
-            )
+            carry, values = self._function(facts, recursion.modules, some.device, make)(carry, now, resets, begins)
             outputs.append(values)
             begin += count
         return {
@@ -136,7 +124,7 @@ class CompiledSteps:
 
 
 def _worth_checking(guards: Sequence) -> list[bool]:
-    """What torch.compile checks before each call: all that a user may change. The rest takes longer than two steps.
+    """What torch.compile checks before each call: all that a user may change. The rest takes longer than a step.
 
     Tensors (also parameters: their type, whether they are trained), types, numbers and names that modules hold stay.
     What this package and torch define, keys (part of what a function is kept under) and hooks do not.
