@@ -31,8 +31,8 @@ class Budget:
     sensor: int = 5000
     fine_tuning: int = 600  # of the simulator's sensor, on the other domain
     motion: int = 3000
-    filter: int = 500
-    end_to_end: int = 150
+    filter: int = 250
+    end_to_end: int = 50
     length: int = 32
     batch: int = 32
 
