@@ -13,7 +13,6 @@ from ur5_study.demos import JOINTS, STATE
 from ur5_study.recipes._base import Recipe, register
 from ur5_study.sensors import NEAR, NearForecast
 
-
 ARM = [index for index in range(STATE) if index != JOINTS - 1]  # what the gripper's opening says nothing about
 ARM_TAPER, PLACE_TAPER = 0.7, 0.8  # of joints among each other, and with the place: chosen on the validation demos
 
