@@ -103,7 +103,7 @@ class CompiledSteps:
             outputs.append(values)
             begin += count
         return {
-            key: torch.cat(values, time)
+            key: torch.cat(values, time) if len(values) > 1 else values[0]
             for key, values in zip(recursion.out_keys, zip(*outputs, strict=True), strict=True)
         }
 
@@ -114,13 +114,24 @@ class CompiledSteps:
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
             own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
-            # A step is thirty kernels of a few microseconds, and calling one from Python takes another.
-            arguments = self.options or ({"options": {"cpp_wrapper": True}} if device.type == "cpu" else {})
+            arguments = self.options or ({"options": _for_processors()} if device.type == "cpu" else {})
             if "mode" not in arguments:  # torch.compile takes one of the two
                 options = {"guard_filter_fn": _worth_checking, **arguments.get("options", {})}
                 arguments = {**arguments, "options": options}
             self._functions[facts] = torch.compile(own, fullgraph=True, dynamic=False, **arguments)
         return self._functions[facts]
+
+
+def _for_processors() -> dict[str, Any]:
+    """A step is thirty kernels of a microsecond or two; so calling them, and what they save, must cost little."""
+    from torch_denkf.filters._kernels import FewCalls  # they import inductor, which takes half a second
+    from torch_denkf.filters._partition import FewSavedTensors
+
+    return {
+        "cpp_wrapper": True,
+        "custom_partitioner_fn": FewSavedTensors(),
+        "post_grad_custom_post_pass": FewCalls(),
+    }
 
 
 def _worth_checking(guards: Sequence) -> list[bool]:

@@ -1,0 +1,67 @@
+"""Fewer saved tensors: the oracle is eager autograd, and inductor's own partitioner for how many there are."""
+
+import pytest
+import torch
+
+from tests.filters.factories import has_compiler
+from torch_denkf.filters import _partition
+from torch_denkf.filters._partition import FewSavedTensors
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
+
+
+def steps(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Six steps, the second of which is also a result."""
+    outputs = []
+    for _ in range(6):
+        x = torch.tanh(x @ w).sin() + x
+        outputs.append(x)
+    return x, outputs[1]
+
+
+def run(function, shape, dtype):
+    """Gradients of weights and input, and the shapes of all that was saved for them."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(shape, generator=generator, dtype=dtype).requires_grad_()
+    w = (0.3 * torch.randn(shape[-1], shape[-1], generator=generator, dtype=dtype)).requires_grad_()
+    saved: list[tuple[int, ...]] = []
+
+    def pack(value):
+        saved.append(tuple(value.shape))
+        return value
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda value: value):
+        last, second = function(x, w)
+    return torch.autograd.grad(last.square().sum() + second.sum(), (x, w)), saved
+
+
+def compiled(partitioner):
+    options = {} if partitioner is None else {"custom_partitioner_fn": partitioner}
+    torch._dynamo.reset()
+    return torch.compile(steps, fullgraph=True, dynamic=False, options=options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_small_tensors_go_as_one_and_gradients_stay(dtype):
+    shape = (4, 5)
+    expected, _ = run(steps, shape, dtype)
+    theirs, many = run(compiled(None), shape, dtype)
+    ours, few = run(compiled(FewSavedTensors()), shape, dtype)
+    assert sum(saved == shape for saved in many) >= 6
+    assert sum(saved == shape for saved in few) <= 2  # the input, and the step that is also a result
+    joined = [saved for saved in few if saved[0] >= 5 * shape[0]]
+    assert len(joined) == 1
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    for value, other, eager in zip(ours, theirs, expected, strict=True):
+        torch.testing.assert_close(value, eager, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(value, other, rtol=tolerance, atol=tolerance)
+
+
+def test_large_tensors_stay_apart(monkeypatch):
+    monkeypatch.setattr(_partition, "LARGE", 4 * 5 * 4)
+    monkeypatch.setattr(FewSavedTensors, "uuid", lambda self: None)  # the cache does not know of the other limit
+    gradients, saved = run(compiled(FewSavedTensors()), (4, 5), torch.float32)
+    assert sum(shape == (4, 5) for shape in saved) >= 6
+    assert max(shape[0] for shape in saved) == 5
+    for value, eager in zip(gradients, run(steps, (4, 5), torch.float32)[0], strict=True):
+        torch.testing.assert_close(value, eager, rtol=1e-5, atol=1e-5)

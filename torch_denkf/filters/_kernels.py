@@ -1,0 +1,75 @@
+"""Which kernels inductor makes of a compiled step: products that take longer to call than to compute are written out.
+
+A product of small matrices takes a microsecond, and two more for the library around it. What inductor writes itself
+runs in one kernel with what comes before and after.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
+from torch.fx import Graph, Node, map_arg
+
+__all__ = ["FewCalls", "insert_call"]
+
+aten = torch.ops.aten
+
+#: Multiplications in one matrix of a batch, up to which inductor's own loop is faster than the library's product.
+SMALL = 1024
+
+
+class FewCalls(CustomGraphPass):
+    """Applied last to each graph, forward and backward: see :func:`part_bias` and :func:`write_out_products`."""
+
+    def __call__(self, graph: Graph) -> None:
+        """Changes ``graph`` in place."""
+        part_bias(graph)
+        write_out_products(graph)
+
+    def uuid(self) -> bytes:
+        """What inductor's cache knows this by."""
+        return get_hash_for_files((__file__,))
+
+
+def part_bias(graph: Graph) -> None:
+    """Adds the bias of a linear layer after the product, in the kernel of the activation.
+
+    The library's product with bias first copies the bias to every row of its result.
+    """
+    for node in graph.find_nodes(op="call_function", target=aten.addmm.default):
+        bias, x, weight = node.args
+        if bias.meta["val"].ndim == 1 and not node.kwargs:  # factors other than 1
+            with graph.inserting_before(node):
+                _replace(
+                    graph,
+                    node,
+                    insert_call(graph, aten.add.Tensor, insert_call(graph, aten.mm.default, x, weight), bias),
+                )
+
+
+def write_out_products(graph: Graph) -> None:
+    """Writes batches of products of tiny matrices, e.g. covariances with two observed numbers, as sums of products."""
+    for node in graph.find_nodes(op="call_function", target=aten.bmm.default):
+        left, right = node.args
+        rows, inner = left.meta["val"].shape[1:]
+        if rows * inner * right.meta["val"].shape[2] <= SMALL:
+            with graph.inserting_before(node):
+                columns = insert_call(graph, aten.unsqueeze.default, left, 3)
+                products = insert_call(
+                    graph, aten.mul.Tensor, columns, insert_call(graph, aten.unsqueeze.default, right, 1)
+                )
+                _replace(graph, node, insert_call(graph, aten.sum.dim_IntList, products, [2]))
+
+
+def insert_call(graph: Graph, function: Any, *args: Any) -> Node:
+    """A node that calls ``function`` where the graph inserts, and knows the shape of its result."""
+    node = graph.call_function(function, args)
+    node.meta["val"] = function(*map_arg(args, lambda argument: argument.meta["val"]))
+    return node
+
+
+def _replace(graph: Graph, old: Node, new: Node) -> None:
+    old.replace_all_uses_with(new)
+    graph.erase_node(old)
