@@ -339,11 +339,9 @@ class Filter(TensorDictSequential):
             outputs = self._compiled.sequence(recursion, self.control_keys, inputs, is_init, starts, detach_every)
         else:
             outputs = self._eager_sequence(recursion, inputs, is_init, starts, work, detach_every)
-        frame_keys = [key for module in self.frame_modules for key in module.out_keys]
-        tensordict.update(work.select(*frame_keys))
-        for key, value in outputs.items():
-            tensordict.set(key, value)
-        return tensordict
+        frame_keys = [unravel_key(key) for module in self.frame_modules for key in module.out_keys]
+        outputs = {**{key: work.get(key) for key in frame_keys}, **outputs}
+        return Row(outputs, tensordict.batch_size, tensordict.device).write(tensordict, outputs)
 
     def _eager_sequence(self, recursion, inputs, is_init, starts, work, detach_every) -> dict[NestedKey, torch.Tensor]:
         """All outputs of the recursion, ``[*B, T, ...]`` each."""
