@@ -12,14 +12,14 @@ from benchmarks.speed.workload import MEMBERS, STEPS, make_filter, make_frames, 
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 
-#: Steps in one compiled graph. With a backward pass it takes three times as long to compile.
-CHUNK, CHUNK_BACKWARD = 20, 10
+#: Steps in one compiled graph.
+CHUNK = 20
 
 
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
     """The sequence eagerly and, unless SPEED_COMPILE=0, compiled in chunks; names for the table."""
     fields = {"samples": scheme == "sensor", "backward": backward}
-    return {kind: sequence(filter, batch, **fields) for kind, filter in filters(scheme, backward).items()}
+    return {kind: sequence(filter, batch, **fields) for kind, filter in filters(scheme).items()}
 
 
 def steps(batch: int) -> dict[str, Callable[[], Tensor]]:
@@ -27,12 +27,12 @@ def steps(batch: int) -> dict[str, Callable[[], Tensor]]:
     return {kind: tensordict_loop(filter, batch) for kind, filter in filters("sensor").items()}
 
 
-def filters(scheme: str, backward: bool = False) -> dict[str, DEnKF]:
+def filters(scheme: str) -> dict[str, DEnKF]:
     """An eager filter and, unless SPEED_COMPILE=0, a compiled one."""
     eager = {"eager": make_filter(scheme)}
     if os.environ.get("SPEED_COMPILE") == "0":
         return eager
-    return {**eager, "compiled": make_filter(scheme).compile(chunk=CHUNK_BACKWARD if backward else CHUNK)}
+    return {**eager, "compiled": make_filter(scheme).compile(chunk=CHUNK)}
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
