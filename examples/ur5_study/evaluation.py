@@ -19,12 +19,12 @@ from ur5_study.demos import JOINTS, STATE
 from ur5_study.readings import BLACK, CONDITIONS, blackouts, fail, read_all
 from ur5_study.recipes import Recipe
 from ur5_study.sensors import WRIST, Preset
-from ur5_study.training import coverage, run_filter
+from ur5_study.training import coverage, filter_error, run_filter
 
 NAMES = ("filter", "sensor", "domain", "training", "condition", "ensemble_size", "seed")
 SCORES = ("joint_mae_deg", "ee_mae_cm", "coverage90", *(f"J{i + 1}_deg" for i in range(JOINTS)))
 BLACKOUT = ("blackout_joint_mae_deg", "std_before_deg", "std_blind_deg", "std_after_deg")
-COLUMNS = (*NAMES, *SCORES, *BLACKOUT, "parameters", "ms_per_step", "demos")
+COLUMNS = (*NAMES, *SCORES, *BLACKOUT, "validation_crps", "parameters", "ms_per_step", "demos")
 AFTER = 15  # steps after a blackout at which the spread is taken again
 
 
@@ -118,9 +118,19 @@ def cost(recipe: Recipe, model: Filter, readings: TensorDict, steps: int = 100) 
 
 
 def size_rows(
-    make, sensor: ImageSensor, codes: TensorDict, sizes: Sequence[int], weights: dict, inflation: float, names: dict
+    make,
+    sensor: ImageSensor,
+    codes: TensorDict,
+    sizes: Sequence[int],
+    weights: dict,
+    inflation: float,
+    names: dict,
+    validation: TensorDict | None = None,
 ) -> list[dict]:
-    """A trained ensemble filter with other numbers of members, on clean demos; ``make(size)`` is its recipe."""
+    """A trained ensemble filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
+
+    With ``validation``, features of other demos, rows also have the CRPS on those, by which a size may be chosen.
+    """
     rows = []
     for size in sizes:
         recipe = make(size)
@@ -134,8 +144,16 @@ def size_rows(
             parts.append(run_filter(recipe, model, readings).exclude(("belief", "ensemble")))
         out = torch.cat(parts)
         row = {**names, "condition": "clean", "ensemble_size": size, "demos": len(out)}
-        rows.append({**row, **scores(out), **cost(recipe, model, first)})
+        row |= {**scores(out), **cost(recipe, model, first)}
+        if validation is not None:
+            row["validation_crps"] = validation_crps(recipe, model, read_all(sensor, validation, size))
+        rows.append(row)
     return rows
+
+
+def validation_crps(recipe: Recipe, model: Filter, readings: TensorDict) -> float:
+    """CRPS of a filter on clean demos and on the same with missing frames, in the units of the loss."""
+    return filter_error(recipe, model, [readings, fail(readings, "missing", seed=1)])["crps"]
 
 
 def save_beliefs(

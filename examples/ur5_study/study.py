@@ -17,7 +17,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training import read_checkpoint, write_checkpoint
 from ur5_study.demos import Collections, FramePool, Roles, all_actions, all_states, real_roles, row_block, sim_roles
-from ur5_study.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows
+from ur5_study.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
 from ur5_study.motion import ArmMotion, train_motion
 from ur5_study.readings import read_all, read_codes
 from ur5_study.recipes import FILTERS, Recipe
@@ -36,7 +36,7 @@ class Study:
     collections: Collections
     out: Path
     budget: Budget = field(default_factory=Budget)
-    sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512)  # of the ensemble, for one row each
+    sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512, 1024)  # of the ensemble, for one row each
 
 
 class Base:
@@ -211,6 +211,8 @@ def _filter(base: Base, names: dict) -> list[dict]:
     domain = names["domain"]
     readings = base.readings(recipe.sensor, domain)
     rows = filter_rows(recipe, model, readings, names)
+    own = read_all(recipe.sensor, base.codes("validation"), MEMBERS)
+    rows[0]["validation_crps"] = validation_crps(recipe, model, own)
     pictured = domain == "sim" or base.training == "fine_tuned"
     if names["filter"] == "denkf" and pictured:
         data = base.study.collections.replay(f"{domain}-sequences", "test")
@@ -224,7 +226,8 @@ def _sizes(base: Base, names: dict) -> list[dict]:
     saved = read_checkpoint(out / "filter.pt")
     sizes = [size for size in base.study.sizes if size != MEMBERS]  # that one is in the table
     make = partial(base.recipe, names["filter"])
-    return size_rows(make, recipe.sensor, base.codes("test"), sizes, saved["model"], saved["inflation"], names)
+    test, validation = base.codes("test"), base.codes("validation")
+    return size_rows(make, recipe.sensor, test, sizes, saved["model"], saved["inflation"], names, validation)
 
 
 def read_rows(out: Path) -> list[dict]:

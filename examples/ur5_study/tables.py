@@ -127,11 +127,15 @@ def _sizes(rows: Sequence[dict]) -> list[str]:
     lines = [
         f"Size of the ensemble, {first['filter']}, clean",
         "",
-        "| members | joints deg | end effector cm | 90 % hold | ms |",
+        "| members | CRPS, validation demos | joints deg | end effector cm | 90 % hold | ms |",
     ]
-    lines.append("|---|---|---|---|---|")
+    lines.append("|---|---|---|---|---|---|")
     for size in sorted({row["ensemble_size"] for row in own}):
         at = pick(own, ensemble_size=size)
         values = [over_seeds(at, key) for key in ("joint_mae_deg", "ee_mae_cm", "coverage90", "ms_per_step")]
-        lines.append(f"| {size} | {values[0]:.2f} | {values[1]:.3f} | {100 * values[2]:.0f} % | {values[3]:.2f} |")
+        crps = over_seeds(at, "validation_crps")
+        chosen_by = "" if crps is None else f"{crps:.3f}"
+        lines.append(
+            f"| {size} | {chosen_by} | {values[0]:.2f} | {values[1]:.3f} | {100 * values[2]:.0f} % | {values[3]:.2f} |"
+        )
     return lines

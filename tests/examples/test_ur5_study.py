@@ -346,6 +346,7 @@ def test_the_table_keeps_what_it_was_given(tmp_path):
     rows = [{**names, **scores, "condition": c, "ensemble_size": 32} for c in ("clean", "black20", "missing")]
     rows[1] |= {"blackout_joint_mae_deg": 2.0, "std_before_deg": 1.0, "std_blind_deg": 3.0, "std_after_deg": 1.1}
     rows.append({**names, **scores, "condition": "clean", "ensemble_size": 8, "joint_mae_deg": 4.5})
+    rows[-1]["validation_crps"] = 1.5
     write_csv(rows, tmp_path / "table.csv")
 
     def place(row):
@@ -355,5 +356,6 @@ def test_the_table_keeps_what_it_was_given(tmp_path):
     assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS)
     text = markdown(rows, "header")
     assert "| sim | glimpse | denkf | 1.25 / 0.25 / 90 % |" in text
-    assert "| 8 | 4.50 | 0.250 | 90 % | 2.00 |" in text
+    assert "| 8 | 1.500 | 4.50 | 0.250 | 90 % | 2.00 |" in text
+    assert "| 32 |  | 1.25 | 0.250 | 90 % | 2.00 |" in text
     assert "| sim | sim | glimpse | denkf | 2.00 | 1.00 | 3.00 | 1.10 |" in text

@@ -220,7 +220,8 @@ class Filter(TensorDictSequential):
             chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step.
                 0 goes back to eager.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
-                too, which takes longer to compile and a quarter less to run.
+                too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile
+                and about 40 % less to run.
 
         Returns:
             This filter.
