@@ -2,12 +2,20 @@
 
 import pytest
 import torch
+from torch._inductor.utils import fresh_cache
 
 from tests.filters.factories import has_compiler
 from torch_denkf.filters import _partition
 from torch_denkf.filters._partition import FewSavedTensors
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
+
+
+@pytest.fixture(autouse=True)
+def _compile_anew():
+    torch._dynamo.reset()
+    with fresh_cache():
+        yield
 
 
 def steps(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -59,7 +67,6 @@ def test_small_tensors_go_as_one_and_gradients_stay(dtype):
 
 def test_large_tensors_stay_apart(monkeypatch):
     monkeypatch.setattr(_partition, "LARGE", 4 * 5 * 4)
-    monkeypatch.setattr(FewSavedTensors, "uuid", lambda self: None)  # the cache does not know of the other limit
     gradients, saved = run(compiled(FewSavedTensors()), (4, 5), torch.float32)
     assert sum(shape == (4, 5) for shape in saved) >= 6
     assert max(shape[0] for shape in saved) == 5
@@ -102,8 +109,6 @@ def test_the_gradient_of_a_weight_is_one_product(monkeypatch, dtype, rows):
         products.append((before, count(graph)))
 
     monkeypatch.setattr(_partition, "join_products", spy)
-    monkeypatch.setattr(FewSavedTensors, "uuid", lambda self: None)  # or a second run finds it in the cache
-    torch._dynamo.reset()
     options = {"custom_partitioner_fn": FewSavedTensors()}
     function = torch.compile(layers, fullgraph=True, dynamic=False, options=options)
     gradients = run_layers(function, dtype, rows)
@@ -112,3 +117,20 @@ def test_the_gradient_of_a_weight_is_one_product(monkeypatch, dtype, rows):
     tolerance = 1e-4 if dtype == torch.float32 else 1e-11  # of sums over 20,000 rows
     for value, eager in zip(gradients, run_layers(layers, dtype, rows), strict=True):
         torch.testing.assert_close(value, eager, rtol=tolerance, atol=tolerance * eager.abs().max().item())
+
+
+def test_a_weight_that_is_used_twice_in_a_step():
+    """Its gradient has two products with one g, that of the bias has g once."""
+
+    def shared(x, first, bias, second, third):
+        outputs = []
+        for _ in range(3):
+            x = x + torch.sin(torch.nn.functional.linear(x, first, bias) + third.sum() * x @ second @ first.mT)
+            outputs.append(x)
+        return x, outputs[1]
+
+    options = {"custom_partitioner_fn": FewSavedTensors()}
+    function = torch.compile(shared, fullgraph=True, dynamic=False, options=options)
+    expected = run_layers(shared, torch.float64, 3)
+    for value, eager in zip(run_layers(function, torch.float64, 3), expected, strict=True):
+        torch.testing.assert_close(value, eager, rtol=1e-11, atol=1e-11)

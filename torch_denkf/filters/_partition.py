@@ -99,7 +99,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
         whole, products = _in_order_of_one_input(products)
         gradients = [product.args[0].args[0] for product in products]
         with graph.inserting_before(end):
-            stacked = rows[frozenset(gradients)] = insert_call(graph, aten.cat.default, gradients)
+            stacked = rows[tuple(sorted(gradients))] = insert_call(graph, aten.cat.default, gradients)
             if whole is None:
                 x = insert_call(graph, aten.cat.default, [product.args[1] for product in products])
             else:
@@ -109,7 +109,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
     for root in end.all_input_nodes:
         sources = [_viewed(term) for term in _terms(root)]
         if all(source.target is aten.sum.dim_IntList and source.args[1:] == ([0], True) for source in sources):
-            stacked = rows.get(frozenset(source.args[0] for source in sources))
+            stacked = rows.get(tuple(sorted(source.args[0] for source in sources)))
             if stacked is not None and root.meta["val"].ndim == 1:
                 with graph.inserting_before(end):
                     root.replace_all_uses_with(insert_call(graph, aten.sum.dim_IntList, stacked, [0]))
@@ -117,7 +117,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
 
 
 def _sums_of_products(graph: Graph) -> dict[Node, list[Node]]:
-    """Results of the graph that are sums of several g' x with small x."""
+    """Results of the graph that are sums of several g' x, both small."""
     sums = {}
     for root in graph.output_node().all_input_nodes:
         terms = _terms(root)
@@ -130,7 +130,7 @@ def _is_weight_gradient(node: Node) -> bool:
     if node.target is not aten.mm.default:
         return False
     left, right = node.args
-    return left.target is aten.permute.default and left.args[1] == [1, 0] and _small(right)
+    return left.target is aten.permute.default and left.args[1] == [1, 0] and _small(left.args[0]) and _small(right)
 
 
 def _terms(node: Node) -> list[Node]:
