@@ -50,7 +50,8 @@ def picture(rows: list[dict], path: Path) -> None:
     for place, row in enumerate(rows):
         if row.get("target"):
             axes.plot([row["target"]] * 2, [place - 0.42, place + 0.42], color="black", linewidth=2)
-        axes.text(row["ratio"] * 1.04, place, number(row["ratio"]), va="center", fontsize=8)
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # over the target's bar, if they meet
+        axes.text(row["ratio"] * 1.06, place, number(row["ratio"]), va="center", fontsize=8, bbox=box)
     axes.axvline(1.0, color="gray", linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
     axes.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
