@@ -125,11 +125,11 @@ def size_rows(
     weights: dict,
     inflation: float,
     names: dict,
-    validation: TensorDict | None = None,
+    validation: TensorDict,
 ) -> list[dict]:
     """A trained ensemble filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
 
-    With ``validation``, features of other demos, rows also have the CRPS on those, by which a size may be chosen.
+    Rows also have the CRPS on ``validation``, features of other demos, by which a size may be chosen.
     """
     rows = []
     for size in sizes:
@@ -144,10 +144,8 @@ def size_rows(
             parts.append(run_filter(recipe, model, readings).exclude(("belief", "ensemble")))
         out = torch.cat(parts)
         row = {**names, "condition": "clean", "ensemble_size": size, "demos": len(out)}
-        row |= {**scores(out), **cost(recipe, model, first)}
-        if validation is not None:
-            row["validation_crps"] = validation_crps(recipe, model, read_all(sensor, validation, size))
-        rows.append(row)
+        crps = validation_crps(recipe, model, read_all(sensor, validation, size))
+        rows.append({**row, **scores(out), **cost(recipe, model, first), "validation_crps": crps})
     return rows
 
 

@@ -1,21 +1,28 @@
-"""Fewer saved tensors: the oracle is eager autograd, and inductor's own partitioner for how many there are."""
+"""Fewer saved tensors: the oracle is eager autograd, and the default partitioner for how many there are."""
 
 import pytest
 import torch
-from torch._inductor.utils import fresh_cache
+from functorch.compile import nop
+from torch._dynamo.backends.common import aot_autograd
+from torch._inductor import config
+from torch._inductor.compile_fx import partition_fn
+from torch._inductor.decomposition import select_decomp_table
 
-from tests.filters.factories import has_compiler
 from torch_denkf.filters import _partition
 from torch_denkf.filters._partition import FewSavedTensors
 
-pytestmark = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 
-
-@pytest.fixture(autouse=True)
-def _compile_anew():
+def compiled(function, partitioner=None):
+    """The function through all that inductor does before it writes code, which alone needs a C++ compiler."""
     torch._dynamo.reset()
-    with fresh_cache():
-        yield
+
+    def split(*args, **fields):
+        with config.patch(custom_partitioner_fn=partitioner):
+            return partition_fn(*args, **fields)
+
+    stages = {"fw_compiler": nop, "bw_compiler": nop, "partition_fn": split}
+    backend = aot_autograd(**stages, decompositions=select_decomp_table())
+    return torch.compile(function, backend=backend, fullgraph=True, dynamic=False)
 
 
 def steps(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -43,18 +50,12 @@ def run(function, shape, dtype):
     return torch.autograd.grad(last.square().sum() + second.sum(), (x, w)), saved
 
 
-def compiled(partitioner):
-    options = {} if partitioner is None else {"custom_partitioner_fn": partitioner}
-    torch._dynamo.reset()
-    return torch.compile(steps, fullgraph=True, dynamic=False, options=options)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_small_tensors_go_as_one_and_gradients_stay(dtype):
     shape = (4, 5)
     expected, _ = run(steps, shape, dtype)
-    theirs, many = run(compiled(None), shape, dtype)
-    ours, few = run(compiled(FewSavedTensors()), shape, dtype)
+    theirs, many = run(compiled(steps), shape, dtype)
+    ours, few = run(compiled(steps, FewSavedTensors()), shape, dtype)
     assert sum(saved == shape for saved in many) >= 6
     assert sum(saved == shape for saved in few) <= 2  # the input, and the step that is also a result
     joined = [saved for saved in few if saved[0] >= 5 * shape[0]]
@@ -67,7 +68,7 @@ def test_small_tensors_go_as_one_and_gradients_stay(dtype):
 
 def test_large_tensors_stay_apart(monkeypatch):
     monkeypatch.setattr(_partition, "LARGE", 4 * 5 * 4)
-    gradients, saved = run(compiled(FewSavedTensors()), (4, 5), torch.float32)
+    gradients, saved = run(compiled(steps, FewSavedTensors()), (4, 5), torch.float32)
     assert sum(shape == (4, 5) for shape in saved) >= 6
     assert max(shape[0] for shape in saved) == 5
     for value, eager in zip(gradients, run(steps, (4, 5), torch.float32)[0], strict=True):
@@ -79,7 +80,7 @@ def layers(x: torch.Tensor, first, bias, second, third) -> tuple[torch.Tensor, t
     outputs = []
     for _ in range(5):
         hidden = torch.nn.functional.linear(x, first, bias).relu()
-        x = x + torch.sin(hidden @ second) + 0.1 * x @ third
+        x = x + torch.sin(torch.nn.functional.linear(hidden, second)) + 0.1 * x @ third
         outputs.append(x)
     return x, outputs[1]
 
@@ -109,8 +110,7 @@ def test_the_gradient_of_a_weight_is_one_product(monkeypatch, dtype, rows):
         products.append((before, count(graph)))
 
     monkeypatch.setattr(_partition, "join_products", spy)
-    options = {"custom_partitioner_fn": FewSavedTensors()}
-    function = torch.compile(layers, fullgraph=True, dynamic=False, options=options)
+    function = compiled(layers, FewSavedTensors())
     gradients = run_layers(function, dtype, rows)
     ((before, after),) = products
     assert before - after == (3 * 4 if rows == 3 else 0)  # three layers, five steps each
@@ -129,8 +129,7 @@ def test_a_weight_that_is_used_twice_in_a_step():
             outputs.append(x)
         return x, outputs[1]
 
-    options = {"custom_partitioner_fn": FewSavedTensors()}
-    function = torch.compile(shared, fullgraph=True, dynamic=False, options=options)
+    function = compiled(shared, FewSavedTensors())
     expected = run_layers(shared, torch.float64, 3)
     for value, eager in zip(run_layers(function, torch.float64, 3), expected, strict=True):
         torch.testing.assert_close(value, eager, rtol=1e-11, atol=1e-11)

@@ -24,7 +24,7 @@ __all__ = ["FewSavedTensors"]
 
 aten = torch.ops.aten
 
-#: Bytes of a tensor from which on copying it costs more than an object of its own.
+#: Bytes of a tensor from which on it stays alone: copying it takes about as long as an object of its own.
 LARGE = 2**15
 
 
