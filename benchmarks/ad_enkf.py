@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, pi
+from math import log
 from pathlib import Path
 
 import torch
@@ -30,13 +30,12 @@ from torch import nn
 
 from torch_denkf.data.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
-from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional import gaspari_cohn
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
     FromSensor,
     LearnedTransition,
-    NoisyTransition,
     Select,
 )
 from torch_denkf.objectives import DEnKFLoss
@@ -82,62 +81,24 @@ class Lorenz96(nn.Module):
         return lorenz96_step(state, forcing=self.forcing)
 
 
-class TaperedAnalysis(EnsembleAnalysis):
-    r"""The update with perturbed observations and tapered covariances: with few members the far ones are noise.
+def tapers(dims: Sequence[int], variables: int, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Factors on the covariances of the variables and the observed ones ``[N, O]``, and of the observed ``[O, O]``.
 
-    Gain :math:`(\rho \circ C H^T)(\rho \circ H C H^T + R)^{-1}`, and the likelihood of the innovation under the same
-    tapered covariance, as AD-EnKF has them in high dimensions. Without a taper it is ``EnsembleAnalysis("perturbed")``.
+    With few members correlations of variables far apart are noise; AD-EnKF tapers them in gain and likelihood alike.
 
     Args:
         dims: the observed variables, of those on the circle.
         variables: N, on the circle.
         radius: distance at which correlations have fallen to 5/24; they are zero from twice that on.
-        **kwargs: see :class:`EnsembleAnalysis`.
     """
-
-    def __init__(self, dims: Sequence[int], variables: int, radius: float, **kwargs) -> None:
-        super().__init__("perturbed", **kwargs)
-        dims, places = torch.as_tensor(dims), torch.arange(variables)
-        self.register_buffer("taper", gaspari_cohn(on_circle(places, dims, variables) / radius))
-        self.register_buffer("taper_observed", gaspari_cohn(on_circle(dims, dims, variables) / radius))
-
-    def forward(self, tensordict: TensorDict) -> TensorDict:
-        """Writes the belief and the diagnostics."""
-        forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
-        size = forecast.shape[-2]
-        draws = self.read_noise(tensordict)
-        draws = torch.randn_like(predicted) if draws is None else draws
-        draws = (draws - draws.mean(-2, keepdim=True)) * (size / (size - 1)) ** 0.5
-        anomalies, seen = (part - part.mean(-2, keepdim=True) for part in (forecast, predicted))
-        cov = self.taper_observed * (seen.mT @ seen) / (size - 1) + variance.diag_embed()
-        cross = self.taper * (anomalies.mT @ seen) / (size - 1)
-        factor = cholesky(cov)
-        innovation = observation - predicted.mean(-2)
-        shift = observation.unsqueeze(-2) + variance.sqrt().unsqueeze(-2) * draws - predicted
-        ensemble = forecast + torch.cholesky_solve(shift.mT, factor).mT @ cross.mT
-        whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False)
-        nis = whitened.square().sum(-2)
-        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-        log_likelihood = -0.5 * (nis + log_det + innovation.shape[-1] * log(2 * pi))
-        values = (ensemble, ensemble.mean(-2), ensemble.var(-2), innovation, nis, log_likelihood)
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
+    observed, places = torch.as_tensor(dims), torch.arange(variables)
+    return tuple(gaspari_cohn(on_circle(first, observed, variables), radius * 0.3**0.5) for first in (places, observed))
 
 
 def on_circle(first: torch.Tensor, second: torch.Tensor, variables: int) -> torch.Tensor:
     """Distances ``[len(first), len(second)]`` between places on a circle."""
     distance = (first.unsqueeze(-1) - second).abs()
     return torch.minimum(distance, variables - distance)
-
-
-def gaspari_cohn(distance: torch.Tensor) -> torch.Tensor:
-    """The taper of Gaspari & Cohn 1999, eq. 4.10: 1 at 0, 5/24 at 1, 0 from 2 on; a correlation function."""
-    d = distance.to(torch.get_default_dtype())
-    near = 1 + d**2 * (-5 / 3 + d * (5 / 8 + d * (1 / 2 - d / 4)))
-    beyond = d.clamp(min=1)
-    far = 4 - 2 / (3 * beyond) + beyond * (-5 + beyond * (5 / 3 + beyond * (5 / 8 + beyond * (-1 / 2 + beyond / 12))))
-    return torch.where(d <= 1, near, torch.where(d < 2, far, 0.0))
 
 
 def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> torch.Tensor:
@@ -172,7 +133,7 @@ def make_filter(
         every: one variable in so many is observed.
         ensemble_size: E.
         climate: mean and standard deviation of one variable, for those that are not observed at the start.
-        radius: of the taper, see :class:`TaperedAnalysis`; ``None`` for none.
+        radius: of the taper, see :func:`tapers`; ``None`` for none.
         learn_noise: whether the model noise is a parameter, one variance a variable, and wrong at first.
     """
     dims = list(range(0, variables, every))
@@ -183,15 +144,14 @@ def make_filter(
         out_key=("forecast", "noise"),
     )
     mean, std = climate
-    keys = {"sensor_key": "observation", "observation_dim": len(dims)}
+    taper = None if radius is None else tapers(dims, variables, radius)
     return DEnKF(
-        transition=NoisyTransition(LearnedTransition(Lorenz96(START), residual=False), noise, range(variables)),
+        transition=LearnedTransition(Lorenz96(START), residual=False),
         sensor=None,
         observation=Select(dims),
         noise=ConstantNoise([R] * len(dims), in_key="observation"),
-        analysis=EnsembleAnalysis("perturbed", **keys)
-        if radius is None
-        else TaperedAnalysis(dims, variables, radius, **keys),
+        process_noise=noise,
+        analysis=EnsembleAnalysis("perturbed", taper=taper, sensor_key="observation"),
         initial=FromSensor(
             dims, [mean] * variables, [std] * variables, ensemble_size=ensemble_size, sensor_key="observation"
         ),
@@ -329,7 +289,7 @@ def main() -> None:
         f"of {NOISE_START:g} where it is learned (Q: one variance for each variable), and sees no true state. "
         f"E = {args.ensemble}, windows of 40 steps after 20 of warm-up, 8 a batch, gradients cut every 10 steps, Adam.",
         "",
-        "Taper: radius of Gaspari & Cohn's function; `none` is `EnsembleAnalysis`. Noise: learned standard deviation, "
+        "Taper: radius of Gaspari & Cohn's function. Noise: learned standard deviation, "
         f"mean over the variables and range; {NOISE:g} is true. RMSE: of the belief's mean on 4 unseen records of 300 "
         "steps without the first 50, before and after learning, and with the true F and Q in the same filter.",
         "",

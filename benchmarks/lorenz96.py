@@ -103,7 +103,7 @@ def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor,
                 [seeds],
             )
             if case.rotate:
-                frame["noise", "analysis"] = random.rotation(case.ensemble_size)
+                frame["noise", "self"] = random.rotation(case.ensemble_size)
             ensemble = local(frame)["belief", "ensemble"]
         else:
             ensemble = analyse(

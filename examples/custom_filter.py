@@ -45,10 +45,10 @@ class GustyDrift(SubModel):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
         self.log_gust = nn.Parameter(torch.tensor(-1.0))
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        position, velocity = self.read(tensordict, ("belief", "ensemble")).split(2, -1)
+    def compute(self, ensemble: torch.Tensor) -> torch.Tensor:
+        position, velocity = ensemble.split(2, -1)
         velocity = velocity + self.log_gust.exp() * torch.randn_like(velocity)
-        return tensordict.set(("forecast", "ensemble"), torch.cat([position + DT * velocity, velocity], -1))
+        return torch.cat([position + DT * velocity, velocity], -1)
 
 
 class Beacons(Transform):

@@ -24,7 +24,7 @@ os.environ.setdefault("MUJOCO_GL", "egl" if "pixels" in " ".join(sys.argv) else 
 
 import torch
 from dm_control_study.arms import ARMS, NOISE, SIDE, Arm, HoldReading, make_env, make_one, wrap
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
@@ -57,17 +57,16 @@ class ArmTransition(m.SubModel):
         super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
         self.arm, self.scale, self.change = arm, scale, change  # of velocities and of their steps, rad/s
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        ensemble = self.read(tensordict, ("belief", "ensemble"))
+    def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
         angles, velocity = self.arm.split(ensemble)
-        action = self.read(tensordict, "action").to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)
+        action = action.to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)
         features = torch.cat([self.arm.join(angles, velocity / self.scale), action], -1)
         mean, noise = self.module(features).chunk(2, -1)
         noise = (0.02 + nn.functional.softplus(noise - 1.5)) * torch.randn_like(noise)
         velocity = velocity + self.change * (mean + noise)
         # As MuJoCo's semi-implicit Euler has it; without the noise an arm at rest would be believed for ever.
         angles = angles + self.arm.dt * velocity + DRIFT * torch.randn_like(angles)
-        return tensordict.set(("forecast", "ensemble"), self.arm.join(angles, velocity))
+        return self.arm.join(angles, velocity)
 
 
 def collect(arm: Arm, pixels: bool, args: argparse.Namespace) -> TensorDict:

@@ -156,7 +156,8 @@ def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: i
         initial=AroundState(start_std, ensemble_size=ENSEMBLE, state_key="start"),
     )
     scale = torch.cat([torch.full((3,), torch.inf), error_std])  # the pose follows from the velocities
-    loss = DEnKFLoss(recursion, sensor=0.0, observation=1.0, state_scale=scale, observation_scale=error_std)
+    weights = {"state": 0.4, "transition": 0.4, "observation": 1.0}
+    loss = DEnKFLoss(recursion, **weights, sensor=0.0, state_scale=scale, observation_scale=error_std)
     optimiser = torch.optim.Adam(recursion.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=updates)
     for _ in (bar := tqdm(range(updates), desc="training the filter", disable=None)):

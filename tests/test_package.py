@@ -34,14 +34,17 @@ def test_point_10_the_wheel_holds_the_package_alone(wheel):
     (info,) = (name for name in top if name.endswith(".dist-info"))
     assert top == {"torch_denkf", info}
     package = ROOT / "torch_denkf"
-    sources = {str(path.relative_to(ROOT)) for kind in ("*.py", "*.xml") for path in package.rglob(kind)}
+    kinds = ("*.py", "*.xml", "py.typed")
+    sources = {str(path.relative_to(ROOT)) for kind in kinds for path in package.rglob(kind)}
+    assert "torch_denkf/py.typed" in sources, "without it no type checker reads the annotations"
     assert {name for name in names if name.startswith("torch_denkf/")} == sources
     assert any(name.startswith(info) and name.endswith("LICENSE") for name in names)
     metadata = wheel.read(f"{info}/METADATA").decode()
     assert "License-Expression: MIT" in metadata or "License: MIT" in metadata
     assert "License-File: LICENSE" in metadata
-    for pin in ("torch<2.14,>=2.13", "torchrl<0.15,>=0.14.1", "tensordict<0.15,>=0.14.3", "mujoco<4"):
-        assert f"Requires-Dist: {pin}" in metadata
+    for pin in ("torch>=2.13", "torchrl>=0.14.1", "tensordict>=0.14.3", "mujoco<4,>=3.17"):
+        assert f"Requires-Dist: {pin}\n" in metadata
+    assert "Requires-Python: >=3.11\n" in metadata
     assert "Name: torch_denkf" in metadata or "Name: torch-denkf" in metadata
 
 

@@ -32,7 +32,7 @@ PAIRS = (
 #: Scripts of benchmarks/ with ratios() -> list[dict].
 SCRIPTS = ("training_step", "transform_cost", "scaling")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-LIMIT_S = 1500  # for a pair
+LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
 
 
 def in_this_process(name: str, seconds: float, out: Path) -> None:
@@ -90,6 +90,9 @@ def main() -> None:
     parser.add_argument(
         "--no-compile", action="store_true", help="leave out compiled sequences: minutes each to compile"
     )
+    parser.add_argument(
+        "--plain", action="store_true", help="measure the compiled rows with plain inductor, as a column of its own"
+    )
     parser.add_argument("--pair", nargs=2, metavar=("NAME", "JSON"), help="run one pair in this process")
     args = parser.parse_args()
     if args.pair:
@@ -97,13 +100,14 @@ def main() -> None:
         return
     if args.no_compile:
         os.environ["SPEED_COMPILE"] = "0"
+    os.environ["SPEED_PLAIN"] = "1" if args.plain else "0"
     from benchmarks.speed.report import number, write
 
     begun = time.perf_counter()
     machine = in_own_process("machine", args.seconds)
     names = [n for n in args.only if n in PAIRS or (n in SCRIPTS and (ROOT / "benchmarks" / f"{n}.py").exists())]
     command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
-    command += " --no-compile" * args.no_compile
+    command += " --no-compile" * args.no_compile + " --plain" * args.plain
     known, order = args.out / "speed.json", [*PAIRS, *SCRIPTS]
     for name in names:
         print(f"{name} ...", flush=True)
@@ -112,7 +116,13 @@ def main() -> None:
             print(f"  {row['name']}: {number(row['ratio']) or row.get('note')} (target {number(row.get('target'))})")
         # Rows of pairs that were not run again stay, and a run that is stopped leaves what it has measured.
         old = json.loads(known.read_text()) if known.exists() else []
-        rows = [row for row in old if row.get("pair") != name] + new
+        if args.plain:
+            plain = {row["name"]: row["ratio"] for row in new if row["name"].startswith("compiled")}
+            rows = [{**row, "plain": plain.get(row["name"], row.get("plain"))} for row in old]
+        else:
+            plain = {row["name"]: row.get("plain") for row in old}
+            rows = [row for row in old if row.get("pair") != name]
+            rows += [{**row, "plain": plain.get(row["name"])} for row in new]
         rows.sort(key=lambda row: order.index(row["pair"]) if row.get("pair") in order else len(order))
         write(rows, machine, command, time.perf_counter() - begun, args.out, args.plot)
 

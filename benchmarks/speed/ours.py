@@ -32,7 +32,12 @@ def filters(scheme: str) -> dict[str, DEnKF]:
     eager = {"eager": make_filter(scheme)}
     if os.environ.get("SPEED_COMPILE") == "0":
         return eager
-    return {**eager, "compiled": make_filter(scheme).compile(chunk=CHUNK)}
+    return {**eager, "compiled": make_filter(scheme).compile(chunk=CHUNK, **compile_options())}
+
+
+def compile_options() -> dict[str, str]:
+    """None, for this package's passes; with SPEED_PLAIN=1 inductor as it is."""
+    return {"backend": "inductor"} if os.environ.get("SPEED_PLAIN") == "1" else {}
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:

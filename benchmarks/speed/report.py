@@ -22,17 +22,19 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
         f"{machine['python']}. Measured in the same run: matrix peak {machine['peak_gflops']:.0f} GFLOP/s (float32),",
         f"bandwidth {machine['bandwidth_gb_s']:.0f} GB/s. Ratios: ours over theirs, below 1 ours is faster; the median",
         "over interleaved rounds in one process. Times: processor time of a step (S=5, O=2, E=32, Table I without the",
-        "image sensor) unless the row says otherwise. Pairs that this command leaves out were measured before.",
+        "image sensor) unless the row says otherwise. Pairs that this command leaves out were measured before. Plain:",
+        "the ratio of a compiled filter without this package's passes for inductor, from `--plain`.",
         "",
-        "| what | ratio | target | aim | met | ours, us | theirs, us | what differs |",
-        "|---|---|---|---|---|---|---|---|",
+        "| what | ratio | plain | target | aim | met | ours, us | theirs, us | what differs |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         met = {True: "yes", False: "**no**", None: ""}[row.get("met")]
         ratio = number(row["ratio"]) or "not measured"
         limits = [number(row.get("target")), number(row.get("aim"))]
         times = [number(row.get("ours_us"), 1), number(row.get("theirs_us"), 1)]
-        lines.append("| " + " | ".join([row["name"], ratio, *limits, met, *times, row.get("note", "")]) + " |")
+        plain = number(row.get("plain"))
+        lines.append("| " + " | ".join([row["name"], ratio, plain, *limits, met, *times, row.get("note", "")]) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -13,13 +13,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import EKF, UKF, DEnKF
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
+    ConstantNoise,
     DiagonalNoise,
     EnsembleAnalysis,
     GaussianPrior,
     LearnedObservation,
     LearnedTransition,
+    MomentPrior,
     StochasticMLP,
 )
 
@@ -27,6 +30,8 @@ STATE, OBSERVATION, MEMBERS = 5, 2, 32
 HIDDEN, NOISE_HIDDEN = (32, 32, 64, 64), (16, 16)
 RATE = 26 / 256  # 0.1, as a byte has it
 STD = 0.5  # of the observation noise before training
+PROCESS_STD = 0.1  # of the process noise of filters with a mean and a covariance
+POINTS = {"alpha": 1.0, "beta": 0.0, "kappa": 0.5}  # of the unscented transform
 STEPS = 20  # of a sequence
 
 
@@ -48,6 +53,26 @@ def make_filter(scheme: str = "sensor") -> DEnKF:
     )
 
 
+def make_gaussian_filter(kind: str) -> EKF | UKF:
+    """A filter with a mean and a covariance on the same networks, without dropout, and constant Q and R.
+
+    Its first belief is N(0, I), which its first reading updates.
+
+    Args:
+        kind: ``"EKF"`` or ``"UKF"``.
+    """
+    torch.manual_seed(0)
+    models = (
+        LearnedTransition(StochasticMLP(STATE, STATE, HIDDEN, layer="none", output_gain=0.3)),
+        ConstantNoise([PROCESS_STD] * STATE, in_key=("belief", "mean"), out_key=("forecast", "noise")),
+        None,
+        LearnedObservation(StochasticMLP(STATE, OBSERVATION, HIDDEN, layer="none")),
+        ConstantNoise([STD] * OBSERVATION),
+    )
+    start = {"initial": MomentPrior(torch.zeros(STATE), torch.eye(STATE)), "update_at_reset": True}
+    return EKF(*models, **start) if kind == "EKF" else UKF(*models, **POINTS, **start)
+
+
 def make_frames(batch: int, steps: int = STEPS, *, samples: bool = True) -> TensorDict:
     """Frames ``[batch, steps]`` with the sensor's samples, or one reading each."""
     generator = torch.Generator().manual_seed(1)
@@ -61,9 +86,12 @@ def start(filter: DEnKF, batch: int) -> Tensor:
     return filter.initial(TensorDict({}, [batch])).get(("belief", "ensemble"))
 
 
-def weights(filter: DEnKF) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Weight ``[out, in]`` and bias of every layer of the three networks."""
-    networks = {name: filter[name].module for name in ("transition", "observation", "noise")}
+def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """Weight ``[out, in]`` and bias of every layer of the networks: three, or two where Q and R are constant."""
+    if isinstance(filter, DEnKF):
+        networks = {name: filter[name].module for name in ("transition", "observation", "noise")}
+    else:  # one module inside the other: the filter's step, the model, its network
+        networks = {"transition": filter["transition"].module.module, "observation": filter["analysis"].module.module}
     return {
         name: [(layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in network.layers]
         for name, network in networks.items()

@@ -10,11 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf.modules import LearnedTransition, SubModel
+from torch_denkf.modules import LearnedTransition, SubModel, run_module
 from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
 from ur5_study.demos import JOINTS, STATE
 from ur5_study.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
@@ -135,25 +135,26 @@ class AtRest(SubModel):
     Args:
         initial: a belief around the filters' state.
         state_key: the table's state ``[*B, 10]``, or the filters' ``[*B, S]``.
-        size: S.
+        size: S; further numbers of the state are zero, and those beyond it are left out.
     """
 
     def __init__(self, initial: TensorDictModuleBase, state_key: str = "state", size: int = SIZE):
         super().__init__(initial, [state_key], initial.out_keys)
         self.size = size
-        self.state_dim = STATE
+        self.input_dim, self.state_dim = STATE, size
         if hasattr(initial, "ensemble_size"):
             self.ensemble_size = initial.ensemble_size
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        state = self.read(tensordict, self.in_keys[0])
-        missing = self.size - state.shape[-1]
-        state = torch.cat([state, state.new_zeros(*state.shape[:-1], missing)], -1)
-        out = self.module(tensordict.copy().set(self.in_keys[0], state))
-        for key in self.out_keys:
-            tensordict.set(key, out.get(key))
-        return tensordict
+    def parts(self):
+        """The belief around the filters' state."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief."""
+        (key,) = self.in_keys
+        state = self.required(entries, key)
+        state = nn.functional.pad(state, (0, self.size - state.shape[-1]))
+        return run_module(self.module, {**entries, key: state}, call.part("initial"))
 
 
 class MotionLoss(nn.Module):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
 from torch_denkf.functional import crps_ensemble
@@ -181,18 +181,16 @@ class NearForecast(SubModel):
         super().__init__(nn.Identity(), [("sensor", "ensemble"), forecast_key], [NEAR], optional_keys=[log_weight_key])
         self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``("sensor", "near")`` ``[*B, E, 10]``."""
-        samples, forecast = (self.read(tensordict, key) for key in self.in_keys)
+    def compute(self, samples, forecast, log_weights=None, *, batch_size):
+        """The states ``[*B, E, 10]``."""
         angle = forecast[..., WRIST]
-        if forecast.ndim > tensordict.ndim + 1:
-            weights = tensordict.get(self.optional_keys[0], None)
-            angle = angle.mean(-1) if weights is None else (weights.exp() * angle).sum(-1)
+        if angle.ndim > len(batch_size):
+            angle = angle.mean(-1) if log_weights is None else (log_weights.exp() * angle).sum(-1)
         near = angle.detach().unsqueeze(-1).expand(samples.shape[:-1])
         states = self.preset.state_of(samples, near)
         if self.factor != 1.0:
             states = torch.lerp(states.mean(-2, keepdim=True), states, self.factor)
-        return tensordict.set(NEAR, states)
+        return states
 
 
 class BlackIsMissing(SubModel):
@@ -208,13 +206,11 @@ class BlackIsMissing(SubModel):
         super().__init__(nn.Identity(), ["pixels"], ["observed"], optional_keys=["observed"])
         self.threshold = threshold
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``"observed"`` ``[*B, 1]``; what was not observed before stays so."""
-        pixels = self.read(tensordict, "pixels")
+    def compute(self, pixels, before=None):
+        """The mask ``[*B, 1]``; what was not observed before stays so."""
         white = 1.0 if pixels.is_floating_point() else 255
         seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
-        before = tensordict.get("observed", None)
-        return tensordict.set("observed", seen if before is None else seen & before)
+        return seen if before is None else seen & before
 
 
 def disturb(frames: TensorDict, generator: torch.Generator) -> TensorDict:

@@ -9,23 +9,22 @@ from tensordict import TensorDict
 from torch.distributions import MultivariateNormal
 
 from tests.filters.factories import linear_denkf, linear_system
-from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.functional import gaspari_cohn, kalman_predict, kalman_update
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior
 from torch_denkf.objectives import DEnKFLoss
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 from ad_enkf import (
-    TaperedAnalysis,
     climate_of,
     forcing_of,
-    gaspari_cohn,
     learn,
     make_filter,
     noise_of,
     observe,
     on_circle,
     simulate,
+    tapers,
 )
 
 
@@ -64,41 +63,28 @@ def test_only_the_likelihood_counts():
 # ------------------------------------------------------------------------------------------------------ tapering
 
 
-def test_taper_is_a_correlation_with_two_smooth_joints(float64):
-    torch.testing.assert_close(gaspari_cohn(torch.tensor([0.0, 1.0, 2.0, 7.0])), torch.tensor([1, 5 / 24, 0, 0]))
-    for joint in (1.0, 2.0):
-        d = torch.tensor([joint - 1e-7, joint + 1e-7], requires_grad=True)
-        gaspari_cohn(d).sum().backward()
-        torch.testing.assert_close(*d.grad, rtol=0, atol=1e-5)
+def test_taper_is_a_correlation_that_ends_at_twice_its_radius(float64):
+    far, near = tapers([0, 5, 10], 40, radius=5.0)
+    torch.testing.assert_close(near, torch.tensor([[1, 5 / 24, 0], [5 / 24, 1, 5 / 24], [0, 5 / 24, 1]]))
+    assert far[[35, 30], 0].tolist() == pytest.approx([5 / 24, 0], abs=1e-12)  # round the circle
     places = torch.arange(40)
-    distance = on_circle(places, places, 40)
-    assert distance[0, [1, 20, 39]].tolist() == [1, 20, 1]
-    assert torch.linalg.eigvalsh(gaspari_cohn(distance / 5)).amin() > 0
+    assert on_circle(places, places, 40)[0, [1, 20, 39]].tolist() == [1, 20, 1]
+    assert torch.linalg.eigvalsh(tapers(range(40), 40, 5.0)[1]).amin() > 0
 
 
 def members(dims, variables=8, size=5):
     ensemble = torch.randn(3, size, variables)
     sensor = {"ensemble": torch.randn(3, len(dims)), "noise": torch.rand(3, len(dims)) + 0.5}
     forecast = {"ensemble": ensemble, "observation": ensemble[..., dims]}
-    return TensorDict(
-        {"forecast": forecast, "sensor": sensor, "noise": {"analysis": torch.randn(3, size, len(dims))}}, [3]
-    )
-
-
-def test_without_a_taper_it_is_the_librarys_analysis(float64):
-    td = members([0, 2, 4, 6])
-    tapered = TaperedAnalysis([0, 2, 4, 6], 8, 1e12)(td.copy())
-    expected = EnsembleAnalysis("perturbed")(td.copy())
-    for key in EnsembleAnalysis().out_keys:
-        torch.testing.assert_close(tapered[key], expected[key], rtol=0, atol=1e-10)
+    return TensorDict({"forecast": forecast, "sensor": sensor, "noise": {"self": torch.randn(3, size, len(dims))}}, [3])
 
 
 def test_tapered_update_is_its_formula(float64):
     dims, td = [0, 2, 4, 6], members([0, 2, 4, 6])
-    out = TaperedAnalysis(dims, 8, 1.5)(td.copy())
+    out = EnsembleAnalysis("perturbed", taper=tapers(dims, 8, 1.5))(td.copy())
     forecast, y, R = td["forecast", "ensemble"], td["sensor", "ensemble"], td["sensor", "noise"]
     gap = torch.arange(8.0).unsqueeze(-1) - torch.arange(8.0)
-    C = torch.stack([row.mT.cov() for row in forecast]) * gaspari_cohn(torch.minimum(gap % 8, -gap % 8) / 1.5)
+    C = torch.stack([row.mT.cov() for row in forecast]) * gaspari_cohn(torch.minimum(gap % 8, -gap % 8), 1.5 * 0.3**0.5)
     S = C[:, dims][..., dims] + R.diag_embed()
     density = MultivariateNormal(forecast.mean(1)[:, dims], S)
     torch.testing.assert_close(out["info", "log_likelihood"].squeeze(-1), density.log_prob(y), rtol=0, atol=1e-11)
@@ -116,7 +102,7 @@ def test_gradient_is_that_of_finite_differences(float64, every, radius):
     record = observe(simulate(8, 6, 2, rng), every, rng)
     filter = make_filter(8, every, 10, climate=(2.3, 3.6), radius=radius, learn_noise=True)
     filter.draw_noise(record)  # the same noise in every evaluation
-    assert set(record["noise"].keys()) == {"initial", "motion", "analysis"}
+    assert set(record["noise"].keys()) == {"initial", "transition", "analysis"}
     loss = DEnKFLoss.ad_enkf(filter)
     loss(record)["loss_nll"].backward()
     forcing, log_variance, step = forcing_of(filter), filter["transition"].module["noise"].log_variance, 1e-6

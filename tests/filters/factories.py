@@ -5,7 +5,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.filters._compiled import need_compiler
+from torch_denkf.filters.inductor import need_compiler
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules import (
     ConstantNoise,
@@ -58,32 +58,28 @@ def toy_frames(batch, *, masks=1, resets=True):
 class NoisyLinear(SubModel):
     """x' = F x + B a + N(0, Q) for every member; without ``root`` deterministic."""
 
-    def __init__(self, matrix, root=None, ensemble_size=None, control=None):
+    def __init__(self, matrix, root=None, control=None):
         keys = [("belief", "ensemble")] + ["action"] * (control is not None)
-        super().__init__(nn.Identity(), keys, [("forecast", "ensemble")], noise_key=("noise", "transition"))
-        self.ensemble_size = ensemble_size
+        super().__init__(nn.Identity(), keys, [("forecast", "ensemble")])
+        self.noise_names = () if root is None else ("",)
         self.register_buffer("matrix", matrix)
         self.register_buffer("root", root)
         self.register_buffer("control", control)
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        if self.root is None:
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        if self.root is None or members is None:
             return None
-        shape = (*batch_size, self.ensemble_size, self.matrix.shape[0])
+        shape = (*batch_size, members, self.matrix.shape[0])
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
-    runs_on_rows = True
+    def noise_sizes(self, state, *_):
+        return {"members": state.shape[-2]}
 
-    def forward(self, tensordict):
-        state = self.read(tensordict, self.in_keys[0])
+    def compute(self, state, action=None, *, noise):
         out = state @ self.matrix.mT
-        if self.control is not None:
-            out = out + (self.read(tensordict, "action") @ self.control.mT).unsqueeze(-2)
-        if self.root is not None:
-            noise = self.read_noise(tensordict)
-            noise = self.draw_noise(tensordict.batch_size, dtype=state.dtype) if noise is None else noise
-            out = out + noise @ self.root.mT
-        return tensordict.set(self.out_keys[0], out)
+        if action is not None:
+            out = out + (action @ self.control.mT).unsqueeze(-2)
+        return out if noise is None else out + noise @ self.root.mT
 
 
 class FixedEnsemble(SubModel):
@@ -94,11 +90,9 @@ class FixedEnsemble(SubModel):
         self.register_buffer("members", members)
         self.ensemble_size, self.state_dim = members.shape
 
-    def forward(self, tensordict):
-        ensemble = self.members.expand(*tensordict.batch_size, *self.members.shape)
-        for key, value in zip(self.out_keys, (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+    def compute(self, *, batch_size):
+        ensemble = self.members.expand(*batch_size, *self.members.shape)
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
 
 
 def linear_system(dtype=None):
@@ -123,7 +117,7 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
     generator = torch.Generator().manual_seed(0)
     members = torch.randn(ensemble_size, 2, generator=generator, dtype=F.dtype)
     return DEnKF(
-        transition=NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None, ensemble_size, control),
+        transition=NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None, control),
         sensor=None,
         observation=LinearObservation(H),
         noise=ConstantNoise(R.sqrt() if r is None else r, in_key="observation"),

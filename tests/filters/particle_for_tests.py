@@ -43,18 +43,19 @@ def toy_filter(scheme="soft", learned=False, **kwargs):
     return ParticleFilter(**toy_parts(), **options, resampling=scheme, alpha=0.3, **kwargs)
 
 
-def bootstrap(size, *, noisy=True, initial=None, **kwargs):
+def bootstrap(size, *, noisy=True, initial=None, observed_key="observed", **kwargs):
     """The bootstrap filter of :func:`linear_system`, with the prior of :func:`linear_kalman`."""
     F, Q, H, R = linear_system()
     kf = linear_kalman()
     prior = GaussianPrior(kf.initial.mean, kf.initial.cov.diagonal().sqrt(), ensemble_size=size)
     return ParticleFilter(
-        NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None, size),
+        NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None),
         None,
         LinearObservation(H),
-        GaussianLikelihood(sensor_key="observation"),
+        GaussianLikelihood(sensor_key="observation", observed_key=observed_key),
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=prior if initial is None else initial,
+        observed_key=observed_key,
         **kwargs,
     )
 

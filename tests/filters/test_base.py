@@ -75,14 +75,8 @@ def test_modules_are_sorted_by_their_keys_whatever_their_order(float64):
     filter = toy_denkf()
     frames = filter.draw_noise(toy_frames((2, 5)))
     # The sensor behind the transition: still a frame module.
-    other = Filter(
-        filter["transition"],
-        filter["sensor"],
-        filter["observation"],
-        filter["noise"],
-        filter["analysis"],
-        initial=filter.initial,
-    )
+    order = ("transition", "sensor", "observation", "noise", "analysis")
+    other = Filter({name: filter[name] for name in order}, initial=filter.initial)
     assert other.frame_modules == [filter["sensor"], filter["noise"]]
     assert_equal(other.sequence(frames.copy()), filter.sequence(frames.copy()), filter.out_keys)
 
@@ -94,8 +88,13 @@ def test_nested_sequences_are_the_flat_filter(float64):
     nested = Filter(front, flat["transition"], back, initial=flat.initial)
     frames = toy_frames((3, 9), masks=OBS)
     nested.draw_noise(frames)
-    assert set(frames["noise"].keys()) == {"sensor", "initial", "transition", "analysis"}
-    assert_equal(nested.sequence(frames.copy()), flat.sequence(frames.copy()), flat.out_keys)
+    assert set(frames["noise"].keys()) == {"0.0", "1", "2.1.0", "initial"}
+    of_flat = frames.exclude("noise")
+    for place, name in (("0.0", "sensor"), ("1", "transition"), ("2.1.0", "analysis"), ("initial", "initial")):
+        of_flat["noise", name] = frames["noise", place]  # noise is named by the place
+    assert_equal(nested.sequence(frames.copy()), flat.sequence(of_flat.copy()), flat.out_keys)
+    with pytest.raises(KeyError, match=r"'noise', 'sensor'.* is noise of no module"):
+        nested.sequence(of_flat)
     assert_equal(stepwise(nested, frames), nested.sequence(frames.copy()), BELIEF, atol=1e-12)
 
 
@@ -257,10 +256,11 @@ def test_policy_transform_and_sequence_agree(float64, update_at_reset, make):
         by_transform = rollout(env(InitTracker(), DEnKFTransform(filter)), actor)
     assert by_policy["is_init"].sum(1).flatten().tolist() == [3, 3, 1]
     assert by_policy["state"].equal(by_transform["state"]), "the same episodes"
-    # What LSTMModule does, too: at the root stands the belief that has seen the observation there.
-    belief = [key for key in filter.belief_keys if key in by_policy.keys(True)]
+    # At the root stands the belief that has seen the observation there, for the actor, and the one before it.
+    belief = filter.belief_keys
     assert_equal(by_policy, by_transform, belief, atol=1e-13)
-    assert_equal(by_policy["next"], by_policy, filter.carry_keys)
+    assert_equal(by_policy["next", "previous"], by_policy, filter.carry_keys)
+    assert by_policy["previous", "known"].equal(~by_policy["is_init"])
     frames = by_policy.select("observation", "observed", "is_init", "action")
     by_sequence = filter.sequence(frames.copy())
     assert_equal(by_sequence, by_policy, belief, atol=1e-13)
@@ -279,7 +279,8 @@ def test_primer_of_every_kind_of_initial_belief():
         state = torch.get_rng_state()
         primer = filter.make_tensordict_primer()
         assert torch.get_rng_state().equal(state), "no random numbers are used up"
-        assert set(primer.primers.keys(True, True)) == set(filter.carry_keys)
+        carried = {("previous", *key) for key in filter.carry_keys} | {("previous", "known")}
+        assert set(primer.primers.keys(True, True)) == carried
 
 
 def test_summaries_follow_from_the_carry(float64):

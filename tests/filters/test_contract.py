@@ -17,7 +17,7 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import LSTMFilter, ParticleFilter, _recursion, base
+from torch_denkf.filters import LSTMFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
 from torch_denkf.transforms import DEnKFTransform
 
@@ -25,7 +25,7 @@ from torch_denkf.transforms import DEnKFTransform
 def particles(scheme):
     F, Q, H, R = linear_system()
     return ParticleFilter(
-        NoisyLinear(F, torch.linalg.cholesky(Q), 16),
+        NoisyLinear(F, torch.linalg.cholesky(Q)),
         None,
         LinearObservation(H),
         GaussianLikelihood(sensor_key="observation"),
@@ -111,20 +111,6 @@ def test_steps_are_the_sequence(float64, name, width):
 
 
 @every_filter
-def test_rows_are_tensordicts_bit_for_bit(float64, name, monkeypatch):
-    filter, frames = FILTERS[name](), readings(3, 9, width=2)
-    assert filter._make_recursion(False).on_rows
-    filter.draw_noise(frames)
-    on_rows = filter.sequence(frames.copy())
-    step_on_rows = filter.step(on_rows[:, 4].copy())
-    for module in (base, _recursion):
-        monkeypatch.setattr(module, "on_rows", lambda *_: None)
-    assert not filter._make_recursion(False).on_rows
-    assert_same(on_rows, filter.sequence(frames.copy()), filter.out_keys)
-    assert_same(step_on_rows, filter.step(on_rows[:, 4].copy()), filter.out_keys)
-
-
-@every_filter
 def test_compiled_is_eager(float64, name):
     """Forward and backward. What inductor makes of a graph is tested in test_compiled.py."""
     filter, frames = FILTERS[name](), readings(3, 5, width=2)
@@ -137,7 +123,7 @@ def test_compiled_is_eager(float64, name):
         step = filter.step(out[:, 3].select(*filter.carry_keys, *frames.keys()).exclude("noise"))
         gradient = torch.autograd.grad(out["belief", "mean"].square().sum(), frames["observation"])
         outs.append((out, step, gradient[0]))
-    assert {facts[0] for facts in filter._compiled._functions} == {"first", "chunk", "step"}
+    assert {facts[0] for facts in filter.compiled._functions} == {"first", "chunk", "step"}
     for eager, compiled in zip(*outs, strict=True):
         if isinstance(eager, torch.Tensor):
             torch.testing.assert_close(compiled, eager, rtol=0, atol=1e-11)
@@ -208,3 +194,5 @@ def test_the_primer_carries_the_belief_of_a_policy(float64, name):
     frames = rollout.select("observation", "observed", "is_init", "action")
     assert rollout["is_init"].sum() == 4, "each row starts anew once"
     assert_same(filter.sequence(frames), rollout, filter.belief_keys, atol=1e-10)
+    resumed = filter.sequence(rollout[:, 2:].exclude("belief"))
+    assert_same(resumed, rollout[:, 2:], filter.belief_keys, atol=1e-10)

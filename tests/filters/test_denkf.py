@@ -53,7 +53,10 @@ def test_paper_is_table_one():
     # s: 64 (6 49 + 1) + 32 (64 9 + 1) + 16 (32 9 + 1), then 136256 + 4160 + 2080 + 1056 + 66.
     assert count(denkf["sensor"]) == 18880 + 18464 + 4624 + 136256 + 4160 + 2080 + 1056 + 66 == 185586
     assert count(denkf) == 7845 + 7650 + 354 + 185586 == 201435
-    assert denkf.initial.ensemble_size == denkf["sensor"].ensemble_size == denkf["transition"].ensemble_size == 32
+    assert denkf.initial.ensemble_size == denkf["sensor"].ensemble_size == 32
+    frames = denkf.draw_noise(TensorDict({"pixels": torch.zeros(3, 6, 50, 150)}, [3]))
+    assert frames["noise", "transition"].shape == (3, 32, 32 + 32 + 64 + 64)
+    assert frames["noise", "sensor"].shape == (3, 32, 64 + 64 + 32 + 32)
     assert denkf["analysis"].scheme == "sensor"
     assert denkf["transition"].residual
 

@@ -232,3 +232,18 @@ def test_compiled_step_equals_eager(name):
     torch.compiler.reset()
     compiled = torch.compile(filter.step, backend="aot_eager")(td.copy())
     assert_equal(compiled, eager, BELIEF, atol=1e-5)
+
+
+@ALL
+def test_the_noise_is_read_where_its_module_writes_it(float64, name):
+    _, _, _, R = linear_system()
+    frames = linear_frames(3, 12)
+    expected = linear_filter(name).sequence(frames.copy())
+    # What lies under the name that is usual has nothing to do with this filter.
+    frames["sensor", "noise"] = torch.full((3, 12, 2), 100.0)
+    noise = ConstantNoise(R.sqrt(), in_key="observation", out_key=("camera", "r"))
+    found = linear_filter(name, noise=noise).sequence(frames.copy())
+    assert_equal(found, expected, [*BELIEF, *INFO], atol=0)
+    torch.testing.assert_close(found["camera", "r"], R.expand(3, 12, 2), rtol=1e-14, atol=0)
+    alone = linear_filter(name, noise=noise).sequence(frames.exclude("sensor"))
+    assert_equal(alone, expected, [*BELIEF, *INFO], atol=0)

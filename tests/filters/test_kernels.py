@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torch_denkf.filters._kernels import SMALL, FewCalls
+from torch_denkf.filters.inductor.kernels import SMALL, FewCalls
 
 aten = torch.ops.aten
 

@@ -25,8 +25,9 @@ def test_step_equals_sequence_bit_for_bit(float64, scheme, learned, batch, masks
     frames["measurement"] = (frames["measurement"] * 16).round() / 16
     assert frames["is_init"][..., 1:, :].any()
     filter.draw_noise(frames)
-    drawn = {"sensor", "initial", "transition", "motion"}
-    assert set(frames["noise"].keys()) == drawn | ({"resampling"} if scheme in ("systematic", "soft") else set())
+    # Of the sensor, the prior, the motion noise and the stochastic network under it; and of resampling.
+    drawn = {"sensor", "initial.initial", "transition.transition", "transition.transition.transition"}
+    assert set(frames["noise"].keys()) == drawn | ({"transition"} if scheme in ("systematic", "soft") else set())
     steps, sequence = stepwise(filter, frames), filter.sequence(frames.copy())
     # Sums over 8 rows of a matrix product may come in another order for another number of rows: 1e-16.
     assert_equal(steps, sequence, list(dict.fromkeys(filter.out_keys)), atol=1e-12)
@@ -42,7 +43,7 @@ def test_resets_start_from_equal_weights(float64, scheme):
     start = frames["is_init"].squeeze(-1)
     for key in ("belief", "forecast"):
         assert (out[key, "log_weight"][start] == -math.log(E)).all()
-        assert out[key, "ensemble"][start].equal(frames["noise", "initial"][start])
+        assert out[key, "ensemble"][start].equal(frames["noise", "initial.initial"][start])
     updated = ~start & frames["observed"].squeeze(-1)
     assert updated.any()
     assert (out["belief", "log_weight"].std(-1)[updated] > 1e-3).all()
@@ -87,7 +88,7 @@ def test_partial_mask_is_the_filter_of_the_remaining_dimension(float64, kept):
     F, Q, H, R = linear_system()
     both = bootstrap(50)
     one = ParticleFilter(
-        NoisyLinear(F, torch.linalg.cholesky(Q), 50),
+        NoisyLinear(F, torch.linalg.cholesky(Q)),
         None,
         LinearObservation(H[[kept]]),
         GaussianLikelihood(sensor_key="observation"),
@@ -100,6 +101,24 @@ def test_partial_mask_is_the_filter_of_the_remaining_dimension(float64, kept):
     td["observation"] = torch.where(observed, td["observation"], torch.nan)
     masked = both.sequence(td.set("observed", observed))
     assert_equal(masked, single, [*BELIEF, ("info", "ess"), ("info", "log_likelihood")], atol=1e-11)
+
+
+@pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])
+def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
+    frames = TensorDict({"observation": torch.randn(3, 8, 2)}, [3, 8])
+    frames["observed"] = torch.rand(3, 8, 1) < 0.6
+    frames["observed"][:, 3:5], frames["observed"][:, 2] = False, True
+    usual = bootstrap(20, resampling=scheme)
+    frames = usual.draw_noise(frames)
+    expected = usual.sequence(frames.copy())
+    renamed = bootstrap(20, resampling=scheme, observed_key=("camera", "seen"))
+    frames["camera", "seen"] = frames["observed"]
+    found = renamed.sequence(frames.exclude("observed"))
+    keys = [*BELIEF, ("forecast", "log_weight"), ("forecast", "ensemble")]
+    assert_equal(found, expected, keys)
+    for t in (3, 4):
+        assert found["forecast", "log_weight"][:, t].equal(found["belief", "log_weight"][:, t - 1]), "not resampled"
+    assert found["forecast", "log_weight"][:, 2].std() < found["belief", "log_weight"][:, 2].std()
 
 
 # ------------------------------------------------------------------------------------------------- gradients

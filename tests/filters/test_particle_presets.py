@@ -64,7 +64,9 @@ def test_what_is_there_already_is_kept():
     assert filter["transition"] is transition
     assert filter.initial is initial
     assert filter.carry_keys == [("belief", "ensemble"), ("belief", "log_weight")]
-    assert filter["transition"].module.ensemble_size == E
+    # The number of particles is the prior's: all noise of a sequence can be drawn in bulk.
+    noise = filter.draw_noise(toy_frames((3, 6)))["noise"]
+    assert noise["transition.transition"].shape[:3] == noise["transition.transition.transition"].shape[:3] == (3, 6, E)
 
 
 def test_clones_of_past_velocities_are_resampled_along():

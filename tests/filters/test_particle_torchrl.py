@@ -55,8 +55,8 @@ def test_policy_transform_and_sequence_agree(float64, update_at_reset):
 def test_primer_holds_particles_and_weights():
     filter = toy_filter()
     primer = filter.make_tensordict_primer()
-    assert primer.primers["belief", "ensemble"].shape == (E, S)
-    assert primer.primers["belief", "log_weight"].shape == (E,)
+    assert primer.primers["previous", "belief", "ensemble"].shape == (E, S)
+    assert primer.primers["previous", "belief", "log_weight"].shape == (E,)
 
 
 @pytest.mark.parametrize("store_ensemble", [True, False])

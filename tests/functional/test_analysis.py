@@ -372,3 +372,13 @@ def test_a_taper_that_does_not_fit_is_refused(scheme, space, shape, message):
     taper = torch.ones(shape, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
     with pytest.raises(ValueError, match=message):
         problem.analyse(scheme, taper=taper, space=space)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("sizes", SIZES)
+def test_a_rotation_multiplies_the_anomalies_from_the_left(sizes, space):
+    problem, rotation = Problem(*sizes, (3,)), random_rotation(sizes[0], (3,), dtype=torch.float64)
+    assert (rotation - rotation.mT).abs().amax((1, 2)).min() > 0.1, "from the right it would be another one"
+    plain, rotated = (problem.analyse("etkf", space=space, **o).ensemble for o in ({}, {"rotation": rotation}))
+    mean = plain.mean(-2, keepdim=True)
+    torch.testing.assert_close(rotated, mean + rotation @ (plain - mean), **EXACT)

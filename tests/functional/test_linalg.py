@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_denkf.functional import cholesky, inverse_square_root, inverse_square_root_difference
+from torch_denkf.functional import cholesky, inverse_square_root, inverse_square_root_difference, semidefinite_root
 
 # Eigenvalues with repetitions, zeros, and eight decades between them.
 SPECTRA = [[0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 0.0, 0.0], [1e6, 1.0, 1.0, 1e-2], [3.0, 2.0, 1.0, 0.5]]
@@ -46,3 +46,55 @@ def test_cholesky_fails_loudly_and_only_where_it_fails():
     factor = cholesky(torch.stack([good, -good]))
     assert torch.equal(factor[0], torch.linalg.cholesky(good))
     assert factor[1].isnan().all()
+
+
+# The ridge of a root is relative, and 1e-14 times the dimension: its root is 1e-7.
+
+
+def test_root_of_what_is_definite_is_its_cholesky_factor(float64):
+    factor = torch.randn(5, 3, 3).tril()
+    factor.diagonal(dim1=1, dim2=2).abs_().add_(0.5)
+    units = torch.tensor([1e6, 1.0, 1e-6])  # metres and microradians alike
+    factor = units.unsqueeze(-1) * factor
+    root = semidefinite_root(factor @ factor.mT)
+    torch.testing.assert_close(root / units.unsqueeze(-1), factor / units.unsqueeze(-1), rtol=1e-10, atol=1e-10)
+
+
+def test_root_of_rank_one_is_the_vector(float64):
+    vector = torch.tensor([[3.0, -4.0, 0.0], [1e-6, 2e-6, 1e3]])
+    root = semidefinite_root(vector.unsqueeze(-1) * vector.unsqueeze(-2))
+    size = vector.abs().unsqueeze(-1)
+    expected = torch.nn.functional.pad(vector.unsqueeze(-1), (0, 2))
+    assert ((root - expected).abs() <= 1e-6 * size).all()
+
+
+def test_root_of_a_diagonal(float64):
+    variances = torch.tensor([[4.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
+    expected = torch.tensor([[2.0, 0.0, 0.5], [0.0, 0.0, 0.0]]).diag_embed()
+    torch.testing.assert_close(semidefinite_root(variances.diag_embed()), expected, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_root_is_a_root_whatever_the_rank(float64, rank, batch):
+    some = torch.randn(*batch, 3, rank)
+    cov = some @ some.mT
+    root = semidefinite_root(cov)
+    assert (root.triu(1) == 0).all()
+    torch.testing.assert_close(root @ root.mT, cov, rtol=1e-12, atol=1e-12)
+
+
+def test_root_fails_loudly_and_only_where_it_fails(float64):
+    cov = torch.stack([torch.eye(2), torch.tensor([[1.0, 2.0], [2.0, 1.0]]), torch.zeros(2, 2)])
+    root = semidefinite_root(cov)
+    assert root[1].isnan().any()
+    torch.testing.assert_close(root[[0, 2]], cov[[0, 2]], rtol=1e-13, atol=0)
+
+
+def test_gradient_of_a_root_is_that_of_a_root(float64):
+    # A A^T = P: the derivative of the left-hand side in any direction is that direction, up to the ridge.
+    some, direction = torch.randn(3, 3), torch.randn(3, 3)
+    direction = direction + direction.mT
+    square = lambda cov: semidefinite_root(cov) @ semidefinite_root(cov).mT  # noqa: E731
+    _, moved = torch.autograd.functional.jvp(square, some @ some.mT, direction)
+    torch.testing.assert_close(moved, direction, rtol=1e-10, atol=1e-10)

@@ -48,7 +48,7 @@ def test_equals_the_function(float64, scheme, batch, masked):
         td["observed"] = torch.rand(*batch, OBS) < 0.6
     noise = torch.randn(*batch, E, OBS) if scheme == "perturbed" else None
     if noise is not None:
-        td["noise", "analysis"] = noise
+        td["noise", "self"] = noise
     result = expected(td, scheme, perturbation=noise)
     out = EnsembleAnalysis(scheme)(td)
     assert_belief(out, result.ensemble)
@@ -66,7 +66,7 @@ def test_relaxation_then_inflation(float64):
 def test_rotation_given_and_drawn(float64):
     module, td = EnsembleAnalysis("etkf", rotate=True), inputs()
     rotation = random_rotation(E, (3,))
-    given = module(td.copy().set(("noise", "analysis"), rotation))
+    given = module(td.copy().set(("noise", "self"), rotation))
     assert_belief(given, expected(td, "etkf", rotation=rotation).ensemble)
     drawn, again = (module(td.copy())["belief", "ensemble"] for _ in range(2))
     plain = expected(td, "etkf").ensemble
@@ -80,17 +80,24 @@ def test_rotation_given_and_drawn(float64):
 
 @pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
 def test_bulk_noise_is_what_a_step_would_use(float64, scheme):
-    module = EnsembleAnalysis(scheme, rotate=scheme == "etkf", ensemble_size=E, observation_dim=OBS)
+    module = EnsembleAnalysis(scheme, rotate=scheme == "etkf")
     td = inputs()
-    noise = module.draw_noise([3], dtype=torch.float64)
-    first = module(td.copy().set(("noise", "analysis"), noise))["belief", "ensemble"]
+    noise = module.draw_noise([3], members=E, observation_dim=OBS, dtype=torch.float64)
+    first = module(td.copy().set(("noise", "self"), noise))["belief", "ensemble"]
     kwargs = {"rotation": noise} if scheme == "etkf" else {"perturbation": noise}
     assert first.equal(expected(td, scheme, **kwargs).ensemble)
 
 
 def test_no_bulk_noise_where_none_is_needed():
-    for module in (EnsembleAnalysis("sensor", ensemble_size=E), EnsembleAnalysis("perturbed", ensemble_size=E)):
-        assert module.draw_noise([3]) is None
+    for scheme in ("sensor", "etkf", "sakov"):
+        assert EnsembleAnalysis(scheme).draw_noise([3], members=E, observation_dim=OBS) is None
+        assert EnsembleAnalysis(scheme).noise_names == ()
+
+
+def test_no_bulk_noise_of_unknown_size():
+    assert EnsembleAnalysis("perturbed").draw_noise([3], members=E) is None
+    assert EnsembleAnalysis("perturbed").draw_noise([3], observation_dim=OBS) is None
+    assert EnsembleAnalysis("etkf", rotate=True).draw_noise([3], observation_dim=OBS) is None
 
 
 def test_a_single_reading(float64):

@@ -36,18 +36,18 @@ EYE, H = torch.eye(S), torch.eye(OBS, S)
 #: name: (constructor, keyword arguments that rename every key, {the renamed input: its shape})
 CASES = {
     "learned transition": (
-        lambda **k: LearnedTransition(StochasticMLP(S + 2, S, (8,)), ensemble_size=E, **{"action_key": "action", **k}),
-        {"in_key": ("a", "b", "x"), "out_key": ("c", "f"), "action_key": ("a", "u"), "noise_key": ("n", "t")},
+        lambda **k: LearnedTransition(StochasticMLP(S + 2, S, (8,)), **{"action_key": "action", **k}),
+        {"in_key": ("a", "b", "x"), "out_key": ("c", "f"), "action_key": ("a", "u")},
         {("a", "b", "x"): (E, S), ("a", "u"): (2,)},
     ),
     "flipout transition": (
-        lambda **k: LearnedTransition(StochasticMLP(S, S, (8,), layer="flipout"), ensemble_size=E, **k),
-        {"in_key": ("a", "x"), "out_key": "f", "noise_key": "n"},
+        lambda **k: LearnedTransition(StochasticMLP(S, S, (8,), layer="flipout"), **k),
+        {"in_key": ("a", "x"), "out_key": "f"},
         {("a", "x"): (E, S)},
     ),
     "unicycle": (
-        lambda **k: UnicycleTransition(StochasticMLP(2, 2, (8,)), 0.1, ensemble_size=E, **k),
-        {"in_key": ("a", "x"), "out_key": "f", "noise_key": "n"},
+        lambda **k: UnicycleTransition(StochasticMLP(2, 2, (8,)), 0.1, **k),
+        {"in_key": ("a", "x"), "out_key": "f"},
         {("a", "x"): (E, S)},
     ),
     "unicycle motion": (
@@ -87,12 +87,12 @@ CASES = {
     "constant noise": (lambda **k: ConstantNoise([0.1, 0.2], **k), {"in_key": "y", "out_key": "r"}, {"y": (OBS,)}),
     "image sensor": (
         lambda **k: ImageSensor(OBS, image_shape=(1, 8, 8), ensemble_size=E, **k),
-        {"in_key": ("camera", "rgb"), "out_key": "y", "encoding_key": "code", "observed_key": "ok", "noise_key": "n"},
+        {"in_key": ("camera", "rgb"), "out_key": "y", "encoding_key": "code", "observed_key": "ok"},
         {("camera", "rgb"): (1, 8, 8)},
     ),
     "vector sensor": (
         lambda **k: VectorSensor(3, OBS, ensemble_size=E, **k),
-        {"in_key": ("arm", "q"), "out_key": "y", "observed_key": "ok", "noise_key": "n"},
+        {"in_key": ("arm", "q"), "out_key": "y", "observed_key": "ok"},
         {("arm", "q"): (3,)},
     ),
     "gaussian prior": (
@@ -116,7 +116,7 @@ CASES = {
         {("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
     ),
     "analysis": (
-        lambda **k: EnsembleAnalysis("perturbed", ensemble_size=E, observation_dim=OBS, **k),
+        lambda **k: EnsembleAnalysis("perturbed", **k),
         {
             "forecast_key": "f",
             "predicted_key": ("p", "y"),
@@ -125,7 +125,6 @@ CASES = {
             "observed_key": "ok",
             "belief_key": "b",
             "info_key": "i",
-            "noise_key": "n",
         },
         {"f": (E, S), ("p", "y"): (E, OBS), ("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
     ),
@@ -163,7 +162,7 @@ def make(name, batch=(3,)):
 def run(module, td, noise=None):
     td = td.copy()
     if noise is not None:
-        td[module.noise_key] = noise
+        td["noise", "self"] = noise
     torch.manual_seed(1)
     return module(td).select(*module.out_keys)
 
@@ -221,7 +220,7 @@ NO_NOISE = {
 @every_sub_model
 def test_copies_compute_the_same(name):
     module, td = make(name)
-    noise = module.draw_noise(td.batch_size)
+    noise = module.draw_noise(td.batch_size, members=E, state_dim=S, observation_dim=OBS)
     assert (noise is None) == (name in NO_NOISE)
     expected = run(module, td, noise)
     other = CASES[name][0](**CASES[name][1])

@@ -44,7 +44,7 @@ def test_around_state(float64, batch):
 
 def test_around_state_follows_the_filters_type():
     td = AroundState([0.1, 0.1])(TensorDict({"state": torch.zeros(2, dtype=torch.float64)}))
-    assert td["belief", "ensemble"].dtype == torch.float32
+    assert {value.dtype for value in td["belief"].values()} == {torch.float32}
 
 
 class TestFromSensor:
@@ -87,7 +87,7 @@ class TestFromSensor:
 
 def test_noise_given(float64):
     noise = torch.randn(3, 4, 2)
-    td = TensorDict({("noise", "initial"): noise}, [3])
+    td = TensorDict({("noise", "self"): noise}, [3])
     out = GaussianPrior([1.0, 2.0], [3.0, 4.0], ensemble_size=4)(td)["belief", "ensemble"]
     assert out.equal(torch.tensor([1.0, 2.0]) + torch.tensor([3.0, 4.0]) * noise)
 

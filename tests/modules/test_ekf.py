@@ -150,7 +150,6 @@ def test_sub_models_that_draw_their_own_noise_are_refused(Transition):
     noisy = NoisyLinear(matrix, matrix)
     with pytest.raises(ValueError, match=r"NoisyLinear holds random parts \(\['NoisyLinear'\]"):
         Transition(noisy, constant_noise(3))
-    assert noisy.ensemble_size is None
     assert torch.get_rng_state().equal(state)
     Transition(NoisyLinear(matrix), constant_noise(3))
 

@@ -20,6 +20,12 @@ def make(**kwargs):
     return FlowSensor(dt=DT, **{"ensemble_size": 5, "num_cells": (8, 6), "rate": 0.3, **kwargs}).eval()
 
 
+def draw_noise(sensor, batch, **options):
+    """Noise that can be indexed by rows, whatever it is made of."""
+    noise = sensor.draw_noise(batch, **options)
+    return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
+
+
 def random_frames(*batch):
     flow = 0.1 * torch.randn(*batch, *FLOW_SHAPE)
     flow[..., 2, :, :].abs_().clamp_max_(1)
@@ -118,10 +124,10 @@ def test_turn_is_the_median_flow_ahead_or_that_of_the_fit():
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 def test_members_are_separate_corrections_of_one_reading(float64, layer, batch):
     sensor = make(layer=layer)
-    frames, noise = random_frames(*batch), sensor.draw_noise(batch)
+    frames, noise = random_frames(*batch), draw_noise(sensor, batch)
     calls = []
     hook = sensor.module["trunk"].register_forward_hook(lambda module, args, out: calls.append(len(args[0])))
-    out = sensor(frames.copy().set(("noise", "sensor"), noise))
+    out = sensor(frames.copy().set(("noise", "self"), noise))
     hook.remove()
     assert calls == [out.batch_size.numel()]  # once for all frames, and not once a member
     flat, results = frames.reshape(-1), []
@@ -145,10 +151,10 @@ def test_members_are_separate_corrections_of_one_reading(float64, layer, batch):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_steps_equal_the_sequence(float64, layer):
     sensor, frames = make(layer=layer), random_frames(3, 4)
-    noise = sensor.draw_noise([3, 4])
-    whole = sensor(frames.copy().set(("noise", "sensor"), noise))
+    noise = draw_noise(sensor, [3, 4], time=True)
+    whole = sensor(frames.copy().set(("noise", "self"), noise))
     for t in range(4):
-        step = sensor(frames[:, t].copy().set(("noise", "sensor"), noise[:, t]))
+        step = sensor(frames[:, t].copy().set(("noise", "self"), noise[:, t]))
         for key in (("sensor", "ensemble"), ("sensor", "encoding")):
             torch.testing.assert_close(step[key], whole[key][:, t], rtol=0, atol=1e-11)
 
@@ -159,8 +165,8 @@ def test_noise_given_is_noise_drawn(layer):
     torch.manual_seed(1)
     drawn = sensor(frames.copy())["sensor", "ensemble"]
     torch.manual_seed(1)
-    noise = sensor.draw_noise([3])
-    assert sensor(frames.copy().set(("noise", "sensor"), noise))["sensor", "ensemble"].equal(drawn)
+    noise = draw_noise(sensor, [3])
+    assert sensor(frames.copy().set(("noise", "self"), noise))["sensor", "ensemble"].equal(drawn)
     assert not sensor(frames.copy())["sensor", "ensemble"].equal(drawn)
 
 
@@ -183,11 +189,11 @@ def test_the_trunk_drops_in_training_only():
 @pytest.mark.parametrize("columns", [1, 2])
 def test_unobserved_nan_rows_poison_nothing(columns):
     sensor, frames = make(), random_frames(3)
-    noise = sensor.draw_noise([3])
+    noise = draw_noise(sensor, [3])
     observed = torch.tensor([True, False, True]).unsqueeze(-1).expand(3, columns)
 
     def run(value):
-        td = TensorDict({"observed": observed, ("noise", "sensor"): noise}, [3])
+        td = TensorDict({"observed": observed, ("noise", "self"): noise}, [3])
         for key in ("flow", "road"):
             td[key] = frames[key].clone()
             td[key][1] = value
@@ -200,7 +206,7 @@ def test_unobserved_nan_rows_poison_nothing(columns):
     assert out.equal(expected)
     assert all(g.isfinite().all() and g.equal(e) for g, e in zip(grads, expected_grads, strict=True))
     # The others are read as if they were alone.
-    alone = frames[[0, 2]].set(("noise", "sensor"), noise[[0, 2]])
+    alone = frames[[0, 2]].set(("noise", "self"), noise[[0, 2]])
     torch.testing.assert_close(out[[0, 2]], sensor(alone)["sensor", "ensemble"])
 
 

@@ -51,14 +51,15 @@ def test_where_all_is_near_it_is_the_global_transform(float64, batch, samples):
 
 
 def test_a_rotation_is_the_same_for_all_components(float64):
-    module, td = LocalEnsembleAnalysis(everywhere(), rotate=True, ensemble_size=E), inputs()
-    td["noise", "analysis"] = module.draw_noise([3], dtype=torch.float64)
+    module, td = LocalEnsembleAnalysis(everywhere(), rotate=True), inputs()
+    td["noise", "self"] = module.draw_noise([3], members=E, dtype=torch.float64)
     expected = EnsembleAnalysis("etkf", rotate=True)(td.clone())["belief", "ensemble"]
     torch.testing.assert_close(module(td.clone())["belief", "ensemble"], expected, rtol=1e-9, atol=1e-9)
     drawn = [module(td.exclude("noise"))["belief", "ensemble"] for _ in range(2)]
     assert not drawn[0].allclose(drawn[1])
     torch.testing.assert_close(drawn[0].mean(-2), drawn[1].mean(-2))
-    assert LocalEnsembleAnalysis(everywhere(), ensemble_size=E).draw_noise([3]) is None
+    assert LocalEnsembleAnalysis(everywhere()).draw_noise([3], members=E) is None
+    assert module.draw_noise([3]) is None, "without a number of members"
 
 
 def test_a_taper_is_as_good_as_places(float64):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.modules import CholeskyNoise, ConstantNoise, DiagonalNoise, ScaledNoise
+from torch_denkf.modules import CholeskyNoise, ConstantNoise, DiagonalNoise, MappedNoise, ScaledNoise
 
 
 def variance(model, reading, batch=()):
@@ -76,10 +76,30 @@ def test_constant_trains_the_logarithm(float64):
     torch.testing.assert_close(model.log_variance.grad, torch.tensor([0.01, 4.0]), rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("r", [0.1, [0.1, 0.0], [-1.0]])
-def test_constant_bad_r(r):
-    with pytest.raises(ValueError, match="one positive standard deviation a dimension"):
-        ConstantNoise(r)
+@pytest.mark.parametrize("r", [0.1, [0.1, -1e-9], [-1.0], [float("nan")]])
+@pytest.mark.parametrize("trainable", [True, False])
+def test_constant_bad_r(r, trainable):
+    kind = "positive" if trainable else "non-negative"
+    with pytest.raises(ValueError, match=f"one {kind}.* standard deviation a dimension"):
+        ConstantNoise(r, trainable=trainable)
+
+
+def test_constant_without_noise_in_some_dimensions(float64):
+    model = ConstantNoise([0.0, 2.0, 0.0])
+    for batch in ((), (3,), (2, 3)):
+        out = variance(model, torch.randn(*batch, 8, 3), batch)
+        torch.testing.assert_close(out, torch.tensor([0.0, 4.0, 0.0]).expand(*batch, 3), rtol=1e-14, atol=0)
+    assert (ScaledNoise(model, 3.0)(TensorDict({("sensor", "ensemble"): torch.zeros(3)}))["sensor", "noise"] == 0)[
+        [0, 2]
+    ].all()
+    torch.testing.assert_close(
+        MappedNoise(model, torch.eye(3))(TensorDict({("sensor", "ensemble"): torch.zeros(3)}))["sensor", "noise"],
+        torch.diag(torch.tensor([0.0, 4.0, 0.0])),
+        rtol=1e-14,
+        atol=0,
+    )
+    with pytest.raises(ValueError, match="one positive"):
+        ConstantNoise([0.0, 2.0], trainable=True)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])

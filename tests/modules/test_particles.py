@@ -46,8 +46,8 @@ class Shift(SubModel):
     def __init__(self):
         super().__init__(torch.nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
 
-    def forward(self, tensordict):
-        return tensordict.set(self.out_keys[0], self.read(tensordict, self.in_keys[0]) + 1)
+    def compute(self, ensemble):
+        return ensemble + 1
 
 
 def belief(batch=(), size=E):
@@ -102,6 +102,58 @@ def test_motion_noise_has_its_variance(before):
     assert ((cov - expected).abs() <= 4 * error + 1e-12).all()
 
 
+class Covariance(SubModel):
+    """A known Q, the same everywhere."""
+
+    def __init__(self, matrix):
+        super().__init__(torch.nn.Identity(), [("belief", "mean")], [("forecast", "q")])
+        self.register_buffer("matrix", matrix)
+
+    def compute(self, mean):
+        return self.matrix.expand(*mean.shape[:-1], *self.matrix.shape)
+
+
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("kind", ["variances", "covariance", "singular"])
+@pytest.mark.parametrize("dims", [None, [2, 0]])
+def test_motion_noise_in_all_or_some_dimensions_has_its_covariance(before, kind, dims):
+    rows, size = 4000, S if dims is None else len(dims)
+    root = torch.randn(size, size)
+    if kind == "variances":
+        root = root.diagonal().abs().diag()
+        model = ConstantNoise(root.diagonal(), in_key=("belief", "mean"), out_key=("forecast", "q"))
+    else:
+        root = root[:, : size - (kind == "singular")]
+        model = Covariance(root @ root.mT)
+    matrix = torch.nn.Linear(S, S)
+    noisy = NoisyTransition(LearnedTransition(matrix, residual=False), model, dims, before=before)
+    state, mean, cov = statistics(noisy, rows)
+    # As a linear map of independent standard-normal numbers.
+    enters = torch.eye(S) if dims is None else torch.eye(S)[:, dims]
+    root = matrix.weight @ enters @ root if before else enters @ root
+    expected = root @ root.mT
+    sd = expected.diagonal().sqrt()
+    assert ((mean - matrix(state)).abs() <= 4 * sd / rows**0.5 + 1e-12).all()
+    error = ((sd.outer(sd).square() + expected.square()) / rows).sqrt()
+    assert ((cov - expected).abs() <= 4 * error + 1e-12).all()
+    # Where Q is singular nothing moves, up to the root of the ridge of 1e-14.
+    values, vectors = torch.linalg.eigh(expected)
+    still = vectors[:, values < 1e-12 * values[-1]]
+    assert still.shape[1] == S - root.shape[1]
+    assert ((still.mT @ cov @ still).diagonal() <= 1e-12 * values[-1]).all()
+
+
+def test_motion_noise_is_drawn_in_bulk_where_its_size_is_known():
+    q = ConstantNoise([1.0] * S, in_key=("belief", "mean"), out_key=("forecast", "q"))
+    every, some = NoisyTransition(Shift(), q), NoisyTransition(Shift(), q, [1])
+    assert every.draw_noise([4, 2], members=E, state_dim=S).shape == (4, 2, E, S)
+    assert some.draw_noise([4, 2], members=E).shape == (4, 2, E, 1)
+    assert every.draw_noise([4, 2], members=E) is None
+    assert some.draw_noise([4, 2], state_dim=S) is None
+    td = belief((4,)).set(("noise", "self"), torch.randn(4, E, S))
+    torch.testing.assert_close(every(td)["forecast", "ensemble"], td["belief", "ensemble"] + 1 + td["noise", "self"])
+
+
 def test_motion_noise_before_the_motion_moves_the_pose():
     noise = ConstantNoise([1.0, 0.1], in_key=("belief", "ensemble"))
     td = TensorDict({("belief", "ensemble"): torch.zeros(50, 5)})
@@ -121,7 +173,7 @@ def test_noise_model_reads_the_weighted_mean(weights):
     assert noisy.in_keys == [("belief", "ensemble")]
     td = belief((4,)) if weights else belief((4,)).exclude(("belief", "log_weight"))
     td["belief", "mean"] = torch.full((4, S), torch.nan)  # whatever it was before
-    td["noise", "motion"] = torch.ones(4, E, 1)
+    td["noise", "self"] = torch.ones(4, E, 1)
     out = noisy(td.copy())
     x = td["belief", "ensemble"]
     mean = weighted_mean(x, td["belief", "log_weight"]) if weights else x.mean(-2)
@@ -146,14 +198,14 @@ def test_noise_of_the_wrong_size():
 @pytest.mark.parametrize("batch", BATCHES)
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport", None])
 def test_resampling_before_the_motion(scheme, batch):
-    td = belief(batch).set(("noise", "resampling"), torch.rand(*batch, 1))
+    td = belief(batch).set(("noise", "self"), torch.rand(*batch, 1))
     particles, log_weights = td["belief", "ensemble"], td["belief", "log_weight"]
     expected, weights = {
         "systematic": lambda u: systematic_resample(particles, log_weights, u),
         "soft": lambda u: soft_resample(particles, log_weights, u, 0.3),
         "transport": lambda u: transport_resample(particles, log_weights, epsilon=0.2, iterations=7),
         None: lambda u: (particles, log_weights),
-    }[scheme](td["noise", "resampling"])
+    }[scheme](td["noise", "self"])
     module = ResampledTransition(Shift(), scheme, alpha=0.3, epsilon=0.2, iterations=7)
     out = module(td.copy())
     assert out["forecast", "ensemble"].equal(expected + 1)
@@ -195,6 +247,18 @@ def test_resampling_where_few_particles_are_effective():
     assert (out["forecast", "log_weight"][1] == -math.log(E)).all()
     both = ResampledTransition(Shift(), ess_threshold=0.5)(td.set("observed", torch.zeros(2, 1, dtype=torch.bool)))
     assert both["forecast", "log_weight"].equal(td["belief", "log_weight"])
+
+
+def test_a_mask_does_not_overrule_the_threshold():
+    few, many = torch.full((E,), 1e-3), torch.full((E,), 1e-3)
+    few[:2], many[:5] = 1.0, 1.0  # of 7 particles 2 and 5 are effective
+    td = belief((4,))
+    td["belief", "log_weight"] = torch.stack([few, many, few, many]).log().log_softmax(-1)
+    td["observed"] = torch.tensor([[True], [True], [False], [False]])
+    out = ResampledTransition(Shift(), ess_threshold=0.5)(td.copy())
+    assert (out["forecast", "log_weight"][0] == -math.log(E)).all(), "observed, and few are effective"
+    assert out["forecast", "log_weight"][1:].equal(td["belief", "log_weight"][1:])
+    assert out["forecast", "ensemble"][1:].equal(td["belief", "ensemble"][1:] + 1)
 
 
 def test_unknown_scheme():

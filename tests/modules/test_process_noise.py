@@ -80,7 +80,7 @@ def test_mapped_noise_is_g_q_g(inner):
 
 @pytest.mark.parametrize("clones", [0, 2])
 def test_unicycle_noise_is_the_effect_of_the_new_velocities(float64, clones):
-    dt, change = 0.3, torch.zeros(6, 2, requires_grad=True)
+    dt, change = 0.3, (torch.randn(6, 2) * torch.tensor([5.0, 1.0])).requires_grad_()  # new velocities are not the old
     mean = torch.randn(6, 5) * torch.tensor([10.0, 10.0, 2.0, 10.0, 1.0])
     move = UnicycleTransition(lambda v: change.unsqueeze(-2), dt)
     forecast = lambda change: move(  # noqa: E731
@@ -113,3 +113,15 @@ def test_errors_say_what_is_wrong():
         MappedNoise(ConstantNoise([1.0], **FORECAST), torch.ones(3, 2))(belief())
     with pytest.raises(KeyError, match="CholeskyNoise reads"):
         CholeskyNoise(2)(TensorDict({}))
+
+
+def test_dt_may_be_an_entry_that_varies_over_rows(float64):
+    inner = ConstantNoise([0.5, 0.1], **FORECAST)
+    td = TensorDict({"belief": {"mean": torch.randn(4, 5)}, "forecast": {"mean": torch.randn(4, 5)}}, [4])
+    td["clock", "dt"] = torch.tensor([[0.1], [0.2], [0.0], [1.5]])
+    model = UnicycleNoise(inner, ("clock", "dt"))
+    assert ("clock", "dt") in model.in_keys
+    rows = [UnicycleNoise(inner, float(row["clock", "dt"]))(row.copy())["forecast", "noise"] for row in td]
+    torch.testing.assert_close(model(td.copy())["forecast", "noise"], torch.stack(rows), rtol=0, atol=1e-15)
+    with pytest.raises(KeyError, match=r"UnicycleNoise reads \('clock', 'dt'\)"):
+        model(td.exclude("clock"))

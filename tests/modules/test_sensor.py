@@ -15,6 +15,12 @@ def image_sensor(**kwargs):
     return ImageSensor(2, image_shape=SHAPE, ensemble_size=5, num_cells=(8, 6), rate=0.3, **kwargs)
 
 
+def draw(sensor, batch):
+    """Noise that can be indexed by rows, whatever it is made of."""
+    noise = sensor.draw_noise(batch)
+    return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
+
+
 def naive(sensor, frames, noise):
     """One forward of the whole network a frame and member."""
     out = []
@@ -33,10 +39,10 @@ def naive(sensor, frames, noise):
 def test_members_are_separate_forwards_of_one_trunk(float64, layer, batch):
     sensor = image_sensor(layer=layer, loc=[1.0, -1.0], scale=[2.0, 3.0])
     frames = torch.rand(*batch, *SHAPE)
-    noise = sensor.draw_noise(batch)
+    noise = draw(sensor, batch)
     calls = []
     sensor.module["trunk"].register_forward_hook(lambda module, args, out: calls.append(args[0].shape))
-    out = sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, batch))["sensor", "ensemble"]
+    out = sensor(TensorDict({"pixels": frames, ("noise", "self"): noise}, batch))["sensor", "ensemble"]
     count = frames[..., 0, 0, 0].numel()
     assert calls == [(count, *SHAPE)]  # once for all frames, and not once a member
     flat_noise = noise.reshape(count, *noise.shape[len(batch) :]) if layer == "dropout" else noise.reshape(count)
@@ -52,8 +58,8 @@ def test_noise_given_is_noise_drawn(layer):
     torch.manual_seed(1)
     drawn = sensor(TensorDict({"pixels": frames}, [3]))["sensor", "ensemble"]
     torch.manual_seed(1)
-    noise = sensor.draw_noise([3])
-    assert sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, [3]))["sensor", "ensemble"].equal(drawn)
+    noise = draw(sensor, [3])
+    assert sensor(TensorDict({"pixels": frames, ("noise", "self"): noise}, [3]))["sensor", "ensemble"].equal(drawn)
 
 
 def test_uint8_is_divided_by_255():
@@ -73,13 +79,13 @@ def test_deterministic_head_gives_equal_members():
 def test_unobserved_nan_frame_has_finite_output_and_gradients(columns):
     sensor = image_sensor()
     frames = torch.rand(3, *SHAPE)
-    noise = sensor.draw_noise([3])
+    noise = draw(sensor, [3])
     broken = frames.clone()
     broken[1] = torch.nan
     observed = torch.tensor([True, False, True]).unsqueeze(-1).expand(3, columns)
 
     def run(pixels):
-        td = TensorDict({"pixels": pixels, "observed": observed, ("noise", "sensor"): noise}, [3])
+        td = TensorDict({"pixels": pixels, "observed": observed, ("noise", "self"): noise}, [3])
         out = sensor(td)["sensor", "ensemble"]
         return out, torch.autograd.grad(out.square().sum(), list(sensor.parameters()))
 
@@ -109,13 +115,15 @@ def test_wrong_image_shape_names_the_key(shape):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_encoding_is_the_mean_hidden_layer(float64, layer):
     sensor = image_sensor(layer=layer, encoding_key=("sensor", "code"))
-    frames, noise = torch.rand(3, *SHAPE), sensor.draw_noise([3])
-    td = sensor(TensorDict({"pixels": frames, ("noise", "sensor"): noise}, [3]))
+    frames, noise = torch.rand(3, *SHAPE), draw(sensor, [3])
+    td = sensor(TensorDict({"pixels": frames, ("noise", "self"): noise}, [3]))
     hidden = torch.stack(
         [
             sensor.module["head"].forward_with_hidden(
                 sensor.module["trunk"](frames),
-                noise[:, e] if layer == "dropout" else noise.clone().set("signs", noise["signs"][:, e]),
+                noise[:, e]
+                if layer == "dropout"
+                else {"signs": noise["signs"][:, e], "perturbation": noise["perturbation"][0]},
             )[1]
             for e in range(5)
         ]
@@ -142,8 +150,8 @@ def test_vector_sensor(float64, layer, batch):
     sensor = VectorSensor(
         4, 2, ensemble_size=5, num_cells=(8, 6), rate=0.5, layer=layer, loc=[1.0, 2.0], scale=[3.0, 4.0]
     )
-    reading, noise = torch.randn(*batch, 4), sensor.draw_noise(batch)
-    out = sensor(TensorDict({"measurement": reading, ("noise", "sensor"): noise}, batch))["sensor", "ensemble"]
+    reading, noise = torch.randn(*batch, 4), draw(sensor, batch)
+    out = sensor(TensorDict({"measurement": reading, ("noise", "self"): noise}, batch))["sensor", "ensemble"]
     expected = sensor.module["head"](reading.unsqueeze(-2).expand(*batch, 5, 4), noise)
     expected = torch.tensor([1.0, 2.0]) + torch.tensor([3.0, 4.0]) * expected
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
@@ -169,7 +177,7 @@ def test_pixels_are_standardised_channel_by_channel():
     pixels, noise = torch.rand(3, 2, 12, 16), plain.draw_noise([3])
     by_hand = (pixels - loc[:, None, None]) / scale[:, None, None]
     outs = [
-        sensor(TensorDict({"pixels": x, ("noise", "sensor"): noise}, [3]))["sensor", "ensemble"]
+        sensor(TensorDict({"pixels": x, ("noise", "self"): noise}, [3]))["sensor", "ensemble"]
         for sensor, x in ((standard, pixels), (plain, by_hand))
     ]
     torch.testing.assert_close(*outs)

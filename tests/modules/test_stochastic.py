@@ -79,6 +79,33 @@ class TestFlipout:
         bias = layer.bias + F.softplus(layer.bias_rho) * eps[6:]
         torch.testing.assert_close(layer(x, signs, eps), x @ weight.mT + bias, rtol=0, atol=1e-14)
 
+    @pytest.mark.parametrize("batch", [(4,), (2, 3)])
+    def test_each_row_of_a_batch_may_have_its_own_perturbation(self, float64, batch):
+        layer = FlipoutLinear(3, 2, posterior_std=0.5)
+        x, signs, eps = torch.randn(*batch, 6, 3), torch.rand(*batch, 6, 5) < 0.5, torch.randn(*batch, 8)
+        out = layer(x, signs, eps)
+        for index in torch.ones(batch).nonzero().tolist():
+            row = tuple(index)
+            torch.testing.assert_close(out[row], layer(x[row], signs[row], eps[row]), rtol=0, atol=1e-14)
+        shared = layer(x, signs, eps[(0,) * len(batch)].expand(*batch, 8))
+        torch.testing.assert_close(shared, layer(x, signs, eps[(0,) * len(batch)]), rtol=0, atol=1e-14)
+
+    def test_each_time_of_a_sequence_has_its_own_weights_which_the_batch_shares(self, float64):
+        net = StochasticMLP(3, 2, (4,), layer="flipout", posterior_std=0.5)
+        noise = net.draw_noise([2, 7], 3, time=True, dtype=torch.float64)
+        eps, size = noise["perturbation"], (3 * 4 + 4) + (4 * 2 + 2)
+        assert eps.shape == (2, 7, size)
+        assert eps.untyped_storage().nbytes() == 8 * 7 * size, "what is shared takes no memory"
+        assert eps[0].equal(eps[1])
+        assert (eps[0, 1:] != eps[0, :-1]).all()
+        x = torch.randn(2, 7, 3, 3)
+        out = net(x, noise)
+        for t in range(7):  # the sequence, step by step
+            step = net(x[:, t], {name: value[:, t] for name, value in noise.items()})
+            torch.testing.assert_close(out[:, t], step, rtol=0, atol=1e-13)
+        one = net.draw_noise([2, 7], 3, dtype=torch.float64)["perturbation"]
+        assert one.equal(one[:1, :1].expand(2, 7, size)), "without time it is one call"
+
     def test_kl_is_that_of_torch_distributions(self, float64):
         layer = FlipoutLinear(3, 2, posterior_std=0.2, prior_std=0.7)
         with torch.no_grad():
@@ -150,6 +177,7 @@ class TestBothKinds:
         assert rows.shape == (2, 7, 3, size)
         if layer == "flipout":
             assert noise["perturbation"].shape == (2, 7, 3 * 4 + 4 + 4 * 5 + 5 + 5 * 2 + 2)
+            assert noise.keys() == set(net.noise_names)
             assert noise["perturbation"].untyped_storage().nbytes() == 4 * noise["perturbation"].shape[-1]
 
     def test_generator(self, layer):

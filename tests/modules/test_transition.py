@@ -150,3 +150,44 @@ def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean
     torch.testing.assert_close(outs[False].mean(1), torch.zeros(3, 2), rtol=0, atol=1e-6)
     torch.testing.assert_close(outs[False], outs[True] - outs[True].mean(1, keepdim=True), rtol=1e-5, atol=1e-6)
     assert outs[False].std(1).min() > 0.001
+
+
+# -------------------------------------------------------------------------------------- a time step that varies
+
+DTS = torch.tensor([[0.1], [0.2], [0.0], [1.5]], dtype=torch.float64)
+
+
+def test_dt_may_be_an_entry_that_varies_over_rows(float64):
+    network, state = nn.Linear(2, 2), torch.randn(4, 6, 5)
+    by_entry = UnicycleTransition(network, "dt", scale=[2.0, 0.1])
+    assert by_entry.in_keys == [("belief", "ensemble"), "dt"]
+    rows = [
+        forecast(UnicycleTransition(network, float(dt), scale=[2.0, 0.1]), x) for dt, x in zip(DTS, state, strict=True)
+    ]
+    torch.testing.assert_close(forecast(by_entry, state, dt=DTS), torch.stack(rows), rtol=0, atol=1e-14)
+    assert not rows[0].allclose(rows[1])
+    with pytest.raises(KeyError, match="UnicycleTransition reads 'dt', which is missing"):
+        forecast(by_entry, state)
+
+
+def test_dt_may_be_an_entry_beside_a_history(float64):
+    keys = {"history_key": ("belief", "history")}
+    by_entry, state, history = UnicycleTransition(still, "dt", **keys), torch.randn(4, 6, 5), torch.randn(4, 6, 2, 2)
+    rows = [
+        UnicycleTransition(still, float(dt), **keys)(TensorDict({"belief": {"ensemble": x, "history": h}}))[
+            "forecast", "ensemble"
+        ]
+        for dt, x, h in zip(DTS, state, history, strict=True)
+    ]
+    out = by_entry(TensorDict({"belief": {"ensemble": state, "history": history}, "dt": DTS}, [4]))
+    torch.testing.assert_close(out["forecast", "ensemble"], torch.stack(rows), rtol=0, atol=1e-14)
+
+
+def test_motion_takes_dt_from_an_entry_that_varies_over_rows(float64):
+    td = TensorDict({"belief": {"ensemble": torch.randn(4, 6, 5)}, "analysis": {"ensemble": torch.randn(4, 6, 5)}}, [4])
+    out = UnicycleMotion("dt")(td.copy().set("dt", DTS))["belief"]
+    rows = torch.stack([UnicycleMotion(float(dt))(row.copy())["belief"] for dt, row in zip(DTS, td, strict=True)])
+    for name in ("ensemble", "mean", "var"):
+        torch.testing.assert_close(out[name], rows[name], rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="steps of one length; got dt='dt'"):
+        UnicycleMotion("dt", history_key=("belief", "history"))

@@ -124,13 +124,14 @@ def test_sensor_term(float64):
     loss = GaussianLoss(filter, **{**OFF, "sensor": 1.0}, score="mse")
     expected = (samples.mean(-2) - target).square().mean(-1)[seen].mean()
     torch.testing.assert_close(loss(frames)["loss_sensor"], expected)
-    # One reading has no spread to score.
-    loss = GaussianLoss(linear_filter("EKF"), **{**OFF, "sensor": 1.0})
-    loss.set_keys(sensor="observation")
+    # One reading has no spread to score: its CRPS is the absolute error.
     plain = frames_with_state(missing=0.0)
     H = torch.tensor([[1.0, 0.5], [0.0, 1.0]])
-    expected = (plain["observation"] - plain["state"] @ H.mT).square().mean()
-    torch.testing.assert_close(loss(plain)["loss_sensor"], expected)
+    error = plain["observation"] - plain["state"] @ H.mT
+    for score, expected in (("crps", error.abs().mean()), ("mse", error.square().mean())):
+        loss = GaussianLoss(linear_filter("EKF"), **{**OFF, "sensor": 1.0}, score=score)
+        loss.set_keys(sensor="observation")
+        torch.testing.assert_close(loss(plain)["loss_sensor"], expected)
 
 
 def test_a_belief_without_spread_has_a_finite_gradient(float64):
@@ -167,8 +168,9 @@ def test_errors_say_what_to_do():
         GaussianLoss(filter, score="energy")
     with pytest.raises(ValueError, match=r"one entry for each of dims=\[0, 1\]; got 5"):
         GaussianLoss(filter, dims=[0, 1], state_scale=[1.0] * 5)
-    with pytest.raises(KeyError, match=r"reads \('sensor', 'ensemble'\), which is missing"):
-        GaussianLoss(filter)(frames_with_state())
+    assert GaussianLoss(filter)(frames_with_state()).get("loss_sensor", None) is None, "left out: there is no sensor"
+    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\).*set the weight sensor=0\.0"):
+        GaussianLoss(filter, sensor=1.0)(frames_with_state())
     frames = learned_frames(2, 3).set("state", torch.randn(2, 3, 3))
     with pytest.raises(KeyError, match=r"set_keys\(target_observation=\.\.\.\)"):
         GaussianLoss(learned_filter("EKF"))(frames)

@@ -114,7 +114,7 @@ def test_mean_sensor_and_nll_by_hand():
     torch.testing.assert_close(losses["loss_sensor"], crps[observed].mean(), **CLOSE)
 
 
-def test_one_sample_of_the_sensor_has_a_squared_error():
+def test_one_sample_of_the_sensor_has_an_absolute_error():
     filter = toy_filter()
     filter["sensor"].ensemble_size = 1
     frames = toy_frames((2, 7))
@@ -122,7 +122,7 @@ def test_one_sample_of_the_sensor_has_a_squared_error():
     filter.draw_noise(frames)
     out = filter.sequence(frames.copy())
     assert out["sensor", "ensemble"].shape == (2, 7, 1, OBS)
-    error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"]).square().mean(-1)
+    error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"]).abs().mean(-1)
     value = MixtureLoss(filter, **only(TERMS, "sensor"))(frames)["loss_sensor"]
     torch.testing.assert_close(value, error[frames["observed"].all(-1)].mean(), **CLOSE)
 
@@ -144,7 +144,7 @@ def test_a_known_observation_needs_no_target():
     frames = TensorDict({"y": torch.randn(3, 4, 1), "state": torch.randn(3, 4, 2)}, [3, 4])
     loss = MixtureLoss(filter, **only(TERMS, "sensor"))
     loss.set_keys(sensor="y")
-    expected = (frames["y"] - frames["state"][..., :1]).square().mean()
+    expected = (frames["y"] - frames["state"][..., :1]).abs().mean()  # the CRPS of one reading
     torch.testing.assert_close(loss(frames)["loss_sensor"], expected, **CLOSE)
 
 

@@ -606,12 +606,13 @@ def test_diagnostics(float64, update_at_reset):
     check_env_specs(env)
     rollout = env.rollout(6)
     expected = filter.sequence(rollout.select("observation", "observed"))
-    assert_equal(rollout[:, 1:], expected[:, 1:], keys, atol=1e-12)
+    assert_equal(rollout, expected, keys, atol=1e-12)
     assert (rollout["info", "nis"][:, 1:] > 0).all()
-    if update_at_reset:
-        assert_equal(rollout[:, 0], expected[:, 0], keys, atol=1e-12)
-    else:
-        assert all((rollout[key][:, 0] == 0).all() for key in keys)
+    start = filter.initialise(rollout[:, 0].select("observation", "observed"))
+    assert_equal(rollout[:, 0], start, [("forecast", "ensemble")], atol=1e-12)
+    if not update_at_reset:  # an initial belief has no innovation, and is its own forecast
+        assert all((rollout[key][:, 0] == 0).all() for key in keys[:2])
+        assert rollout["forecast", "ensemble"][:, 0].equal(rollout["belief", "ensemble"][:, 0])
 
 
 def test_randomness_does_not_depend_on_the_mode():

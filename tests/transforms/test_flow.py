@@ -149,7 +149,7 @@ def flow_filter(layer):
     members = torch.randn(16, 5) * torch.tensor([0.0, 0.0, 0.0, 1.0, 0.05]) + torch.tensor([0.0, 0, 0, 8.0, 0])
     sensor = FlowSensor(dt=DT, ensemble_size=16, layer=layer)
     return DEnKF(
-        transition=UnicycleTransition(StochasticMLP(2, 2, layer=layer, output_gain=0.1), dt=DT, ensemble_size=16),
+        transition=UnicycleTransition(StochasticMLP(2, 2, layer=layer, output_gain=0.1), dt=DT),
         sensor=sensor,
         observation=Select([3, 4]),
         noise=DiagonalNoise(2, r=[0.5, 0.02], in_features=sensor.encoding_features, in_key=("sensor", "encoding")),

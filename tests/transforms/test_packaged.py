@@ -138,3 +138,12 @@ def test_nan_is_found(packages):
     td["belief", "ensemble"][0, 0] = torch.nan
     with pytest.raises(ValueError, match="the filter diverged"):
         env.step(td)
+
+
+def test_nan_passes_where_nobody_looks_for_it(packages):
+    filter, path, _, _ = packages["[]"]
+    transform = DEnKFTransform(filter, packaged=load_step(path), check_finite=False)
+    env = TransformedEnv(base_env(seed=0), transform)
+    td = env.rand_action(env.reset())
+    td["belief", "ensemble"][0, 0] = torch.nan
+    assert env.step(td)["next", "belief", "mean"].isnan().any()

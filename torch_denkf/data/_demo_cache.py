@@ -95,7 +95,8 @@ def _read(
 ) -> TensorDict:
     first = read_demo(root, entries[0])
     native = first.pixels.shape[2:]
-    size = tuple(native) if size is None else tuple(size)
+    height, width = native if size is None else size
+    size = (height, width)
     frames = sum(entry.frames for entry in entries)
     if frames and (size[0] > native[0] or size[1] > native[1]):
         raise ValueError(f"size {size} is larger than the demos' {native} in {root}; collect larger ones or pass less")

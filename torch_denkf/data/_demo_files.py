@@ -19,13 +19,16 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
-TASKS = ("pick", "push", "put_down")
-DOMAINS = ("sim", "real_like")
+Task = Literal["pick", "push", "put_down"]
+Domain = Literal["sim", "real_like"]
+TASKS: tuple[Task, ...] = ("pick", "push", "put_down")
+DOMAINS: tuple[Domain, ...] = ("sim", "real_like")
 COMMAND = "python -m torch_denkf.data.collect_ur5"
 
 
@@ -148,7 +151,8 @@ def read_demo(root: Path, entry: Entry) -> Demo:
     if wrong is not None:
         raise ValueError(f"{wrong}; {again}")
     try:
-        demo = Demo(**_read_arrays(data))
+        fields: dict[str, Any] = _read_arrays(data)  # numbers and names are arrays without dimensions yet
+        demo = Demo(**fields)
     except (TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} does not hold a demo ({error}); was it written by another version?") from error
     demo.number, demo.seed = int(demo.number), int(demo.seed)

@@ -52,8 +52,8 @@ def find_drives(root: Path, drives: Sequence[str | int] | str | int | None) -> l
         if not found:
             raise FileNotFoundError(f"no drive below {root} has both images and poses: {_what_is_there(root)}")
         return found
-    names = [drives] if isinstance(drives, (str, int)) else list(drives)
-    names = [f"{name:02d}" if isinstance(name, int) else name for name in names]
+    asked = [drives] if isinstance(drives, (str, int)) else drives
+    names = [f"{name:02d}" if isinstance(name, int) else name for name in asked]
     if not names or len(set(names)) < len(names):
         raise ValueError(f"drives are names, each once, or None for all; got {names}")
     return names
@@ -84,7 +84,7 @@ def find_cameras(root: Path, drive: str, cameras: str | Sequence[str]) -> list[s
     """
     if cameras == "both":
         for pair in PAIRS:
-            there = [camera for camera in pair if _frame_files(root / "sequences" / drive / camera)]
+            there: list[str | None] = [camera for camera in pair if _frame_files(root / "sequences" / drive / camera)]
             if there:
                 return there
         return [None]  # the reader says what is missing

@@ -75,8 +75,8 @@ def read_times(file: Path, rows: int) -> tuple[np.ndarray, float]:
     lines = file.read_text().rstrip().splitlines()
     if len(lines) < rows:
         raise ValueError(f"{file} has {len(lines)} times, but there are {rows} posed frames; add the missing rows")
-    times = [_numbers(line.split(), 1, f"{file}:{n}", "seconds") for n, line in enumerate(lines, start=1)]
-    times = np.concatenate(times)
+    numbers = [_numbers(line.split(), 1, f"{file}:{n}", "seconds") for n, line in enumerate(lines, start=1)]
+    times = np.concatenate(numbers)
     dt = float(np.median(np.diff(times))) if len(times) > 1 else DEFAULT_DT
     if dt <= 0:
         raise ValueError(f"{file}: the median difference of its times is {dt} s; expected increasing seconds")

@@ -94,7 +94,8 @@ def recording_from_rows(
     whole = size is None and isinstance(rows, TensorDictBase)
     image = _images(rows, pixels_key) if whole else None
     keep = image is not None and image.dtype == torch.uint8
-    store, numbers = None, []
+    store: np.ndarray | None = None
+    numbers: list[TensorDict] = []
     for at in stretches:
         part = rows[at]
         entries = {"state": _numbers(part, state_key), "episode": _get(part, episode_key).reshape(-1).long()}
@@ -106,13 +107,13 @@ def recording_from_rows(
         pictures = _images(part, pixels_key)
         if pictures.dtype.is_floating_point:
             pictures = (pictures * 255).round().clamp(0, 255).to(torch.uint8)
-        pictures = pictures.permute(0, 2, 3, 1).numpy()
+        arrays = pictures.permute(0, 2, 3, 1).numpy()
         if store is None:
-            side = tuple(pictures.shape[1:3]) if size is None else tuple(size)
-            store = image_store(count, side, None if folder is None else Path(folder).expanduser())
-        for row, picture in zip(range(at.start, at.stop), pictures, strict=True):
+            height, width = arrays.shape[1:3] if size is None else size
+            store = image_store(count, (height, width), None if folder is None else Path(folder).expanduser())
+        for row, picture in zip(range(at.start, at.stop), arrays, strict=True):
             store[row] = scaled(np.ascontiguousarray(picture), store.shape[2:])
-    out = torch.cat(numbers)
+    out: TensorDict = torch.cat(numbers)
     frame = _count_from_start(out["episode"], episode_key)
     out.update(
         {

@@ -15,6 +15,7 @@ from torch_denkf.data import _raster as raster
 from torch_denkf.data import _textures as textures
 from torch_denkf.data._camera import Camera
 from torch_denkf.data._scene import PATCH, RESOLUTION, Scene
+from torch_denkf.data._terrain import Relief
 from torch_denkf.data._things import FAR, HAZE, Things
 
 GRID = 16  # m: new ground is drawn when the camera has moved that far
@@ -32,6 +33,8 @@ class Renderer:
         supersample: (down, across), pixels drawn for each pixel of the picture, which averages them.
     """
 
+    _relief: Relief  # around the stretch
+
     def __init__(self, scene: Scene, camera: Camera, supersample: tuple[int, int] = (3, 2)):
         self.scene, self.camera = scene, camera
         self.fine = fine = camera.supersampled(*supersample)
@@ -42,8 +45,9 @@ class Renderer:
         self._coarse_b = (np.arange(0, height + STEP, STEP) - fine.cy) / fine.fy
         self._across, self._down = raster.hats(width, STEP), raster.hats(height, STEP)
         self._things = Things(scene, fine)
-        self._stretch, self._relief = None, None
-        self._origin, self._pyramid = None, []
+        self._stretch: int | None = None
+        self._origin: np.ndarray | None = None
+        self._pyramid: list[np.ndarray] = []
 
     def render(self, pose: np.ndarray, frame: int | None = None) -> np.ndarray:
         """Draw one picture.
@@ -65,11 +69,11 @@ class Renderer:
         self._inverse, self._top = inverse, top
         cars = [] if frame is None else [box for mover in scene.traffic if (box := mover.at(frame)) is not None]
         self._things.draw(picture, pose, cars, self._shown)
-        picture = cv2.resize(picture, self.camera.size[::-1], interpolation=cv2.INTER_AREA)
+        averaged = cv2.resize(picture, self.camera.size[::-1], interpolation=cv2.INTER_AREA)
         gain = 1.0 if scene.exposure is None or frame is None else scene.exposure[frame]
         grey = 255 * (np.arange(256) / 255) ** scene.gamma * gain
         table = np.clip(grey[:, None] * scene.light, 0, 255).astype(np.uint8)
-        return cv2.LUT(picture, table[None])
+        return cv2.LUT(averaged, table[None])
 
     def _travel(self, pose: np.ndarray, frame: int | None) -> None:
         """Heights of the ground and of what stands on it, for the stretch where the camera is."""

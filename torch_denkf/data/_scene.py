@@ -156,7 +156,8 @@ class Scene:
             cv2.fillConvexPoly(dark, hull, 255, cv2.LINE_8, 4)
             return
         thick = max(1, round((0.35 if item.width > 2 else 0.12) / RESOLUTION))
-        cv2.line(dark, *pixels(np.stack([item.foot, item.foot + away])).tolist(), 255, thick, cv2.LINE_8, 4)
+        foot, top = pixels(np.stack([item.foot, item.foot + away])).tolist()
+        cv2.line(dark, foot, top, 255, thick, cv2.LINE_8, 4)
         if item.width > 2:  # a tree's crown
             centre, length = item.foot + 0.62 * away, np.linalg.norm(away)
             axes = (round(0.3 * length * 16 / RESOLUTION) + 1, round(0.35 * item.width * 16 / RESOLUTION))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -21,7 +23,7 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cells: dict[int, flo
     """
     total = np.zeros(shape, np.float32)
     for cell, deviation in cells.items():
-        coarse = rng.standard_normal((shape[0] // cell, shape[1] // cell), dtype=np.float32)
+        coarse: np.ndarray = rng.standard_normal((shape[0] // cell, shape[1] // cell), dtype=np.float32)
         if cell > 1:
             padded = np.pad(coarse, 2, mode="wrap")
             fine = cv2.resize(padded, None, fx=cell, fy=cell, interpolation=cv2.INTER_CUBIC)
@@ -30,7 +32,7 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cells: dict[int, flo
     return total
 
 
-def tinted(values: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
+def tinted(values: np.ndarray, colour: Sequence[float] | np.ndarray) -> np.ndarray:
     """Grey values around 1 times a BGR colour, as uint8."""
     return np.clip(values[..., None] * np.array(colour, np.float32), 0, 255).astype(np.uint8)
 
@@ -59,7 +61,8 @@ def ground(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray
     if paving[0] > 120:
         tiles[1][::16] //= 2  # slabs of 1.6 m
         tiles[1][:, ::16] //= 2
-    return tuple(np.tile(tile, (4, 4, 1)) for tile in tiles)
+    grass, pavement, asphalt = (np.tile(tile, (4, 4, 1)) for tile in tiles)
+    return grass, pavement, asphalt
 
 
 def facade(rng: np.random.Generator, rows: int = 96, columns: int = 160) -> np.ndarray:
@@ -143,7 +146,8 @@ def car(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             cv2.rectangle(view, (x, 40), (x + 9, 48), (12, 12, 12), -1)
     cv2.rectangle(views[2], (16, 26), (39, 33), (30, 30, 30), -1)
     cv2.rectangle(views[1], (20, 31), (35, 35), (200, 205, 205), -1)
-    return tuple(views)
+    side, rear, front = views
+    return side, rear, front
 
 
 def panorama(rng: np.random.Generator, haze: np.ndarray, rows: int = 160, columns: int = 1440) -> np.ndarray:

@@ -71,7 +71,7 @@ class Things:
         points[:, 1, :, 1] = feet.mean(1, keepdims=True) - np.array([item.height for item in items])[:, None]
         pixels, depth = project(self.camera, points, pose)
         for k in np.flatnonzero(~fixed):
-            self._car_shadow(picture, items[k], pose, shown)
+            self._car_shadow(picture, cars[order[k] - len(self.feet)], pose, shown)
         ahead = depth.min((1, 2)) > NEAR
         gone = raster.hidden(pixels, ahead, ahead & ~card & (middle < FAR - FADE - 12), picture.shape)
         gone |= card & (middle < 2 * NEAR)

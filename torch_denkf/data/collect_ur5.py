@@ -25,7 +25,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from torch_denkf.data import _demo_files as files
-from torch_denkf.data._demo_files import COLLECTION, TASKS, Entry
+from torch_denkf.data._demo_files import COLLECTION, TASKS, Domain, Entry, Task
 from torch_denkf.envs._collect_ur5 import DOMAINS, Options, make_demos
 
 __all__ = ["collect_ur5_demos", "main"]
@@ -40,8 +40,8 @@ def collect_ur5_demos(
     *,
     size: tuple[int, int] = (224, 224),
     frames: int | None = 0,
-    domain: str = "sim",
-    tasks: Sequence[str] = TASKS,
+    domain: Domain = "sim",
+    tasks: Sequence[Task] = TASKS,
     seed: int = 0,
     max_steps: int = EPISODE,
     noise: float = 0.0,
@@ -86,7 +86,7 @@ def collect_ur5_demos(
     """
     if demos < 1 or processes < 1:
         raise ValueError(f"demos and processes must be positive, got {demos} and {processes}")
-    options = Options(tuple(size), frames, domain, tuple(tasks), seed, max_steps, noise)
+    options = Options(size, frames, domain, tuple(tasks), seed, max_steps, noise)
     root = Path(root).expanduser().resolve()
     try:
         root.mkdir(parents=True, exist_ok=True)

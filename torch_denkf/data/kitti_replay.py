@@ -232,7 +232,7 @@ def _rows(drive: TensorDictBase, episode: int, mirrored_width: int | None) -> Te
 
 
 def _pixel_statistics(drives: Sequence[TensorDictBase], chunk: int = 256) -> dict[str, Tensor]:
-    total, square, count = 0.0, 0.0, 0.0
+    total = square = count = torch.zeros((), dtype=torch.float64)
     for drive in drives:
         for index in torch.arange(len(drive)).split(chunk):
             frames = frames_at(drive, index)

@@ -137,9 +137,7 @@ class UR5ExperienceReplay(EpisodeReplay):
         if progress and tqdm is not None:
             bar = tqdm(total=len(entries), desc="reading demos", unit=" demos", disable=None, delay=0.5)
         try:
-            self._demos = read_demos(
-                self.root, entries, None if size is None else tuple(size), cache, _ignore if bar is None else bar.update
-            )
+            self._demos = read_demos(self.root, entries, size, cache, _ignore if bar is None else bar.update)
         finally:
             if bar is not None:
                 bar.close()

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf.deployment.package import FACTS
 from torch_denkf.filters import Filter
-from torch_denkf.filters._parts import submodels
+from torch_denkf.filters.inductor import need_compiler
+from torch_denkf.modules._base import flat_noise
 
 
 class _FlatStep(nn.Module):
@@ -24,11 +25,8 @@ class _FlatStep(nn.Module):
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """Takes one step."""
-        tensordict = TensorDict({}, batch_size=self.batch_size)
-        for key, value in zip(self.in_keys, values, strict=True):
-            tensordict.set(key, value)
-        tensordict = self.filter.step(tensordict)
-        return tuple(tensordict.get(key) for key in self.out_keys)
+        written = self.filter.take_step(dict(zip(self.in_keys, values, strict=True)), self.batch_size)
+        return tuple(written[key] for key in self.out_keys)
 
 
 def export_step(
@@ -63,6 +61,7 @@ def export_step(
 
     Example:
         >>> import tempfile
+        >>> from tensordict import TensorDict
         >>> from torch_denkf.deployment import export_step, load_step
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
@@ -79,10 +78,10 @@ def export_step(
     if path.suffix != ".pt2":
         raise ValueError(f"a package ends in .pt2, got {path}")
     if compiled:
-        _need_compiler()
+        need_compiler()
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
-    written = [unravel_key(key) for key in filter.out_keys]
+    written = list(filter.out_keys)
     out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys)]))
     unknown = [key for key in out_keys if key not in written]
     if unknown:
@@ -114,30 +113,16 @@ def export_step(
 
 def _inputs(filter: Filter, example: TensorDictBase) -> list[NestedKey]:
     """What the step reads: all that it must, and what the example has of what it may."""
-    optional = [key for part in submodels(filter.module) for key in (*part.optional_keys, part.noise_key) if key]
-    keys = [unravel_key(key) for key in filter.in_keys]
+    structure = filter.structure
+    keys = [*structure.needed, *structure.controls, *structure.carry]
     missing = [key for key in keys if example.get(key, None) is None]
     if missing:
         raise KeyError(
             f"the step reads {missing}, which the example lacks; it holds {sorted(map(str, example.keys(True, True)))}"
         )
-    written = {unravel_key(key) for key in filter.out_keys}
-    keys += [key for key in map(unravel_key, optional) if key not in written and example.get(key, None) is not None]
-    return list(dict.fromkeys(keys))
+    keys += [key for key in structure.optional if example.get(key, None) is not None]
+    return [*keys, *flat_noise(example.get("noise", None))]
 
 
 def _name(key: NestedKey) -> str:
     return key if isinstance(key, str) else ".".join(key)
-
-
-def _need_compiler() -> None:
-    from torch._inductor.cpp_builder import get_cpp_compiler
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    try:
-        get_cpp_compiler()
-    except InvalidCxxCompiler as error:
-        raise RuntimeError(
-            "export_step(compiled=True) needs a C++ compiler (Debian: apt install g++; or set CXX); compiled=False "
-            "writes a package without one"
-        ) from error

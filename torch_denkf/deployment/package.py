@@ -77,6 +77,7 @@ def load_step(path: str | Path) -> PackagedStep:
             compiled = any("aotinductor" in name for name in archive.namelist())
     except zipfile.BadZipFile as error:
         raise ValueError(f"{path} is no package of a step, or it was cut; export it again") from error
+    run: Callable[..., tuple[Tensor, ...]]
     if compiled:
         run = torch._inductor.aoti_load_package(str(path))
         facts = run.get_metadata().get(FACTS, "")

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torch_denkf.data._demo_files import DOMAINS, TASKS, Demo, Entry, write_demo
+from torch_denkf.data._demo_files import DOMAINS, TASKS, Demo, Domain, Entry, Task, write_demo
 from torch_denkf.envs.ur5 import STEPS, UR5TableEnv
 from torch_denkf.envs.ur5_expert import UR5Expert
 
@@ -28,13 +28,14 @@ class Options:
 
     size: tuple[int, int]
     frames: int | None
-    domain: str
-    tasks: tuple[str, ...]
+    domain: Domain
+    tasks: tuple[Task, ...]
     seed: int
     max_steps: int
     noise: float
 
     def __post_init__(self):
+        object.__setattr__(self, "size", tuple(self.size))  # a list has no hash
         unknown = [task for task in self.tasks if task not in TASKS]
         if unknown or not self.tasks or len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"tasks are some of {', '.join(TASKS)}, each once; got {list(self.tasks)}")
@@ -107,7 +108,7 @@ def _make(root: Path, options: Options, number: int) -> Entry:
     )
 
 
-def _task(options: Options, number: int) -> str:
+def _task(options: Options, number: int) -> Task:
     return options.tasks[number % len(options.tasks)]
 
 

@@ -47,7 +47,7 @@ class Camera:
         """One frame, uint8 ``[H, W, 3]``: the mean of the pictures, bent by the lens, with the sensor's noise."""
         if len(pictures) == 1 and self._map is None and not any(self._noise):
             return pictures[0]
-        light = self.lens(np.mean(pictures, axis=0, dtype=np.float32) if len(pictures) > 1 else pictures[0])
+        light = self.lens(np.stack(pictures).mean(0, dtype=np.float32) if len(pictures) > 1 else pictures[0])
         light = light.astype(np.float32)
         dark, bright = self._noise
         if dark or bright:

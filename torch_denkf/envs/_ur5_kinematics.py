@@ -100,12 +100,12 @@ def plan_path(scene: UR5Scene, start: np.ndarray, waypoints: list[Waypoint], ste
     rows = []
     for waypoint in waypoints:
         share = minimum_jerk(np.arange(1, waypoint.steps + 1) / waypoint.steps)
-        solutions = [joints]
+        nodes = [joints]
         for node in NODES[1:]:
             where = position + node * (waypoint.position - position)
             turned = _slerp(rotation, waypoint.rotation, node)
-            solutions.append(inverse_kinematics(scene, where, turned, solutions[-1], iterations=25))
-        solutions = np.array(solutions)
+            nodes.append(inverse_kinematics(scene, where, turned, nodes[-1], iterations=25))
+        solutions = np.array(nodes)
         if np.abs(np.diff(solutions, axis=0)).max() > 1.2:
             raise Unreachable("the arm would turn over on the way")
         powers = np.arange(len(NODES))

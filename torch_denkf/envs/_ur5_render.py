@@ -107,7 +107,7 @@ class Renderer:
                 before the next is asked for, so that all may share one ``MjData``, also with ``data``.
             groups: the geoms to draw of ``data``.
         """
-        if self._context is None:
+        if self._gl is None or self._context is None:
             raise RuntimeError("the renderer is closed")
         mujoco.mj_camlight(self._model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -141,8 +141,8 @@ class Renderer:
     def close(self) -> None:
         """Frees the context; nothing can be drawn afterwards."""
         gl, context, self._gl, self._context = self._gl, self._context, None, None
-        if context is not None:
-            gl.make_current()
-            context.free()
         if gl is not None:
+            if context is not None:
+                gl.make_current()
+                context.free()
             gl.free()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torch_denkf.data._demo_files import TASKS
+from torch_denkf.data._demo_files import TASKS, Task
 from torch_denkf.envs._ur5_kinematics import READY, Unreachable, Waypoint, inverse_kinematics, plan_path, tool_down
 from torch_denkf.envs._ur5_scene import FINGER_TRAVEL, FULL_OPENING, UR5Scene
 
@@ -32,7 +32,7 @@ class Episode:
     path: np.ndarray
 
 
-def draw_episode(scene: UR5Scene, task: str, rng: np.random.Generator, steps: int, attempts: int = 100) -> Episode:
+def draw_episode(scene: UR5Scene, task: Task, rng: np.random.Generator, steps: int, attempts: int = 100) -> Episode:
     """Draws object, home pose, tool tilts and pace until the arm reaches all of the expert's way.
 
     Raises:
@@ -46,7 +46,7 @@ def draw_episode(scene: UR5Scene, task: str, rng: np.random.Generator, steps: in
     raise Unreachable(f"none of {attempts} draws of the task {task!r} lies within the arm's reach")
 
 
-def succeeded(scene: UR5Scene, task: str, episode: Episode) -> bool:
+def succeeded(scene: UR5Scene, task: Task, episode: Episode) -> bool:
     """Pick: lifted by 8 cm. Push: within 3 cm of the goal. Put-down: that too, standing, the gripper 7 cm away."""
     position, height = scene.object_position(), episode.half_size[2]
     if task == "pick":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -12,6 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+if TYPE_CHECKING:
+    from torch_denkf.envs._ur5_camera import Camera
+    from torch_denkf.envs._ur5_render import Renderer
 
 __all__ = ["UR5TableEnv"]
 
@@ -112,12 +116,14 @@ class UR5TableEnv(EnvBase):
         if pixels_dtype not in (torch.float32, torch.uint8):
             raise ValueError(f"pixels are torch.float32 or torch.uint8, not {pixels_dtype}")
         super().__init__(batch_size=torch.Size([]), device=device)
-        self.task, self.domain, self.size, self.max_steps = task, domain, tuple(size), max_steps
+        height, width = size
+        self.task, self.domain, self.size, self.max_steps = task, domain, (height, width), max_steps
         self.from_pixels, self.pixels_dtype, self.render_at = from_pixels, pixels_dtype, render_at
         self._tasks, self._domains, self._look = tasks, domains, domains.DOMAINS[domain]
         self._scene = scenes.UR5Scene(self.size)
         domains.apply_domain(self._scene, self._look)
-        self._renderer = self._camera = None
+        self._camera: Camera | None = None
+        self._renderer: Renderer | None = None
         self._set_specs()
         self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
@@ -159,6 +165,7 @@ class UR5TableEnv(EnvBase):
         self._domains.light_of_episode(scene, self._look, 1 + self._look.flicker * self._noise.standard_normal())
         self._now = 0
         self._shots = deque([self._exposure()] * (1 + self._look.delay), maxlen=1 + self._look.delay)
+        self._drawn: set[int] | None
         if isinstance(self.render_at, int):
             count = min(self.render_at, self.max_steps + 1)
             self._drawn = {int(step) for step in frames.choice(self.max_steps + 1, count, replace=False)}
@@ -228,12 +235,12 @@ class UR5TableEnv(EnvBase):
             )
         rows = state.detach().cpu().double().reshape(-1, state.shape[-1]).numpy()
         members = ghosts.detach().cpu().double().reshape(len(rows), *ghosts.shape[-2:]).numpy()
-        camera, pose_with = self._open(), self._scene.pose_with
+        (camera, renderer), pose_with = self._open(), self._scene.pose_with
         pictures = [
-            self._tensor(camera.lens(self._draw(pose_with(row[:7]), [pose_with(g[:7]) for g in group], scenery)))
+            camera.lens(self._draw(renderer, pose_with(row[:7]), [pose_with(g[:7]) for g in group], scenery))
             for row, group in zip(rows, members, strict=True)
         ]
-        return torch.stack(pictures).reshape(*state.shape[:-1], 3, *self.size).to(state.device)
+        return torch.stack(list(map(self._tensor, pictures))).reshape(*state.shape[:-1], 3, *self.size).to(state.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Frees the renderer; the next picture would open it again."""
@@ -246,11 +253,11 @@ class UR5TableEnv(EnvBase):
         return self._scene.poses[-self._look.exposures :]
 
     def _frame(self) -> Tensor:
-        camera = self._open()
-        return self._tensor(camera.expose([self._draw(pose) for pose in self._shots[0]], self._noise))
+        camera, renderer = self._open()
+        return self._tensor(camera.expose([self._draw(renderer, pose) for pose in self._shots[0]], self._noise))
 
-    def _open(self):
-        if self._renderer is None:
+    def _open(self) -> tuple[Camera, Renderer]:
+        if self._camera is None or self._renderer is None:
             from torch_denkf.envs._ur5_camera import Camera
             from torch_denkf.envs._ur5_render import GHOSTS, SCENERY, Renderer
 
@@ -261,14 +268,16 @@ class UR5TableEnv(EnvBase):
             self._camera = Camera(self.size, self._look.distortion, self._look.noise)
             self._renderer = Renderer(model, self.size)
             self.is_closed = False  # for EnvBase.__del__
-        return self._camera
+        return self._camera, self._renderer
 
-    def _draw(self, pose: np.ndarray, ghosts: Iterable[np.ndarray] = (), scenery: bool = True) -> np.ndarray:
+    def _draw(
+        self, renderer: Renderer, pose: np.ndarray, ghosts: Iterable[np.ndarray] = (), scenery: bool = True
+    ) -> np.ndarray:
         from torch_denkf.envs._ur5_render import GHOSTS, PLAIN, SCENERY
 
         groups = (PLAIN, GHOSTS, SCENERY) if scenery else (PLAIN, GHOSTS)
         posed = self._scene.posed
-        return self._renderer.draw(posed(pose), (posed(ghost) for ghost in ghosts), groups)
+        return renderer.draw(posed(pose), (posed(ghost) for ghost in ghosts), groups)
 
     def _tensor(self, picture: np.ndarray) -> Tensor:
         planes = picture.transpose(2, 0, 1)

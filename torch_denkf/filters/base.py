@@ -11,60 +11,92 @@ At a reset the forecast is the initial belief, and so is the belief unless ``upd
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
+from typing import Any, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import TensorDictPrimer
+from torch import Tensor
+from torchrl.envs.transforms import Compose, TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf.filters._checks import (
+    check_inputs,
+    refuse_missing_actions,
+    refuse_non_finite,
+    refuse_two_precisions,
+    refuse_unknown_noise,
+    refuse_unknown_readings,
+)
 from torch_denkf.filters._compiled import CompiledSteps
-from torch_denkf.filters._parts import Known, inputs_of, submodels
-from torch_denkf.filters._recursion import Recursion, run, where_rows
-from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._row import Row, RowPlan, on_rows
+from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._primer import LastAction, belief_primer
+from torch_denkf.filters._sequence import filter_rows
+from torch_denkf.filters._slices import as_rows, starts_of
+from torch_denkf.filters._steps import Steps, blank, previous_key, where_rows
+from torch_denkf.filters._structure import Structure, submodels
+from torch_denkf.filters._summaries import summaries
+from torch_denkf.modules._base import Call, Entries, flat_noise, named_modules_of, reads, run_module
 
-__all__ = ["Filter", "submodels", "where_rows"]
+__all__ = ["Filter", "FilterOptions", "LastAction", "submodels", "where_rows"]
 
-#: What follows from what: the summaries of a belief that a filter carries under these names.
-_SUMMARIES = {
-    "ensemble": {"mean": ensemble_mean, "var": ensemble_var},
-    "particles": {"mean": weighted_mean, "var": weighted_var},
-    "cov": {"var": lambda cov: cov.diagonal(dim1=-2, dim2=-1)},
-}
+_KNOWN = ("previous", "known")
+
+
+class FilterOptions(TypedDict, total=False):
+    """What every filter's constructor takes beside its parts; see :class:`Filter`."""
+
+    control_keys: Sequence[NestedKey]
+    init_key: NestedKey
+    update_at_reset: bool
+    forecast_keys: Mapping[NestedKey, NestedKey] | None
+    variance_ceiling: float | None
+    check_finite: bool
 
 
 class Filter(TensorDictSequential):
     """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
 
-    The modules are sorted once, by their keys: those that depend on the belief (transition, observation,
-    analysis) form the *recursion*; the others (sensor, noise) read frames alone and, on a sequence, run once on
-    all of them. The entries that the recursion reads before it writes them, and that ``initial`` provides, are the
-    *carry*: ``("belief", "ensemble")`` for an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a
-    Kalman filter.
+    The modules are sorted once, by their keys: those that depend on the belief (transition, observation, analysis) are
+    the step; the others (sensor, noise) read frames alone and, on a sequence, run once on all of them. The entries that
+    the step reads before it writes them, and that ``initial`` provides, are the *carry*: ``("belief", "ensemble")`` for
+    an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a Kalman filter.
 
-    Called outside torchrl's recurrent mode, a filter takes one step on a tensordict ``[*B]``: the carry there is
-    the belief at t-1, the frame is that of t, and afterwards the belief is that of t, also under ``("next", ...)``
-    so that a policy hands it on like :class:`torchrl.modules.LSTMModule` does its hidden state. In recurrent mode
-    (``with set_recurrent_mode(True)``; every torchrl loss does it) it takes a sequence ``[*B, T]``, time last. Its
-    first element starts from the belief that is stored there, which has seen that frame already, or from the
-    initial belief where none is stored; elements with ``is_init`` start anew from the initial belief; all others
-    are one step on from their predecessor. Actions are read one step earlier, as torchrl stores them.
+    There are three ways to run it:
+
+    * :meth:`step` in a loop: the carry in the tensordict is the belief at t-1, the frame that of t; afterwards the
+      belief is that of t.
+    * :meth:`sequence` on ``[*B, T]``, time last. Where an episode or a slice begins (``is_init``, or after a ``done``)
+      the belief is the one that is stored there, which has seen that frame already, and the initial belief where none
+      is stored. All other beliefs are one step on from their predecessor. Actions are read one step earlier, as torchrl
+      stores them.
+    * in a policy, behind :meth:`make_tensordict_primer`, like :class:`torchrl.modules.LSTMModule`: the belief at t-1
+      comes under ``("previous", ...)``, that of t goes to ``("belief", ...)`` for the actor, and to
+      ``("next", "previous", ...)`` for the next step. torchrl's losses, which turn its recurrent mode on, then filter
+      the stored sequences; each begins with a step from the belief that is stored under ``("previous", ...)``.
 
     Args:
-        modules: TensorDict modules in order, or one dict of them by name.
+        modules: TensorDict modules in order, or one dict of them by name. The name (or number) of a module is its
+            place; its noise is read from, and drawn to, ``("noise", place)``.
         initial: the initial belief, see :mod:`torch_denkf.modules.belief`.
         control_keys: entries that drive the transition *out of* the time they are stored at, by default the action.
         init_key: marks the first element of an episode, ``[*B, 1]`` bool, as written by
-            :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; a sequence without it starts anew
-            after every ``("next", "done")``.
+            :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; one of its name in a group of agents
+            counts, too.
         update_at_reset: whether the initial belief is updated with the first frame.
+        forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
+        variance_ceiling: the belief's variances are held at it, so that an unstable system that nobody observes stays
+            finite, with one warning; in the state's units squared. ``None`` for no ceiling.
+        check_finite: whether :meth:`step` raises where the new belief is not finite.
 
     Raises:
-        ValueError: if no module depends on what ``initial`` provides.
+        ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
+            before it is read.
+        TypeError: if parameters or constants differ in precision.
 
     Example:
         >>> from torch_denkf.filters import KalmanFilter
@@ -84,49 +116,72 @@ class Filter(TensorDictSequential):
         control_keys: Sequence[NestedKey] = ("action",),
         init_key: NestedKey = "is_init",
         update_at_reset: bool = False,
+        forecast_keys: Mapping[NestedKey, NestedKey] | None = None,
+        variance_ceiling: float | None = 1e12,
+        check_finite: bool = True,
     ):
+        if len(modules) == 1 and isinstance(modules[0], Mapping):
+            modules = (OrderedDict(modules[0]),)
         super().__init__(*modules)
         self.initial = initial
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
-        self.update_at_reset = update_at_reset
-        self._plan: RowPlan | None = None
-        self._known: Known | None = None
-        self._compiled: CompiledSteps | None = None
-        self._sort_modules()
+        self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
+        self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
+        self.compiled: CompiledSteps | None = None
+        self._said_ceiling = False
+        self._sorted_for: tuple = ()
+        refuse_two_precisions(self)
+        self._sort()
 
-    def _sort_modules(self) -> None:
-        provided = [unravel_key(key) for key in self.initial.out_keys]
-        self.carry_keys = [key for key in map(unravel_key, self.in_keys) if key in provided]
-        if not self.carry_keys:
-            raise ValueError(
-                f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
-                f"{list(self.in_keys)}. Give both the same keys."
-            )
-        modules = list(self._module_iter())
-        dependent = {*self.carry_keys, *self.control_keys}
-        self._recursion = []
-        for index, module in enumerate(modules):
-            if not dependent.isdisjoint(map(unravel_key, module.in_keys)):
-                self._recursion.append(index)
-                dependent.update(map(unravel_key, module.out_keys))
-        recursion = [modules[index] for index in self._recursion]
-        self.recursion_out_keys = list(dict.fromkeys(unravel_key(k) for m in recursion for k in m.out_keys))
-        self.belief_keys = [key for key in provided if key in self.recursion_out_keys]
-        # The first module of the recursion is the transition; what it writes is the forecast of the carry, in order.
-        self._forecast_of = dict(zip(self.carry_keys, map(unravel_key, recursion[0].out_keys), strict=False))
-        self._share_size("ensemble_size", (self.initial,))
-        # A transition may hold process noise, whose width is another.
-        self._share_size("observation_dim", [module for module in modules if module is not recursion[0]])
+    @property
+    def structure(self) -> Structure:
+        """The modules by what they read; found anew where one of them has been replaced."""
+        if self._sorted_for != (*_flat(self), self.initial, *self.control_keys):
+            self._sort()
+        return self._structure
 
-    def _share_size(self, name: str, sources: Iterable[TensorDictModuleBase]) -> None:
-        """Tells the sub-models that leave ``name`` open the size on which all ``sources`` agree, if they do."""
-        sizes = {getattr(part, name, None) for source in sources for part in submodels(source)} - {None}
-        if len(sizes) != 1:
-            return
-        for part in submodels(self.module):
-            if hasattr(part, name) and getattr(part, name) is None:
-                setattr(part, name, *sizes)
+    def _sort(self) -> None:
+        """Sorts the modules, and says what they read and write."""
+        structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
+        self._sorted_for, self._structure = (*_flat(self), self.initial, *self.control_keys), structure
+        keys = [*structure.needed, *structure.controls, *structure.carry, *map(previous_key, structure.carry), _KNOWN]
+        keys += [*map(previous_key, structure.controls), *structure.belief, self.init_key, *structure.optional]
+        self.in_keys = list(dict.fromkeys(keys))
+        of_start = [*map(unravel_key, self.initial.in_keys), *getattr(self.initial, "optional_keys", ())]
+        self._all_keys = list(dict.fromkeys([*keys, *of_start]))
+        self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
+        self.out_keys = [*structure.frame_keys, *structure.step_keys]
+
+    @property
+    def carry_keys(self) -> list[NestedKey]:
+        """The entries of the belief that go on from step to step."""
+        return list(self.structure.carry)
+
+    @property
+    def belief_keys(self) -> list[NestedKey]:
+        """All entries of the belief: the carry, and what follows from it."""
+        return list(self.structure.belief)
+
+    @property
+    def log_likelihood_keys(self) -> list[NestedKey]:
+        """The log-likelihoods that add up to that of all readings."""
+        return list(self.structure.likelihoods)
+
+    @property
+    def frame_modules(self) -> list[TensorDictModuleBase]:
+        """The modules that read frames alone, and not the belief."""
+        return [module for _, module in self.structure.frames]
+
+    @property
+    def transition_module(self) -> TensorDictModuleBase:
+        """The module that forecasts the carry: the first that depends on the belief."""
+        return self.structure.transition[1]
+
+    @property
+    def update_modules(self) -> list[TensorDictModuleBase]:
+        """The modules between the forecast and the belief."""
+        return [module for _, module in self.structure.update]
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
@@ -139,89 +194,28 @@ class Filter(TensorDictSequential):
         """Returns the modules between some keys; a part of a filter is a plain ``TensorDictSequential``."""
         return self[:].select_subsequence(in_keys, out_keys)
 
-    @property
-    def frame_modules(self) -> list[TensorDictModuleBase]:
-        """The modules that read frames alone, and not the belief."""
-        return [module for index, module in enumerate(self._module_iter()) if index not in self._recursion]
+    def make_tensordict_primer(self) -> TensorDictPrimer | Compose:
+        """Returns the transform that carries the belief where the filter is part of the policy.
 
-    @property
-    def transition_module(self) -> TensorDictModuleBase:
-        """The module that forecasts the carry: the first that depends on the belief."""
-        return list(self._module_iter())[self._recursion[0]]
-
-    @property
-    def update_modules(self) -> list[TensorDictModuleBase]:
-        """The modules between the forecast and the belief."""
-        modules = list(self._module_iter())
-        return [modules[index] for index in self._recursion[1:]]
-
-    def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Returns the transform that keeps the carry in the environment's tensordict where the filter is a policy's.
-
-        Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; needs torchrl's ``InitTracker`` in the
-        environment, too, so that the filter knows where an episode begins.
+        Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
+        the last action (:class:`torch_denkf.transforms.LastAction`).
         """
-        probe = TensorDict({}, batch_size=[])
-        for key in self.initial.in_keys:
-            probe.set(key, torch.zeros(getattr(self.initial, "observation_dim", getattr(self.initial, "state_dim", 1))))
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            belief = self.initial(probe)
-        primers = Composite()
-        for key in self.carry_keys:
-            value = belief.get(key)
-            primers[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-        return TensorDictPrimer(primers, expand_specs=True)
-
-    # ----------------------------------------------------------------------------------------------- one step
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Takes one step, or filters a sequence in recurrent mode; writes into ``tensordict``."""
-        if recurrent_mode():
-            return self.sequence(tensordict)
-        is_init = tensordict.get(self.init_key, None)
-        if is_init is None:
-            tensordict = self.step(tensordict)
-        else:
-            self._check_carry(tensordict)
-            tensordict = run(self.frame_modules, tensordict)
-            recursion, starts = self._make_recursion(self.update_at_reset), self._initial_of(tensordict)
-            tensordict = recursion.advance(tensordict, is_init, starts)
-        for key in self.carry_keys:
-            tensordict.set(("next", key) if isinstance(key, str) else ("next", *key), tensordict.get(key))
-        return tensordict
-
-    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Predicts, then updates, on ``[*B]``: the carry in ``tensordict`` is the belief at t-1.
-
-        Raises:
-            KeyError: if the carry is missing.
-        """
-        plan = on_rows(self.module._modules.values(), self._plan) if type(tensordict) is TensorDict else None
-        if plan is None:
-            self._check_carry(tensordict)
-            return run(self._module_iter(), tensordict)
-        self._plan, row = plan, Row.of(tensordict, plan.reads)
-        self._check_carry(row)
-        if self._compiled is None:
-            row = run(plan.modules, row)
-        else:
-            row = self._compiled.step(plan, row, row.get(self.carry_keys[0]).dtype)
-        return row.write(tensordict, plan.writes)
+        return belief_primer(self)
 
     def compile(self, *, chunk: int = 4, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
 
-        The first call of each kind (chunk, batch size, with or without gradients) compiles for up to minutes, later
-        ones reuse that; copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it
-        gives eagerly, up to rounding. Filters with a part that needs a TensorDict (see ``SubModel.runs_on_rows``) and
-        noise that is not a tensor (flipout) stay eager.
+        The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
+        copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it gives eagerly, up
+        to rounding. Steps stay eager where the size of a noise is not known in advance, and on a policy's data.
 
         Args:
-            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step.
-                0 goes back to eager.
+            chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
+                small chunk compiles sooner, a large one runs faster. 0 goes back to eager.
             **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
-                too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile
-                and about 40 % less to run. On a GPU ``mode="reduce-overhead"`` asks for CUDA graphs (never run here).
+                too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
+                about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU
+                ``mode="reduce-overhead"`` asks for CUDA graphs.
 
         Returns:
             This filter.
@@ -232,146 +226,281 @@ class Filter(TensorDictSequential):
         """
         if chunk < 0:
             raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
-        self._compiled = CompiledSteps(chunk, options) if chunk else None
+        self.compiled = CompiledSteps(chunk, options) if chunk else None
         return self
 
-    def initialise(self, tensordict: TensorDictBase) -> TensorDictBase:
+    # ----------------------------------------------------------------------------------------------- one step
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Takes one step, or filters a sequence in recurrent mode; writes into ``tensordict``."""
+        if recurrent_mode():
+            return self.sequence(tensordict)
+        structure = self.structure
+        entries = self.entries_of(tensordict)
+        resumed = all(previous_key(key) in entries for key in structure.carry)
+        refuse_missing_actions(structure, entries, resumed)
+        for key in (*structure.carry, *structure.controls):
+            if previous_key(key) in entries:
+                entries[key] = entries[previous_key(key)]
+        check_inputs(self, entries, tensordict)
+        reset, known = starts_of(tensordict, self.init_key, step=True), entries.get(_KNOWN)
+        if known is not None:
+            known = known.reshape(*tensordict.batch_size, 1)
+            reset = ~known if reset is None else reset | ~known
+        call, steps = Call(tensordict.batch_size), self.steps()
+        if reset is None:
+            written = self.take_step(entries, tensordict.batch_size)
+        else:
+            written = steps.frames(entries, call)
+            entries.update(written)
+            start = self.initial_belief(entries, call)
+            written.update(steps.advance(entries, call, reset, start))
+            blank(steps, written, reset)
+        write(tensordict, written)
+        for key in structure.carry:
+            tensordict.set(("next", *_path(previous_key(key))), written[key])
+        some = written[structure.carry[0]]
+        tensordict.set(("next", *_KNOWN), torch.ones(*tensordict.batch_size, 1, dtype=torch.bool, device=some.device))
+        return tensordict
+
+    def step(
+        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
+    ) -> TensorDictBase:
+        """Predicts, then updates, on ``[*B]``: the carry in ``tensordict`` is the belief at t-1.
+
+        Args:
+            tensordict: carry, frame, and what else the modules read; the new belief is written there. A dictionary of
+                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision.
+            without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
+                out, and the belief is the forecast unless another sensor has something to say.
+
+        Returns:
+            ``tensordict`` (of a dictionary, a new one), with the belief of t.
+
+        Raises:
+            KeyError: if an entry is missing, or ``without`` names what no module reads.
+            ValueError: if the new belief is not finite, and ``check_finite``.
+        """
+        tensordict = self._of_one_robot(tensordict)
+        without = refuse_unknown_readings(self.structure, without)
+        entries = self.entries_of(tensordict, one_step=True)
+        check_inputs(self, entries, tensordict, without)
+        if without:
+            call, steps, missing = Call(tensordict.batch_size), self.steps(), set(without)
+            written = steps.frames(entries, call, missing)
+            written.update(steps.advance({**entries, **written}, call, missing=missing))
+            lost = [key for key in self.structure.carry if key in self.structure.step_keys and key not in written]
+            if lost:
+                raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
+        else:
+            written = self.take_step(entries, tensordict.batch_size)
+        if self.check_finite and not torch.compiler.is_compiling():
+            refuse_non_finite(self.structure, entries, written)
+        write(tensordict, written)
+        return tensordict
+
+    def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+        """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does."""
+        tensordict = self._of_one_robot(tensordict)
+        hidden = tensordict.copy()
+        for key in dict.fromkeys(part.mask_key for part in submodels(self.module) if hasattr(part, "mask_key")):
+            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
+        without = self.structure.readings
+        out = self.step(hidden, without=without)
+        written = [key for key in self.out_keys if out.get(key, None) is not None]
+        return tensordict.update(out.select(*written))
+
+    def take_step(self, entries: Entries, batch_size: torch.Size) -> Entries:
+        """What one step writes where ``entries`` are, compiled or not; nothing is checked."""
+        structure = self.structure
+        steps = self.steps()
+        if self.compiled is not None:
+            drawn = draw_noise(self, entries, batch_size, (*structure.frames, structure.transition, *structure.update))
+            if drawn is not None:
+                written = self.compiled.step(steps, {**entries, **drawn}, batch_size)
+                self._look_at_ceiling(written)
+                return written
+        call = Call(batch_size)
+        written = steps.frames(entries, call)
+        written.update(steps.advance({**entries, **written}, call))
+        return written
+
+    def initialise(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
-        frame_outputs = {unravel_key(key) for module in self.frame_modules for key in module.out_keys}
-        if self.update_at_reset or not frame_outputs.isdisjoint(map(unravel_key, self.initial.in_keys)):
-            tensordict = run(self.frame_modules, tensordict)
-        tensordict = self.initial(tensordict)
+        tensordict = self._of_one_robot(tensordict)
+        entries, call, structure = self.entries_of(tensordict), Call(tensordict.batch_size), self.structure
+        frame_keys, written = set(structure.frame_keys), {}
+        if self.update_at_reset or not frame_keys.isdisjoint(chain(*reads(self.initial))):
+            written = self.steps().frames(entries, call)
+            entries.update(written)
+        start = self.initial_belief(entries, call)
         if self.update_at_reset:
-            for key, forecast_key in self._forecast_of.items():
-                tensordict.set(forecast_key, tensordict.get(key))
-            tensordict = run(self.update_modules, tensordict)
+            written.update(self.steps().first(entries, call, start, in_sequence=False))
+        else:
+            written.update(start)
+            written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
+        for key, value in written.items():
+            tensordict.set(key, value)
         return tensordict
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
-        for key in self.belief_keys:
-            if key not in self.carry_keys:
-                source = next(k for k in self.carry_keys if k[-1] in _SUMMARIES and key[-1] in _SUMMARIES[k[-1]])
-                kind, values = source[-1], [tensordict.get(source)]
-                if (*source[:-1], "log_weight") in self.carry_keys:  # an ensemble with weights
-                    kind, values = "particles", [*values, tensordict.get((*source[:-1], "log_weight"))]
-                tensordict.set(key, _SUMMARIES[kind][key[-1]](*values))
+        carry = {key: tensordict.get(key) for key in self.structure.carry}
+        for key, value in summaries(carry, self.structure.belief).items():
+            tensordict.set(key, value)
         return tensordict
-
-    def _check_carry(self, tensordict: TensorDictBase | Row) -> None:
-        for key in self.carry_keys:
-            if tensordict.get(key, None) is None:
-                raise KeyError(
-                    f"{type(self).__name__} carries its belief in {key!r}, which the tensordict lacks. Call "
-                    "filter.initialise(tensordict) at the start of an episode; in an environment append "
-                    "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
-                    "part of the policy."
-                )
-
-    def _initial_of(self, frames: TensorDictBase) -> TensorDictBase:
-        """The initial belief for every element of ``frames``, which is left as it is."""
-        return self.initial(frames.copy()).select(*self.belief_keys, *self.carry_keys)
-
-    def _lookup(self) -> Known:
-        """What follows from the modules alone, looked up anew when one of them is another."""
-        modules = (*self.module._modules.values(), self.initial)
-        if self._known is None or self._known.modules != modules:
-            recursion = (self.transition_module, *self.update_modules)
-            inputs = inputs_of(recursion, {*self.recursion_out_keys, *self.carry_keys})
-            self._known = Known(modules, tuple(submodels(self)), inputs)
-        return self._known
-
-    def _make_recursion(self, update_at_reset: bool) -> Recursion:
-        modules, known = list(self._module_iter()), self._lookup()
-        recursion = Recursion(
-            [modules[index] for index in self._recursion],
-            plans=known.plans,
-            carry_keys=self.carry_keys,
-            belief_keys=self.belief_keys,
-            forecast_of=self._forecast_of,
-            out_keys=self.recursion_out_keys,
-            update_at_reset=update_at_reset,
-        )
-        known.plans = recursion.plans
-        return recursion
 
     # --------------------------------------------------------------------------------------------- a sequence
 
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
-        Noise that is there already is kept.
+        Noise that is there already is kept. Noise that depends on a size which only the step knows is drawn there.
         """
-        dtype = next((p.dtype for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
-        for module in self._lookup().parts:
-            key = module.noise_key
-            if key is not None and tensordict.get(key, None) is None:
-                size, device = tensordict.batch_size, tensordict.device
-                noise = module.draw_noise(size, device=device, dtype=dtype, generator=generator)
-                if noise is not None:
-                    tensordict.set(key, noise)
+        entries, size, structure = self.entries_of(tensordict), tensordict.batch_size, self.structure
+        modules = (*structure.frames, structure.transition, *structure.update, ("initial", self.initial))
+        drawn = draw_noise(self, entries, size, modules, time=len(size) > 0, generator=generator, as_far_as_known=True)
+        for key, value in (drawn or {}).items():
+            tensordict.set(key, value)
         return tensordict
 
-    def sequence(self, tensordict: TensorDictBase, *, detach_every: int | None = None) -> TensorDictBase:
+    def sequence(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        detach_every: int | None = None,
+        keep: Sequence[NestedKey] | None = None,
+    ) -> TensorDictBase:
         """Filters a sequence ``[*B, T]`` and writes what a step writes, for every time.
+
+        Slices of one length in a flat ``[N]``, as torchrl's ``SliceSampler`` returns them, are filtered side by side
+        where their beginnings are marked.
 
         Args:
             tensordict: frames, and optionally ``is_init``, actions, masks, noise, and stored beliefs (see the class).
             detach_every: truncates back-propagation through time: the belief is detached every so many steps.
+            keep: the outputs to write; all by default. Ensembles of long sequences are large.
 
         Returns:
-            ``tensordict``, with the outputs of all modules.
+            ``tensordict``, with the outputs.
 
         Raises:
-            ValueError: if there is no time dimension.
+            ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
+            KeyError: if an entry is missing.
         """
-        if not tensordict.ndim:
-            raise ValueError("A sequence has time as its last batch dimension; this tensordict has batch_size [].")
-        work = run(self.frame_modules, self.draw_noise(tensordict.copy()))
-        is_init = self._starts(tensordict)
-        stored = all(tensordict.get(key, None) is not None for key in self.belief_keys)
-        if stored:  # these have seen their frame
-            starts = tensordict.select(*self.belief_keys, *self.carry_keys)
-        else:  # where only the first element starts, only its initial belief is needed
-            starts = self._initial_of(work if is_init is not None else work[..., :1])
-        recursion = self._make_recursion(self.update_at_reset and not stored)
-        inputs = {key: work.get(key) for key in self._recursion_inputs(work)}
-        if recursion.on_rows and self._compiled is not None and self._compiled.takes(inputs):
-            outputs = self._compiled.sequence(recursion, self.control_keys, inputs, is_init, starts, detach_every)
-        else:
-            outputs = self._eager_sequence(recursion, inputs, is_init, starts, work, detach_every)
-        frame_keys = [unravel_key(key) for module in self.frame_modules for key in module.out_keys]
-        outputs = {**{key: work.get(key) for key in frame_keys}, **outputs}
-        return Row(outputs, tensordict.batch_size, tensordict.device).write(tensordict, outputs)
+        size = tensordict.batch_size
+        if not size or not size[-1]:
+            raise ValueError(
+                "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
+                f"batch_size {list(size)}."
+            )
+        self.structure  # noqa: B018 - sorts the modules anew where one has been replaced
+        keep = list(self.out_keys) if keep is None else [unravel_key(key) for key in keep]
+        unknown = [key for key in keep if key not in self.out_keys]
+        if unknown:
+            raise ValueError(f"keep names {unknown}; the filter writes {list(self.out_keys)}.")
+        new = starts_of(tensordict, self.init_key)
+        rows, new = as_rows(tensordict, new)
+        outputs = filter_rows(self, rows, new, detach_every, keep)
+        if self.compiled is not None:
+            self._look_at_ceiling(outputs)
+        if rows is not tensordict:
+            outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
+        write(tensordict, {key: outputs[key] for key in keep})
+        return tensordict
 
-    def _eager_sequence(self, recursion, inputs, is_init, starts, work, detach_every) -> dict[NestedKey, torch.Tensor]:
-        """All outputs of the recursion, ``[*B, T, ...]`` each."""
-        time, steps = work.ndim - 1, work.shape[-1]
-        values = {key: value.unbind(time) for key, value in inputs.items()}
-        resets, starts = None if is_init is None else is_init.unbind(time), starts.unbind(time)
-        rows = []
-        for t in range(steps):
-            now = {key: value[max(t - 1, 0) if key in self.control_keys else t] for key, value in values.items()}
-            if recursion.on_rows:
-                rows.append(Row(now, work.batch_size[:-1], work.device))
-            else:
-                rows.append(TensorDict({}, batch_size=work.batch_size[:-1], device=work.device).update(now))
-        first = recursion.first(rows[0], starts[0])
-        cuts = [bool(detach_every) and t % detach_every == 0 for t in range(1, steps)]
-        belief = first.select(*self.carry_keys)
-        _, later = recursion.roll(belief, rows[1:], None if resets is None else resets[1:], starts[1:], cuts)
-        outputs = [first.select(*recursion.out_keys), *later]
-        return {key: torch.stack([output.get(key) for output in outputs], time) for key in recursion.out_keys}
+    def stepped(self, tensordict: TensorDictBase) -> Tensor:
+        """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
+        size = tensordict.batch_size
+        new, first = starts_of(tensordict, self.init_key), torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+        first[..., 0] = True
+        new = first if new is None else first | new.reshape(size)
+        if all(tensordict.get(previous_key(key), None) is not None for key in self.structure.carry):
+            known = tensordict.get(_KNOWN, None)  # a policy's data: every element with a belief before it is a step
+            return torch.ones_like(new) if known is None else known.reshape(size)
+        return ~new
 
-    def _starts(self, tensordict: TensorDictBase) -> torch.Tensor | None:
-        """Marks the first elements of episodes or slices: ``is_init``, or what follows a ``("next", "done")``."""
-        is_init = tensordict.get(self.init_key, None)
-        done = tensordict.get(("next", "done"), None)
-        if is_init is not None or done is None:
-            return is_init
-        time = tensordict.ndim - 1
-        return torch.cat([torch.ones_like(done.narrow(time, 0, 1)), done.narrow(time, 0, done.shape[time] - 1)], time)
+    # -------------------------------------------------------------------------------------------------- helpers
 
-    def _recursion_inputs(self, tensordict: TensorDictBase) -> list[NestedKey]:
-        """The entries of ``tensordict`` that the recursion reads and does not write."""
-        return [key for key in self._lookup().inputs if tensordict.get(key, None) is not None]
+    def like(self) -> Tensor | None:
+        """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
+        return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
+
+    def steps(self, update_at_reset: bool | None = None) -> Steps:
+        """What one step does, on entries; ``update_at_reset`` as the filter's by default."""
+        update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
+        return Steps(self._structure, update_at_reset, self.variance_ceiling, self._say_ceiling)
+
+    def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
+        """What the modules may read, as far as it is there; for ``one_step`` not what starts a sequence."""
+        self.structure  # noqa: B018 - sorts the modules anew where one has been replaced
+        entries = {}
+        for key in self._step_keys if one_step else self._all_keys:
+            value = tensordict.get(key, None)
+            if value is not None:
+                entries[key] = value
+        noise = flat_noise(tensordict.get("noise", None))
+        if noise:
+            refuse_unknown_noise(self, noise)
+            entries.update(noise)
+        return entries
+
+    def initial_belief(self, entries: Entries, call: Call) -> Entries:
+        """The belief at the start of an episode."""
+        hidden = {key: value for key, value in entries.items() if key not in self.structure.belief}
+        start = run_module(self.initial, hidden, call.part("initial"))
+        return summaries(start, self.structure.belief)
+
+    def _of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+        if isinstance(tensordict, TensorDictBase):
+            return tensordict
+        like = self.like()
+        out = TensorDict(dict(tensordict), batch_size=[])
+        if like is None:
+            return out
+        return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
+
+    def _look_at_ceiling(self, written: Entries) -> None:
+        """Says whether a variance is held at its ceiling, where a compiled graph could not."""
+        if self.variance_ceiling is None or self._said_ceiling or torch.compiler.is_compiling():
+            return
+        for key in self.steps().variance_keys():
+            value = written.get(key)
+            if value is not None and not value.is_cuda and (value >= 0.999 * self.variance_ceiling).any():
+                self._say_ceiling(key)
+
+    def _say_ceiling(self, key: NestedKey) -> None:
+        if not self._said_ceiling:
+            self._said_ceiling = True
+            warnings.warn(
+                f"The variance in {key!r} has reached variance_ceiling={self.variance_ceiling:g} and is held there: "
+                "nothing observes what grows. Said once.",
+                stacklevel=2,
+            )
+
+
+def _flat(sequence: TensorDictSequential) -> Iterator[Any]:
+    """The modules of a filter, and those of the plain sequences among them."""
+    for module in sequence._modules["module"]._modules.values():
+        yield module
+        if type(module) is TensorDictSequential:
+            yield from _flat(module)
+
+
+def write(tensordict: TensorDictBase, written: Entries) -> None:
+    """Sets entries, looking up each nested tensordict once."""
+    owners: dict[tuple, Any] = {}
+    for key, value in written.items():
+        prefix = () if isinstance(key, str) else key[:-1]
+        owner = tensordict if not prefix else owners.get(prefix)
+        if owner is None:
+            owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
+        if isinstance(owner, TensorDictBase):
+            owners[prefix] = owner
+            owner.set(key[-1] if prefix else key, value)
+        else:  # not there yet
+            tensordict.set(key, value)
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key

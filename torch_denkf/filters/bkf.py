@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 
 __all__ = ["BackpropKF"]
@@ -39,9 +39,8 @@ class BackpropKF(Filter):
             by it without bound.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        control_keys: see :class:`Filter`; the first drives the transition where ``control`` is given.
-        init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`.
+        **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
+            ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and ``check_finite`` of :class:`Filter`.
 
     Reference:
         Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,
@@ -72,11 +71,11 @@ class BackpropKF(Filter):
         inflation: float = 1.0,
         observation_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
-        control_keys: Sequence[NestedKey] = ("action",),
-        init_key: NestedKey = "is_init",
-        update_at_reset: bool = False,
+        **kwargs: Unpack[FilterOptions],
     ):
-        action = {} if control is None else {"control": control, "action_key": control_keys[0]}
+        action: dict[str, Any] = {}
+        if control is not None:
+            action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(
             noise=noise,
@@ -90,6 +89,4 @@ class BackpropKF(Filter):
                 observed_key=observed_key,
             ),
         )
-        super().__init__(
-            modules, initial=initial, control_keys=control_keys, init_key=init_key, update_at_reset=update_at_reset
-        )
+        super().__init__(modules, initial=initial, **kwargs)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Unpack
 
 import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
@@ -18,7 +19,9 @@ from torch_denkf.modules import (
     ImageSensor,
     LearnedObservation,
     LearnedTransition,
+    NoisyTransition,
     StochasticMLP,
+    as_process_noise,
 )
 
 __all__ = ["DEnKF"]
@@ -32,15 +35,23 @@ class DEnKF(Filter):
 
     Args:
         transition: :math:`f_\theta`, forecasts ``("forecast", "ensemble")``.
-        sensor: :math:`s_\xi`, writes ``("sensor", "ensemble")``; ``None`` where the reading is in the tensordict and
-            ``analysis`` reads it there.
+        sensor: :math:`s_\xi`, writes ``("sensor", "ensemble")``; ``None`` where the reading is in the tensordict, under
+            ``observation_key``.
         observation: :math:`h_\psi`, writes ``("forecast", "observation")``.
         noise: :math:`r_\zeta`, writes ``("sensor", "noise")``.
-        analysis: the update, ``EnsembleAnalysis("sensor")`` by default.
+        analysis: the update; ``EnsembleAnalysis("sensor")`` by default, and ``EnsembleAnalysis("perturbed")`` without a
+            sensor.
         initial: the initial belief, which also fixes the number of members.
-        control_keys: see :class:`Filter`.
-        init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`.
+        process_noise: Q of the motion, beside the noise of the transition's network: standard deviations ``[S]`` (a
+            number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
+            ensemble without any process noise collapses. ``None``: the transition's own noise alone.
+        angles: components of the observation that are angles in radians, for the default ``analysis``.
+        observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
+            ``check_finite`` of :class:`Filter`.
+
+    Raises:
+        ValueError: if it is not clear where the reading is.
 
     Reference:
         Liu, Clark, Campbell, Zhou, Ben Amor, "Enhancing state estimation in robots: a data-driven approach with
@@ -63,24 +74,24 @@ class DEnKF(Filter):
         analysis: TensorDictModuleBase | None = None,
         *,
         initial: TensorDictModuleBase,
-        control_keys: Sequence[NestedKey] = ("action",),
-        init_key: NestedKey = "is_init",
-        update_at_reset: bool = False,
+        process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
+        angles: Sequence[int] = (),
+        observation_key: NestedKey | None = None,
+        **kwargs: Unpack[FilterOptions],
     ):
+        if process_noise is not None:
+            transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
+        if analysis is not None and (angles or observation_key is not None):
+            raise ValueError("angles and observation_key are for the default analysis; give them to yours instead.")
+        if analysis is None:
+            if observation_key is None and sensor is None:
+                raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
+            reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
+            keys = {"sensor_key": reading, "noise_variance_key": noise.out_keys[0]}
+            analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(
-            noise=noise,
-            transition=transition,
-            observation=observation,
-            analysis=EnsembleAnalysis("sensor") if analysis is None else analysis,
-        )
-        super().__init__(
-            modules,
-            initial=initial,
-            control_keys=control_keys,
-            init_key=init_key,
-            update_at_reset=update_at_reset,
-        )
+        modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)
+        super().__init__(modules, initial=initial, **kwargs)
 
     @classmethod
     def paper(

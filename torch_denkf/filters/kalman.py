@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 
 __all__ = ["KalmanFilter"]
@@ -26,8 +28,11 @@ class KalmanFilter(Filter):
         observation_noise: R, ``[O]`` variances or ``[O, O]``.
         mean: of the initial belief, ``[S]``.
         cov: of the initial belief, ``[S, S]``.
+        control: B, ``[S, A]``, of the action; ``None`` for none.
+        angles: components of the observation that are angles in radians.
         observation_key: readings ``[*B, O]``.
-        update_at_reset: whether the initial belief is updated with the first reading.
+        **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
+            ``update_at_reset``, ``variance_ceiling`` and ``check_finite`` of :class:`Filter`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -47,11 +52,16 @@ class KalmanFilter(Filter):
         *,
         mean: torch.Tensor,
         cov: torch.Tensor,
+        control: torch.Tensor | None = None,
+        angles: Sequence[int] = (),
         observation_key: NestedKey = "observation",
-        update_at_reset: bool = False,
+        **kwargs: Unpack[FilterOptions],
     ):
+        action: dict[str, Any] = {}
+        if control is not None:
+            action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(
-            transition=LinearTransition(transition, transition_noise),
-            analysis=KalmanAnalysis(observation, observation_noise, observation_key=observation_key),
+            transition=LinearTransition(transition, transition_noise, **action),
+            analysis=KalmanAnalysis(observation, observation_noise, observation_key=observation_key, angles=angles),
         )
-        super().__init__(modules, initial=MomentPrior(mean, cov), update_at_reset=update_at_reset)
+        super().__init__(modules, initial=MomentPrior(mean, cov), **kwargs)

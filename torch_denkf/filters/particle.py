@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Unpack
 
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules import (
     GaussianLikelihood,
     NoisyTransition,
@@ -17,6 +17,7 @@ from torch_denkf.modules import (
     ResampledTransition,
     SubModel,
     WithWeights,
+    as_process_noise,
 )
 
 __all__ = ["DPF", "PFM", "ParticleFilter"]
@@ -44,10 +45,12 @@ class ParticleFilter(Filter):
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling heeds; the likelihood has its own key.
-        control_keys: see :class:`Filter`.
-        init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`.
+        process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
+            all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
+        angles: components of the observation that are angles in radians, for the default likelihood.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
+            ``check_finite`` of :class:`Filter`.
 
     Raises:
         ValueError: on an unknown ``resampling``.
@@ -85,11 +88,20 @@ class ParticleFilter(Filter):
         alpha: float = 0.05,
         epsilon: float = 0.05,
         ess_threshold: float | None = None,
+        process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
+        angles: Sequence[int] = (),
         observed_key: NestedKey = "observed",
-        control_keys: Sequence[NestedKey] = ("action",),
-        init_key: NestedKey = "is_init",
-        update_at_reset: bool = False,
+        **kwargs: Unpack[FilterOptions],
     ):
+        if process_noise is not None:
+            if isinstance(transition, ResampledTransition):
+                raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
+            transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
+        if likelihood is None:
+            keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
+            likelihood = GaussianLikelihood(angles=angles, observed_key=observed_key, **keys)
+        elif angles:
+            raise ValueError("angles are for the default likelihood; give them to yours instead.")
         if not isinstance(transition, ResampledTransition):
             transition = ResampledTransition(
                 transition,
@@ -106,15 +118,13 @@ class ParticleFilter(Filter):
             noise=noise,
             transition=transition,
             observation=observation,
-            likelihood=GaussianLikelihood() if likelihood is None else likelihood,
+            likelihood=likelihood,
             analysis=ParticleAnalysis() if analysis is None else analysis,
         )
         super().__init__(
             OrderedDict((name, module) for name, module in modules.items() if module is not None),
             initial=initial,
-            control_keys=control_keys,
-            init_key=init_key,
-            update_at_reset=update_at_reset,
+            **kwargs,
         )
 
 

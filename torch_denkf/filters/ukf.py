@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Unpack
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 
 __all__ = ["UKF"]
@@ -23,7 +25,8 @@ class UKF(Filter):
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
-        process_noise: Q, see :mod:`torch_denkf.modules.process_noise`.
+        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
+            :mod:`torch_denkf.modules.process_noise`.
         sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
             reading is in the tensordict, under ``observation_key``.
         observation: observes ensembles, writes ``("forecast", "observation")``.
@@ -37,9 +40,8 @@ class UKF(Filter):
         angles: components of the observation that are angles in radians.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.
-        control_keys: see :class:`Filter`.
-        init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
+            ``check_finite`` of :class:`Filter`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -63,7 +65,7 @@ class UKF(Filter):
     def __init__(
         self,
         transition: TensorDictModuleBase,
-        process_noise: TensorDictModuleBase,
+        process_noise: TensorDictModuleBase | Sequence[float] | float,
         sensor: TensorDictModuleBase | None,
         observation: TensorDictModuleBase,
         noise: TensorDictModuleBase,
@@ -76,18 +78,19 @@ class UKF(Filter):
         angles: Sequence[int] = (),
         observation_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
-        control_keys: Sequence[NestedKey] = ("action",),
-        init_key: NestedKey = "is_init",
-        update_at_reset: bool = False,
+        **kwargs: Unpack[FilterOptions],
     ):
-        points = {"alpha": alpha, "beta": beta, "kappa": kappa}
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(
             noise=noise,
-            transition=UKFTransition(transition, process_noise, **points),
+            transition=UKFTransition(
+                transition, as_process_noise(process_noise, initial), alpha=alpha, beta=beta, kappa=kappa
+            ),
             analysis=UKFAnalysis(
                 observation,
-                **points,
+                alpha=alpha,
+                beta=beta,
+                kappa=kappa,
                 inflation=inflation,
                 angles=angles,
                 observation_key=observation_key,
@@ -95,6 +98,4 @@ class UKF(Filter):
                 observed_key=observed_key,
             ),
         )
-        super().__init__(
-            modules, initial=initial, control_keys=control_keys, init_key=init_key, update_at_reset=update_at_reset
-        )
+        super().__init__(modules, initial=initial, **kwargs)

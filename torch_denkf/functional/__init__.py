@@ -1,10 +1,16 @@
 """The mathematics: tensors in, tensors out, no state, any leading batch dimensions."""
 
 from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
+from torch_denkf.functional.angles import align_angles, mean_observation, wrap_angles
 from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
-from torch_denkf.functional.linalg import cholesky, inverse_square_root, inverse_square_root_difference
+from torch_denkf.functional.linalg import (
+    cholesky,
+    inverse_square_root,
+    inverse_square_root_difference,
+    semidefinite_root,
+)
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, letkf, neighbours, neighbours_of_taper
 from torch_denkf.functional.moments import (
     ensemble_anomalies,
@@ -29,7 +35,6 @@ from torch_denkf.functional.unscented import (
     unscented_moments,
     unscented_update,
     unscented_weights,
-    wrap_angles,
 )
 from torch_denkf.functional.weighted import crps_weighted, weighted_mean, weighted_var
 
@@ -55,6 +60,8 @@ __all__ = [
     "unscented_moments",
     "unscented_update",
     "wrap_angles",
+    "align_angles",
+    "mean_observation",
     "crps_ensemble",
     "crps_gaussian",
     "energy_score",
@@ -67,6 +74,7 @@ __all__ = [
     "cholesky",
     "inverse_square_root",
     "inverse_square_root_difference",
+    "semidefinite_root",
     "effective_sample_size",
     "soft_resample",
     "systematic_resample",

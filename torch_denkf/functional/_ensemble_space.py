@@ -8,6 +8,7 @@ result is as large as the ensemble.
 from __future__ import annotations
 
 import math
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -54,7 +55,7 @@ def columns_in_a_tile(forecast: Tensor, *others: Tensor | None) -> int | None:
     Where everything fits in two tiles nothing is gained; a graph for gradients keeps all it saw, in tiles or not;
     a compiler would unroll the loop over tiles and fuses the plain formulas itself.
     """
-    columns = TILE_ELEMENTS // forecast[..., 0].numel()
+    columns = TILE_ELEMENTS // max(forecast[..., 0].numel(), 1)
     widest = max(tensor.shape[-1] for tensor in (forecast, *others) if tensor is not None)
     if columns < 64 or widest < 2 * columns or torch.compiler.is_compiling():
         return None
@@ -135,6 +136,12 @@ class _Tiles:
             return variance, None
         mask = self.observed.expand(self.noise.shape)[..., part]
         return torch.where(mask, variance, 1), mask
+
+    @overload
+    def __call__(self, part: slice, innovation: Tensor) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    @overload
+    def __call__(self, part: slice) -> tuple[Tensor, Tensor, None]: ...
 
     def __call__(self, part: slice, innovation: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
         """Y, the mean's shift and the members', as in ``analyse``; the last only where the innovation is wanted."""

@@ -1,16 +1,21 @@
-"""A Cholesky solution of a few unknowns written out, for compilers: it melts into the arithmetic around it.
+"""Cholesky factors and solutions of a few unknowns written out, for compilers: they melt into what is around them.
 
 In a compiled step LAPACK's calls for a 2 x 2 system cost more than the system: they cannot be fused, each costs a
-call, and in a package (AOTInductor) they go through a slow fallback. Eagerly, LAPACK is the faster one.
+call, and in C++ (a filter's ``compile()`` on a processor, a package of AOTInductor) some go through a slow fallback.
+Eagerly, LAPACK is the faster one.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 #: The largest O that is written out; the number of operations grows with its cube.
 LARGEST = 4
+#: The largest matrix whose factor alone is written out, of a state's covariance, say.
+LARGEST_FACTOR = 6
 
 
 def solve_written_out(gram: Tensor, cross: Tensor, shift: Tensor, mean_shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -32,36 +37,104 @@ def solve_written_out(gram: Tensor, cross: Tensor, shift: Tensor, mean_shift: Te
         >>> increment.item(), square.item(), log_det.exp().item()
         (0.5, 1.0, 4.0)
     """
-    size = gram.shape[-1]
-    lower: list[list[Tensor]] = []  # L, each element [*B, 1]
-    for i in range(size):
+    lower = _factor(gram, ridge=1)
+    solved = _solve(lower, _rows(cross))
+    increment = _sum(shift[..., i, None] * value.unsqueeze(-2) for i, value in enumerate(solved))
+    square = _squared_norm(_forward(lower, _entries(mean_shift.squeeze(-2))))
+    return increment, square, _log_det(lower)
+
+
+def gain_written_out(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The gain of a symmetric M, O x O, and what its likelihood needs, without a call of LAPACK.
+
+    Args:
+        matrix: M, ``[*B, O, O]`` with O of 1 to 4; its lower triangle is read.
+        cross: C, ``[*B, O, S]``.
+        residual: r, ``[*B, O]``.
+
+    Returns:
+        Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
+
+    Examples:
+        >>> one = torch.ones(1, 1)
+        >>> gain, square, log_det = gain_written_out(4 * one, 2 * one, 2 * one[0])
+        >>> gain.item(), square.item(), log_det.exp().item()
+        (0.5, 1.0, 4.0)
+    """
+    lower = _factor(matrix)
+    gain = torch.stack(_solve(lower, _rows(cross)), -1)
+    return gain, _squared_norm(_forward(lower, _entries(residual))), _log_det(lower)
+
+
+def cholesky_written_out(matrix: Tensor) -> Tensor:
+    """The lower Cholesky factor of a symmetric N x N matrix, all NaN where there is none; N of 1 to 6.
+
+    Examples:
+        >>> cholesky_written_out(torch.tensor([[[4.0]], [[-1.0]]])).flatten()
+        tensor([2., nan])
+    """
+    lower = _factor(matrix)
+    last = lower[-1][-1]  # NaN where any pivot is not positive
+    zero = torch.where(last > 0, torch.zeros_like(last), last)
+    rows = [torch.cat([*row, *[zero] * (len(lower) - len(row))], -1) for row in lower]
+    factor = torch.stack(rows, -2)
+    return torch.where((last > 0).unsqueeze(-1), factor, torch.nan)
+
+
+def _rows(matrix: Tensor) -> Sequence[Tensor]:
+    return matrix.unbind(-2)
+
+
+def _entries(vector: Tensor) -> Sequence[Tensor]:
+    return vector.split(1, -1)
+
+
+def _factor(matrix: Tensor, ridge: float = 0) -> list[list[Tensor]]:
+    """L of the matrix and ``ridge`` on its diagonal; each element ``[*B, 1]``, NaN from a pivot on that has no root."""
+    lower: list[list[Tensor]] = []
+    for i in range(matrix.shape[-1]):
         row: list[Tensor] = []
         for j in range(i + 1):
-            rest = gram[..., i, j, None]
+            rest = matrix[..., i, j, None]
             for k in range(j):
                 rest = rest - row[k] * (lower[j][k] if j < i else row[k])
             if j < i:
                 row.append(rest / lower[j][j])
             else:
-                pivot = rest + 1
+                pivot = rest + ridge if ridge else rest
                 row.append(torch.where(pivot > 0, pivot, torch.nan).sqrt())
         lower.append(row)
+    return lower
 
-    def forward(values: list[Tensor]) -> list[Tensor]:
-        solved: list[Tensor] = []
-        for i in range(size):
-            rest = values[i]
-            for k in range(i):
-                rest = rest - lower[i][k] * solved[k]
-            solved.append(rest / lower[i][i])
-        return solved
 
-    solved = forward([cross[..., i, :] for i in range(size)])
-    for i in reversed(range(size)):  # with the transpose of L, in place
-        for k in range(i + 1, size):
+def _forward(lower: list[list[Tensor]], values: Sequence[Tensor]) -> list[Tensor]:
+    """L⁻¹ times rows ``[*B, ...]``."""
+    solved: list[Tensor] = []
+    for i, rest in enumerate(values):
+        for k in range(i):
+            rest = rest - lower[i][k] * solved[k]
+        solved.append(rest / lower[i][i])
+    return solved
+
+
+def _solve(lower: list[list[Tensor]], values: Sequence[Tensor]) -> list[Tensor]:
+    """(L Lᵀ)⁻¹ times rows."""
+    solved = _forward(lower, values)
+    for i in reversed(range(len(solved))):  # with the transpose of L, in place
+        for k in range(i + 1, len(solved)):
             solved[i] = solved[i] - lower[k][i] * solved[k]
         solved[i] = solved[i] / lower[i][i]
-    increment = sum(shift[..., i, None] * solved[i].unsqueeze(-2) for i in range(size))
-    square = sum(value.square() for value in forward([mean_shift[..., 0, i, None] for i in range(size)]))
-    log_det = 2 * sum(lower[i][i].log() for i in range(size))
-    return increment, square, log_det
+    return solved
+
+
+def _squared_norm(entries: Sequence[Tensor]) -> Tensor:
+    return _sum(value.square() for value in entries)
+
+
+def _log_det(lower: list[list[Tensor]]) -> Tensor:
+    return 2 * _sum(row[-1].log() for row in lower)
+
+
+def _sum(values: Iterable[Tensor]) -> Tensor:
+    first, *others = values
+    return sum(others, first)

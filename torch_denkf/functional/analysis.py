@@ -149,19 +149,18 @@ def analyse(
 
     solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
     increment, square_root, nis, log_det = solve(normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf")
-    if scheme != "etkf":
+    if square_root is None:
         ensemble = forecast + increment
     elif rotation is None:
         ensemble = mean + increment + square_root
     else:
         ensemble = mean + increment + rotation @ square_root
 
-    if observed is None:
-        count = dim
-    else:
-        observed = observed.expand(noise.shape)
-        count = observed.sum(-1, keepdim=True, dtype=noise.dtype)
-        ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
+    count: int | Tensor = dim
+    if observed is not None:
+        seen = observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype)
+        ensemble = torch.where((seen > 0).unsqueeze(-1), ensemble, forecast)
+        count = seen
     nis = nis * (size - 1)
     log_det = log_det + noise.log().sum(-1, keepdim=True)
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional._checks import check_shape
+from torch_denkf.functional._small_system import LARGEST, gain_written_out
 from torch_denkf.functional.linalg import cholesky
 
 
@@ -108,7 +109,7 @@ def kalman_update(
     else:
         check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
     identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
-    count = dim
+    count: int | Tensor = dim
     if observed is not None:
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
         check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
@@ -120,10 +121,8 @@ def kalman_update(
         count = observed.sum(-1, keepdim=True, dtype=mean.dtype)
 
     cross = observation_matrix @ cov  # HP
-    factor = cholesky(cross @ observation_matrix.mT + noise)
-    gain = torch.cholesky_solve(cross, factor).mT
     innovation = observation - _apply(observation_matrix, mean)
-    nis, log_det = _whiten(innovation, factor)
+    gain, nis, log_det = solve_for_gain(cross @ observation_matrix.mT + noise, cross, innovation)
     keep = torch.eye(state_dim, dtype=mean.dtype, device=mean.device) - gain @ observation_matrix
     cov = keep @ cov @ keep.mT + gain @ noise @ gain.mT
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
@@ -159,6 +158,23 @@ def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The gain Cᵀ M⁻¹ with the residual's covariance M, and the two numbers of its likelihood.
+
+    Args:
+        matrix: M, ``[*B, O, O]``.
+        cross: C, ``[*B, O, S]``.
+        residual: r, ``[*B, O]``.
+
+    Returns:
+        Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
+    """
+    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST:
+        return gain_written_out(matrix, cross, residual)
+    factor = cholesky(matrix)
+    return torch.cholesky_solve(cross, factor).mT, *_whiten(residual, factor)
 
 
 def _whiten(residual: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:

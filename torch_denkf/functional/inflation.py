@@ -102,16 +102,17 @@ def random_rotation(
     """
     if ensemble_size < 2:
         raise ValueError(f"ensemble_size must be at least 2, got {ensemble_size}")
-    options = {"dtype": dtype, "device": device}
-    gaussian = torch.randn(*batch_shape, ensemble_size - 1, ensemble_size - 1, generator=generator, **options)
+    shape = (*batch_shape, ensemble_size - 1, ensemble_size - 1)
+    gaussian = torch.randn(shape, generator=generator, dtype=dtype, device=device)
     orthogonal, triangular = torch.linalg.qr(gaussian)
     # Without these signs the draw would depend on the QR convention (Mezzadri 2007).
     signs = torch.where(triangular.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(gaussian.dtype)
     orthogonal = orthogonal * signs.unsqueeze(-2)
     # The reflection that swaps the first axis and the direction of ones: its other columns span the rest.
-    normal = torch.full((ensemble_size,), -(ensemble_size**-0.5), **options)
+    normal = torch.full((ensemble_size,), -(ensemble_size**-0.5), dtype=dtype, device=device)
     normal[0] += 1
-    reflection = torch.eye(ensemble_size, **options) - 2 * normal.outer(normal) / normal.dot(normal)
+    reflection = torch.eye(ensemble_size, dtype=dtype, device=device)
+    reflection = reflection - 2 * normal.outer(normal) / normal.dot(normal)
     basis = reflection[:, 1:]
     return basis @ orthogonal @ basis.mT + 1 / ensemble_size
 

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torch_denkf.functional._small_system import LARGEST_FACTOR, cholesky_written_out
+
 
 def cholesky(matrix: Tensor) -> Tensor:
     """The lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
@@ -27,8 +29,38 @@ def cholesky(matrix: Tensor) -> Tensor:
         >>> cholesky(torch.tensor([[[4.0]], [[-1.0]]])).flatten()
         tensor([2., nan])
     """
+    if torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= LARGEST_FACTOR:
+        return cholesky_written_out(matrix)
     factor, info = torch.linalg.cholesky_ex(matrix)
     return torch.where((info == 0)[..., None, None], factor, torch.nan)
+
+
+def semidefinite_root(cov: Tensor) -> Tensor:
+    """A root A of a covariance, A Aᵀ = P, also of a singular one.
+
+    It is the Cholesky factor of the correlations, with the standard deviations put back. The correlations' ridge is
+    relative, so that metres and milliradians are treated alike, and as large as round-off makes the eigenvalues of a
+    Gram matrix negative. The scaling is a constant to the gradient: any scaling gives a root of the same matrix.
+
+    Args:
+        cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
+
+    Returns:
+        A, lower triangular, ``[*B, N, N]``; NaN where P is not positive semi-definite.
+
+    Examples:
+        >>> import torch
+        >>> semidefinite_root(torch.tensor([[4.0, 0.0], [0.0, 0.0]]))
+        tensor([[2., 0.],
+                [0., 0.]])
+    """
+    dim = cov.shape[-1]
+    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
+    inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
+    ridge = 10 * dim * torch.finfo(cov.dtype).eps
+    diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
+    correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
+    return std.unsqueeze(-1) * cholesky(correlation)
 
 
 def inverse_square_root(matrix: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ class Neighbours(NamedTuple):
         taper: their weights in [0, 1], ``[S, L]``; 0 for those that fill up.
     """
 
-    index: Tensor
+    index: Tensor  # type: ignore[assignment]  # in the place of tuple.index, which nobody needs here
     taper: Tensor
 
 

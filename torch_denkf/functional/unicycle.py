@@ -2,11 +2,13 @@ r"""The known motion of a vehicle on the plane: a pose moves with speed and turn
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 
-def unicycle_move(pose: Tensor, velocity: Tensor, dt: float) -> Tensor:
+def unicycle_move(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> Tensor:
     r"""Moves poses for one step (the paper's section IV-A).
 
     .. math::
@@ -19,7 +21,7 @@ def unicycle_move(pose: Tensor, velocity: Tensor, dt: float) -> Tensor:
     Args:
         pose: (x m, y m, theta rad), ``[*, 3]``.
         velocity: (v m/s, theta_dot rad/s), ``[*, 2]``.
-        dt: time step in s.
+        dt: time step in s, a number or ``[*, 1]``.
 
     Returns:
         The poses afterwards, ``[*, 3]``; theta is not wrapped.
@@ -34,13 +36,13 @@ def unicycle_move(pose: Tensor, velocity: Tensor, dt: float) -> Tensor:
     return pose + moved
 
 
-def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
     """Jacobians of :func:`unicycle_move`.
 
     Args:
         pose: (x m, y m, theta rad) before the step, ``[*, 3]``.
         velocity: (v m/s, theta_dot rad/s), ``[*, 2]``.
-        dt: time step in s.
+        dt: time step in s, a number or ``[*, 1]``.
 
     Returns:
         The derivatives by the pose ``[*, 3, 3]`` and by the velocity ``[*, 3, 2]``.
@@ -51,9 +53,14 @@ def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float) -> tuple[Tenso
                 [0.0000, 0.0500],
                 [0.0000, 0.1000]])
     """
+    dt = dt[..., 0] if isinstance(dt, Tensor) else dt
     heading = pose[..., 2] + 0.5 * dt * velocity[..., 1]
     cos, sin, way = heading.cos(), heading.sin(), dt * velocity[..., 0]
     zero, one = torch.zeros_like(way), torch.ones_like(way)
     by_pose = [[one, zero, -way * sin], [zero, one, way * cos], [zero, zero, one]]
     by_velocity = [[dt * cos, -0.5 * dt * way * sin], [dt * sin, 0.5 * dt * way * cos], [zero, dt * one]]
-    return tuple(torch.stack([torch.stack(row, -1) for row in rows], -2) for rows in (by_pose, by_velocity))
+    return _matrix(by_pose), _matrix(by_velocity)
+
+
+def _matrix(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    return torch.stack([torch.stack(tuple(row), -1) for row in rows], -2)

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional._checks import check_ensemble, check_shape
-from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, _whiten
-from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.angles import wrap_angles
+from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
+from torch_denkf.functional.linalg import semidefinite_root
 
 
 class UnscentedWeights(NamedTuple):
@@ -61,11 +62,10 @@ def unscented_weights(
         tensor([0.3333, 0.1667, 0.1667, 0.1667, 0.1667])
     """
     spread = _spread(dim, alpha, kappa)
-    mean = torch.full((2 * dim + 1,), 0.5 / spread, dtype=dtype, device=device)
-    cov = mean.clone()
-    mean[0] = (spread - dim) / spread
-    cov[0] = (spread - dim) / spread + 1 - alpha**2 + beta
-    return UnscentedWeights(mean, cov)
+    center = torch.arange(2 * dim + 1, device=device) == 0
+    weights = torch.full((2 * dim + 1,), 0.5 / spread, dtype=dtype, device=device)
+    mean = torch.where(center, (spread - dim) / spread, weights)
+    return UnscentedWeights(mean, torch.where(center, (spread - dim) / spread + 1 - alpha**2 + beta, weights))
 
 
 def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float = 0.5) -> Tensor:
@@ -92,7 +92,7 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
         tensor([ 0.,  2., -2.])
     """
     _check_moments(mean, cov)
-    columns = math.sqrt(_spread(mean.shape[-1], alpha, kappa)) * _root(cov).mT
+    columns = math.sqrt(_spread(mean.shape[-1], alpha, kappa)) * semidefinite_root(cov).mT
     center = mean.unsqueeze(-2)
     return torch.cat([center, center + columns, center - columns], -2)
 
@@ -170,7 +170,8 @@ def unscented_update(
         noise = noise.diag_embed()
     else:
         check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
-    innovation, count = wrap_angles(observation - expected, angles), dim
+    innovation = wrap_angles(observation - expected, angles)
+    count: int | Tensor = dim
     if observed is not None:
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
         check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
@@ -182,37 +183,14 @@ def unscented_update(
         count = observed.sum(-1, keepdim=True, dtype=points.dtype)
     mean = points[..., 0, :]
     anomalies = points - mean.unsqueeze(-2)
-    factor = cholesky(_weighted_gram(deviations, weights.cov, deviations) + noise)
     cross = deviations.mT @ (weights.cov.unsqueeze(-1) * anomalies)
-    gain = torch.cholesky_solve(cross, factor).mT
-    nis, log_det = _whiten(innovation, factor)
+    predicted_cov = _weighted_gram(deviations, weights.cov, deviations) + noise
+    gain, nis, log_det = solve_for_gain(predicted_cov, cross, innovation)
     remaining = anomalies - deviations @ gain.mT
     cov = _weighted_gram(remaining, weights.cov, remaining) + gain @ noise @ gain.mT
     mean = mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1)
     log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
     return GaussianUpdate(mean, (cov + cov.mT) / 2, innovation, nis, log_likelihood)
-
-
-def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
-    """Wraps some components of differences to [-pi, pi).
-
-    Args:
-        difference: ``[*, N]``.
-        angles: the components that are angles in radians.
-
-    Returns:
-        ``[*, N]``.
-
-    Examples:
-        >>> wrap_angles(torch.tensor([6.0, 6.0]), [1])
-        tensor([ 6.0000, -0.2832])
-    """
-    if not angles:
-        return difference
-    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
-    is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
-    is_angle[list(angles)] = True
-    return torch.where(is_angle, wrapped, difference)
 
 
 def _spread(dim: int, alpha: float, kappa: float) -> float:
@@ -222,22 +200,6 @@ def _spread(dim: int, alpha: float, kappa: float) -> float:
             f"sigma points need alpha^2 (S + kappa) > 0; got alpha={alpha}, kappa={kappa} and S={dim}. Use kappa >= 0."
         )
     return spread
-
-
-def _root(cov: Tensor) -> Tensor:
-    """A root A of ``cov``, A Aᵀ = P: the Cholesky factor of the correlations, with the standard deviations put back.
-
-    The correlations' ridge is relative, so that metres and milliradians are treated alike, and as large as round-off
-    makes the eigenvalues of a Gram matrix negative. The scaling is a constant to the gradient: any scaling gives a
-    root of the same matrix.
-    """
-    dim = cov.shape[-1]
-    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
-    inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
-    ridge = 10 * dim * torch.finfo(cov.dtype).eps
-    diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
-    correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
-    return std.unsqueeze(-1) * cholesky(correlation)
 
 
 def _deviations(points: Tensor, weights: UnscentedWeights, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -250,7 +212,7 @@ def _deviations(points: Tensor, weights: UnscentedWeights, angles: Sequence[int]
         )
     center = points[..., :1, :]
     deviations = wrap_angles(points - center, angles)
-    shift = weights.mean @ deviations
+    shift = (weights.mean.unsqueeze(-1) * deviations).sum(-2)
     return center.squeeze(-2) + shift, deviations - shift.unsqueeze(-2)
 
 

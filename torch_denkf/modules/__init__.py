@@ -3,7 +3,7 @@
 Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSensor, ...``.
 """
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import Call, SubModel, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.calibration import MemberGain
@@ -18,7 +18,7 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
-from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise
+from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise, as_process_noise
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
@@ -28,6 +28,9 @@ from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
 
 __all__ = [
     "SubModel",
+    "Call",
+    "reads",
+    "run_module",
     "StochasticMLP",
     "FlipoutLinear",
     "deterministic",
@@ -63,6 +66,7 @@ __all__ = [
     "CholeskyNoise",
     "MappedNoise",
     "UnicycleNoise",
+    "as_process_noise",
     "EKFTransition",
     "EKFAnalysis",
     "UKFTransition",

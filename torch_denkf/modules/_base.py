@@ -1,38 +1,88 @@
-"""What the sub-models share: their own forward, clear errors, and noise that may come in as a tensor."""
+"""What every sub-model is: a function of tensors, with names for what it reads and what it writes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModule
-from torch import nn
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
 
-__all__ = ["SubModel"]
+__all__ = ["Call", "Entries", "SubModel", "flat_noise", "random_parts", "reads", "run_module"]
+
+#: Tensors by unravelled key: what a step of a filter works on.
+Entries: TypeAlias = dict[NestedKey, Tensor]
+#: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
+Noise: TypeAlias = "Tensor | Mapping[str, Tensor] | None"
+
+
+class Call(NamedTuple):
+    """One call of a module on entries.
+
+    Attributes:
+        batch_size: ``[*B]``, in front of every entry.
+        place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
+        sample: whether random modules draw; if not, they run their deterministic forward.
+        time: whether the last dimension of ``batch_size`` is time.
+    """
+
+    batch_size: torch.Size
+    place: str = "self"
+    sample: bool = True
+    time: bool = False
+
+    def part(self, name: str) -> Call:
+        """The call of a part of the module."""
+        return self._replace(place=name if self.place == "self" else f"{self.place}.{name}")
 
 
 class SubModel(TensorDictModule):
-    """A :class:`~tensordict.nn.TensorDictModule` that reads, computes and writes in its own ``forward``.
+    """A part of a filter: a function of tensors, and the keys of what it reads and writes.
 
-    A plain ``TensorDictModule`` costs about 40 us a call in tensordict 0.14, a subclass with its own forward
-    about 5 us, which matters where a whole filter step takes 400 us.
-
-    Sub-classes read with :meth:`read`, so that a missing entry names itself, and list what they can do without
-    in ``optional_keys``. A sub-model that draws random numbers gives its ``noise_key`` and draws with
-    :meth:`draw_noise`; when the tensordict holds ``noise_key``, that noise is used instead of fresh one. This is
-    what makes a step equal a sequence, and lets a filter draw the noise of a whole sequence at once.
-
-    A sub-class whose ``forward`` uses nothing of its tensordict but ``get``, ``set``, ``batch_size``, ``ndim`` and
-    ``device`` says ``runs_on_rows = True`` beside that ``forward``: a filter then spares it the TensorDict.
+    A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
+    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead, which costs less.
+    Noise that it finds there is used instead of fresh noise: in a filter under ``("noise", place)``, by itself under
+    ``("noise", "self")``.
 
     Args:
-        network: the module that holds the parameters.
+        network: the module that holds the parameters; ``torch.nn.Identity()`` if there is none.
         in_keys: entries that must be there.
         out_keys: entries that are written.
-        optional_keys: entries that are used when they are there.
-        noise_key: entry that holds the noise, if the sub-model is stochastic.
+        optional_keys: entries that are used where they are there.
+
+    Attributes:
+        noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
+            for one tensor without a name of its own.
+
+    Example:
+        >>> class Wind(SubModel):
+        ...     def __init__(self):
+        ...         super().__init__(nn.Identity(), [("forecast", "ensemble"), "wind"], [("forecast", "ensemble")])
+        ...
+        ...     def compute(self, ensemble, wind):  # [*B, E, S], [*B, S]
+        ...         return ensemble + wind.unsqueeze(-2)
+        >>> td = TensorDict({"forecast": {"ensemble": torch.zeros(8, 2)}, "wind": torch.ones(2)})
+        >>> Wind()(td)["forecast", "ensemble"].mean()
+        tensor(1.)
     """
+
+    if TYPE_CHECKING:
+
+        @property
+        def noise_names(self) -> tuple[str, ...]:
+            """A tuple in the class, or a property."""
+
+    else:
+        noise_names = ()
+    _wants: frozenset[str] = frozenset()
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
+        cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
 
     def __init__(
         self,
@@ -41,44 +91,240 @@ class SubModel(TensorDictModule):
         out_keys: Sequence[NestedKey],
         *,
         optional_keys: Sequence[NestedKey] = (),
-        noise_key: NestedKey | None = None,
     ):
         super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
-        self.optional_keys = [unravel_key(key) for key in optional_keys]
-        self.noise_key = None if noise_key is None else unravel_key(noise_key)
-
-    runs_on_rows = False
+        required = set(map(unravel_key, self.in_keys))
+        self.optional_keys = [key for key in dict.fromkeys(map(unravel_key, optional_keys)) if key not in required]
 
     # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would hide our buffers.
     __getattr__ = nn.Module.__getattr__
 
-    def read(self, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
-        """Returns the entry ``key``.
+    def compute(self, *values: Any, **_: Any) -> Tensor | tuple[Tensor, ...]:
+        """What the sub-model writes: one tensor for each of ``out_keys``, or a tensor alone if that is one.
 
-        Raises:
-            KeyError: if it is missing; the message names it and lists what is there.
+        Args:
+            *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+            **_: a sub-class may ask for ``batch_size``, the ``[*B]`` in front of every entry, and, if it has
+                ``noise_names``, for ``noise``: what :meth:`draw_noise` drew, or ``None`` for the deterministic forward.
         """
-        value = tensordict.get(key, None)
-        if value is None:
-            present = sorted(str(name) for name in tensordict.keys(True, True))
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which the tensordict lacks. It holds {', '.join(present)}. "
-                f"Rename the key in the constructor of {type(self).__name__}, or put the module that writes it "
-                "in front."
-            )
-        return value
-
-    def read_noise(self, tensordict: TensorDictBase) -> torch.Tensor | TensorDictBase | None:
-        """Returns the noise that the tensordict brings, or ``None`` where fresh noise is to be drawn."""
-        return None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
 
     def draw_noise(
         self,
         batch_size: Sequence[int],
         *,
+        members: int | None = None,
+        state_dim: int | None = None,
+        observation_dim: int | None = None,
+        time: bool = False,
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
         generator: torch.Generator | None = None,
-    ) -> torch.Tensor | TensorDictBase | None:
-        """Draws the noise of one call on ``batch_size`` elements; ``None`` for a deterministic sub-model."""
+    ) -> Noise:
+        """Draws the noise of one call on ``batch_size`` elements.
+
+        Args:
+            batch_size: ``[*B]``, or ``[*B, T]`` for a whole sequence.
+            members: E, the size of the ensemble.
+            state_dim: S.
+            observation_dim: O, of the reading that the sub-model uses.
+            time: whether the last of ``batch_size`` is time.
+            device: where to draw.
+            dtype: of floating noise.
+            generator: source of randomness; torch's global one by default.
+
+        Returns:
+            A tensor ``[*batch_size, ...]``, or several by ``noise_names``; ``None`` where there is no noise, or a size
+            that it depends on is not known.
+        """
         return None
+
+    def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
+        """The sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        return {}
+
+    def parts(self) -> dict[str, TensorDictModuleBase]:
+        """The modules inside that may draw noise of their own, by name."""
+        return {}
+
+    def on_entries(self, entries: Entries, call: Call) -> Entries:
+        """What the sub-model writes where ``entries`` are; changes nothing.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        values: list[Tensor | None] = [self.required(entries, key) for key in self.in_keys]
+        values += [entries.get(key) for key in self.optional_keys]
+        extra: dict[str, Any] = {}
+        if "batch_size" in self._wants:
+            extra["batch_size"] = call.batch_size
+        if "noise" in self._wants:
+            extra["noise"] = self._noise(entries, values, call)
+        out = self.compute(*values, **extra)
+        return dict(zip(self.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))
+
+    def required(self, entries: Entries, key: NestedKey) -> Tensor:
+        """The entry ``key``.
+
+        Raises:
+            KeyError: if it is missing; the message names it and lists what is there.
+        """
+        value = entries.get(key)
+        if value is None:
+            present = ", ".join(sorted(map(str, entries))) or "nothing"
+            raise KeyError(
+                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Rename the key in the "
+                f"constructor of {type(self).__name__}, or put the module that writes it in front."
+            )
+        return value
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reads, computes and writes on a TensorDict."""
+        entries = {}
+        for key in (*self.in_keys, *self.optional_keys):
+            value = tensordict.get(key, None)
+            if value is not None:
+                entries[key] = value
+        if len(entries) < len(self.in_keys):  # the message is to list all that is there
+            entries = dict.fromkeys(map(unravel_key, tensordict.keys(True, True))) | entries
+        entries.update(flat_noise(tensordict.get("noise", None)))
+        for key, value in self.run(entries, Call(tensordict.batch_size)).items():
+            tensordict.set(key, value)
+        return tensordict
+
+    def run(self, entries: Entries, call: Call) -> Entries:
+        """What :meth:`on_entries` gives.
+
+        Raises:
+            TypeError: if entries and parameters differ in precision.
+        """
+        if torch.compiler.is_compiling():
+            return self.on_entries(entries, call)
+        try:
+            return self.on_entries(entries, call)
+        except RuntimeError as error:
+            self._explain_precision(error, entries)
+            raise
+
+    def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
+        names = self.noise_names
+        if not names or not call.sample:
+            return None
+        given: Noise
+        if names == ("",):
+            given = entries.get(("noise", call.place))
+        else:
+            found = {name: entries.get(("noise", call.place, name)) for name in names}
+            given = {name: value for name, value in found.items() if value is not None}
+            given = given if len(given) == len(found) else None
+        if given is None:
+            like = next((value for value in values if value is not None and value.is_floating_point()), None)
+            if like is None:  # nothing is read: what is drawn lies beside the constants
+                own = (*self.parameters(), *self.buffers())
+                like = next((value for value in own if value.is_floating_point()), None)
+            where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
+            where.update(self.noise_sizes(*values))
+            given = self.draw_noise(call.batch_size, time=call.time, **where)
+        return given
+
+    def _explain_precision(self, error: RuntimeError, entries: Entries) -> None:
+        own = {p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()}
+        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
+        given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
+        if len(own | set(given.values())) > 1 and any(word in str(error) for word in ("dtype", "scalar type")):
+            raise TypeError(
+                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'the precision of its inputs'} and got "
+                + ", ".join(f"{key!r} in {dtype}" for key, dtype in given.items())
+                + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
+                "(filter.double())."
+            ) from error
+
+
+# ------------------------------------------------------------------------------------------------------ any module
+
+
+def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:
+    """What a module writes where ``entries`` are: a sub-model, a sequence of modules, or any TensorDict module.
+
+    Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
+    sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
+    """
+    if not (module._forward_hooks or module._forward_pre_hooks):
+        if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
+            return module.run(entries, call)
+        if type(module) is TensorDictSequential:
+            return run_modules(named_modules_of(module), entries, call)
+    keys, optional = reads(module)
+    tensordict = TensorDict({}, batch_size=call.batch_size)
+    for key in (*keys, *optional):
+        value = entries.get(key)
+        if value is not None:
+            tensordict.set(key, value)
+    for place, part in random_parts(module, call.place):
+        for name in part.noise_names:
+            value = entries.get(("noise", place, name) if name else ("noise", place))
+            if value is not None:
+                own = "self" if place == call.place else place.removeprefix(call.place + ".")
+                tensordict.set(("noise", own, name) if name else ("noise", own), value)
+    missing = [key for key in keys if key not in entries]
+    if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
+        raise KeyError(f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}.")
+    tensordict = module(tensordict)
+    return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
+
+
+def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
+    """What named modules write, one after the other."""
+    entries, written = dict(entries), {}
+    for name, module in modules:
+        out = run_module(module, entries, call.part(name))
+        entries.update(out)
+        written.update(out)
+    return written
+
+
+def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
+    """The modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
+    return list(sequence.module._modules.items())
+
+
+def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What a module must find, and what it uses where it is there."""
+    if type(module) is not TensorDictSequential:
+        may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
+        must = [key for key in map(unravel_key, module.in_keys) if key not in may]
+        return list(dict.fromkeys(must)), list(dict.fromkeys(may))
+    needed: dict[NestedKey, None] = {}
+    optional: dict[NestedKey, None] = {}
+    made: set[NestedKey] = set()
+    for _, part in named_modules_of(module):
+        must, may = reads(part)
+        needed.update((key, None) for key in must if key not in made)
+        optional.update((key, None) for key in may if key not in made)
+        made.update(map(unravel_key, part.out_keys))
+    return list(needed), [key for key in optional if key not in needed]
+
+
+def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
+    """The sub-models that draw noise, and their places, in the order in which they run."""
+    parts: Iterable[tuple[str, TensorDictModuleBase]]
+    if isinstance(module, SubModel):
+        if module.noise_names:
+            yield place, module
+        parts = module.parts().items()
+    else:
+        parts = named_modules_of(module) if type(module) is TensorDictSequential else ()
+    for name, part in parts:
+        yield from random_parts(part, name if place == "self" else f"{place}.{name}")
+
+
+def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
+    """Noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    if noise is None:
+        return {}
+    if isinstance(noise, Tensor):
+        return {("noise", *place): noise}
+    if isinstance(noise, TensorDictBase):
+        keys = noise.keys(True, True)
+        return {("noise", *place, *((key,) if isinstance(key, str) else key)): noise.get(key) for key in keys}
+    return {("noise", *place, name): value for name, value in noise.items()}

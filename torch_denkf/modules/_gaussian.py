@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional import GaussianUpdate
-from torch_denkf.modules._base import SubModel
+from torch_denkf.functional import GaussianUpdate, mean_observation
+from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
+
+
+_DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 
 
 class GaussianTransition(SubModel):
@@ -30,30 +33,32 @@ class GaussianTransition(SubModel):
         refuse_random_layers(transition, type(self).__name__)
         in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_key, forecast_key))
         self_made = [unravel_key(ensemble_key), *out_keys]
-        in_keys += further_keys((transition, process_noise), [*in_keys, *self_made])
-        super().__init__(transition, in_keys, out_keys)
+        further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
+        super().__init__(transition, in_keys + further, out_keys, optional_keys=optional)
         self.process_noise = process_noise
-        self.ensemble_key, self.forecast_ensemble_key = ensemble_key, forecast_ensemble_key
+        self.ensemble_key, self.forecast_ensemble_key = map(unravel_key, (ensemble_key, forecast_ensemble_key))
 
-    runs_on_rows = True
+    def parts(self):
+        """The process noise; the transition is deterministic."""
+        return {"process_noise": self.process_noise}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast."""
-        mean, cov = (self.read(tensordict, key) for key in self.in_keys[:2])
-        with deterministic(self.module):
-            mean, cov = self._forecast(tensordict, mean, cov)
-        work = tensordict.copy().set(self.out_keys[0], mean)
-        cov = cov + as_covariance(self.read(self.process_noise(work), self.process_noise.out_keys[0]), mean)
-        tensordict.set(self.out_keys[0], mean)
-        return tensordict.set(self.out_keys[1], cov)
+    def on_entries(self, entries, call):
+        """The forecast."""
+        mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
+        mean, cov = self._forecast(entries, mean, cov, call._replace(sample=False))
+        work = {**entries, self.out_keys[0]: mean}
+        noise = run_module(self.process_noise, work, call.part("process_noise"))
+        cov = cov + as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
+        return {self.out_keys[0]: mean, self.out_keys[1]: cov}
 
-    def _forecast(self, tensordict, mean, cov) -> tuple[torch.Tensor, torch.Tensor]:
+    def _forecast(self, entries: Entries, mean, cov, call: Call) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and covariance before the process noise is added."""
         raise NotImplementedError
 
-    def _move(self, tensordict: TensorDictBase, states: torch.Tensor) -> torch.Tensor:
-        """The transition of an ensemble ``[*B, E, S]``; writes into ``tensordict``."""
-        return self.read(self.module(tensordict.set(self.ensemble_key, states)), self.forecast_ensemble_key)
+    def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
+        """The transition of an ensemble ``[*B, E, S]``."""
+        with deterministic(self.module):  # also of networks that do not know about calls
+            return run_module(self.module, {**entries, self.ensemble_key: states}, call)[self.forecast_ensemble_key]
 
 
 class GaussianAnalysis(SubModel):
@@ -76,43 +81,46 @@ class GaussianAnalysis(SubModel):
     ):
         refuse_random_layers(observation, type(self).__name__)
         in_keys = [(forecast_key, "mean"), (forecast_key, "cov"), observation_key, noise_variance_key]
-        in_keys += further_keys([observation], [*in_keys, ensemble_key])
+        further, optional = further_keys([observation], [*in_keys, ensemble_key])
         out_keys = [(belief_key, name) for name in ("mean", "cov", "var")]
         out_keys += [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
-        super().__init__(observation, in_keys, out_keys, optional_keys=[observed_key])
-        self.inflation, self.angles = inflation, list(angles)
-        self.ensemble_key, self.predicted_key = ensemble_key, predicted_key
+        super().__init__(observation, in_keys + further, out_keys, optional_keys=[observed_key, *optional])
+        self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
+        self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
+        self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and the diagnostics."""
-        mean, cov, observation, noise = (self.read(tensordict, key) for key in self.in_keys[:4])
+    def on_entries(self, entries, call):
+        """The belief and the diagnostics."""
+        mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
-            observation = observation.mean(-2)
-        with deterministic(self.module):
-            update, observed = self._update(tensordict, mean, cov, observation, noise)
-        write_update(self, tensordict, update, observed, self.inflation)
-        return tensordict
+            observation = mean_observation(observation, self.angles)
+        update, observed = self._update(entries, mean, cov, observation, noise, call._replace(sample=False))
+        values = updated(update, observed, self.inflation)
+        return dict(zip(self.out_keys, values, strict=True))
 
-    def _update(self, tensordict, mean, cov, observation, noise) -> tuple[GaussianUpdate, torch.Tensor | None]:
+    def without_reading(self, mean, cov, *_):
+        """The belief where there is no reading: the forecast; innovation and its kin are zero."""
+        predicted = self._observe({}, mean.unsqueeze(-2), Call(mean.shape[:-1], sample=False))[0]
+        zero = torch.zeros_like(predicted[..., 0, :])
+        return mean, cov, cov.diagonal(dim1=-2, dim2=-1), zero, zero[..., :1], zero[..., :1]
+
+    def _update(
+        self, entries: Entries, mean, cov, observation, noise, call: Call
+    ) -> tuple[GaussianUpdate, torch.Tensor | None]:
         """The update, and the mask that it used."""
         raise NotImplementedError
 
-    def _observe(self, tensordict: TensorDictBase, states: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran; writes."""
-        out = self.module(tensordict.set(self.ensemble_key, states))
-        return self.read(out, self.predicted_key), out.get(self.optional_keys[0], None)
+    def _observe(
+        self, entries: Entries, states: torch.Tensor, call: Call
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
+        with deterministic(self.module):
+            written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
+        return written[self.predicted_key], written.get(self.observed_key, entries.get(self.observed_key))
 
 
-def write_update(
-    module: SubModel,
-    tensordict: TensorDictBase,
-    update: GaussianUpdate,
-    observed: torch.Tensor | None,
-    inflation: float = 1.0,
-) -> None:
-    """Writes mean, cov, var, innovation, nis and log_likelihood under the module's ``out_keys``.
+def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
+    """Returns mean, cov, var, innovation, nis and log_likelihood.
 
     ``inflation`` multiplies the belief's standard deviations where anything is observed.
     """
@@ -121,9 +129,7 @@ def write_update(
         inflated = inflation**2 * cov
         cov = inflated if observed is None else torch.where(observed.any(-1)[..., None, None], inflated, cov)
     variance = cov.diagonal(dim1=-2, dim2=-1)
-    values = (update.mean, cov, variance, update.innovation, update.nis, update.log_likelihood)
-    for key, value in zip(module.out_keys, values, strict=True):
-        tensordict.set(key, value)
+    return update.mean, cov, variance, update.innovation, update.nis, update.log_likelihood
 
 
 def as_covariance(noise: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
@@ -131,11 +137,18 @@ def as_covariance(noise: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     return noise.diag_embed() if noise.ndim == mean.ndim else noise
 
 
-def further_keys(modules: Iterable[TensorDictModuleBase], known: Iterable[NestedKey]) -> list[NestedKey]:
-    """What ``modules`` read beside the entries ``known``."""
+def further_keys(
+    modules: Iterable[TensorDictModuleBase], known: Iterable[NestedKey]
+) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What ``modules`` must find, and what they may, beside the entries ``known``."""
     known = set(map(unravel_key, known))
-    keys = [unravel_key(key) for module in modules for key in module.in_keys]
-    return [key for key in dict.fromkeys(keys) if key not in known]
+    needed: dict[NestedKey, None] = {}
+    optional: dict[NestedKey, None] = {}
+    for module in modules:
+        must, may = reads(module)
+        needed.update((key, None) for key in must if key not in known)
+        optional.update((key, None) for key in may if key not in known)
+    return list(needed), list(optional)
 
 
 def refuse_random_layers(module: nn.Module, owner: str) -> None:
@@ -147,11 +160,12 @@ def refuse_random_layers(module: nn.Module, owner: str) -> None:
     """
     networks = [part for part in module.modules() if isinstance(part, StochasticMLP)]
     inside = {layer for network in networks for layer in network.modules()}
-    kinds = (nn.modules.dropout._DropoutNd, FlipoutLinear)
+    kinds = (*_DROPOUTS, FlipoutLinear)
     random = [
         name or type(part).__name__
         for name, part in module.named_modules()
-        if (isinstance(part, kinds) and part not in inside) or (isinstance(part, SubModel) and _draws(part, networks))
+        if (isinstance(part, kinds) and part not in inside)
+        or (isinstance(part, SubModel) and part.noise_names and part.module not in networks)
     ]
     if random:
         raise ValueError(
@@ -159,18 +173,3 @@ def refuse_random_layers(module: nn.Module, owner: str) -> None:
             "layers into a StochasticMLP, whose mean network is then used, or take them out: the noise of this filter "
             "is in its covariances."
         )
-
-
-def _draws(part: SubModel, networks: list[StochasticMLP]) -> bool:
-    """Whether a sub-model, asked for the noise of one member, draws any that is not a network's."""
-    if part.noise_key is None or part.module in networks:
-        return False
-    size = getattr(part, "ensemble_size", 1)
-    if size is None:
-        part.ensemble_size = 1
-    try:
-        with torch.random.fork_rng(devices=[]):
-            return part.draw_noise(()) is not None
-    finally:
-        if size is None:
-            part.ensemble_size = None

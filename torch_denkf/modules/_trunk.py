@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 
 __all__ = ["activation_bytes", "couples_frames", "in_chunks", "reduced_precision"]
+
+
+_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
+
+
+def _tensors(values: Any) -> Iterator[Tensor]:
+    """The tensors in nested tuples, lists and dictionaries."""
+    if isinstance(values, Tensor):
+        yield values
+    elif isinstance(values, dict):
+        yield from _tensors(tuple(values.values()))
+    elif isinstance(values, (tuple, list)):
+        for value in values:
+            yield from _tensors(value)
 
 
 class _Allocations(TorchDispatchMode):
@@ -24,10 +37,9 @@ class _Allocations(TorchDispatchMode):
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         out = function(*args, **(kwargs or {}))
-        tensors = (leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor))
-        known = {tensor.untyped_storage().data_ptr() for tensor in tensors}
-        for tensor in tree_leaves(out):
-            if isinstance(tensor, Tensor) and tensor.untyped_storage().data_ptr() not in known:
+        known = {tensor.untyped_storage().data_ptr() for tensor in _tensors((args, kwargs))}
+        for tensor in _tensors(out):
+            if tensor.untyped_storage().data_ptr() not in known:
                 self.bytes += tensor.untyped_storage().nbytes()
         return out
 
@@ -46,7 +58,7 @@ def activation_bytes(trunk: nn.Module, frame: Tensor) -> int:
 
 def couples_frames(trunk: nn.Module) -> bool:
     """Returns whether a batch norm makes a frame's features depend on what else is in its chunk."""
-    return any(isinstance(module, _BatchNorm) for module in trunk.modules())
+    return any(isinstance(module, _BATCH_NORMS) for module in trunk.modules())
 
 
 def reduced_precision(dtype: torch.dtype | None, device: torch.device) -> AbstractContextManager:

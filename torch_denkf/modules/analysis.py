@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf.functional import (
+    align_angles,
     analyse,
+    ensemble_cov,
     ensemble_mean,
     ensemble_var,
     inflate,
@@ -33,8 +36,8 @@ class EnsembleAnalysis(SubModel):
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
-        ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
-        observation_dim: O, likewise.
+        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         forecast_key: forecast ensemble ``[*B, E, S]``.
         predicted_key: predicted observations ``[*B, E, O]``.
         sensor_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]`` (not for ``"sensor"``).
@@ -42,7 +45,8 @@ class EnsembleAnalysis(SubModel):
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed.
         belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``.
         info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
-        noise_key: optional standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``.
+            Where a filter holds several analyses of one prefix, each has its own, ``(info_key, place, ...)``, and
+            ``nis`` and ``log_likelihood`` under the prefix are their sums.
 
     Raises:
         ValueError: on an unknown scheme.
@@ -66,8 +70,8 @@ class EnsembleAnalysis(SubModel):
         relaxation: float = 0.0,
         rotate: bool = False,
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
-        ensemble_size: int | None = None,
-        observation_dim: int | None = None,
+        angles: Sequence[int] = (),
+        covariance: bool = False,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         sensor_key: NestedKey = ("sensor", "ensemble"),
@@ -75,7 +79,6 @@ class EnsembleAnalysis(SubModel):
         observed_key: NestedKey = "observed",
         belief_key: str = "belief",
         info_key: str = "info",
-        noise_key: NestedKey = ("noise", "analysis"),
     ):
         if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
             raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
@@ -85,45 +88,61 @@ class EnsembleAnalysis(SubModel):
             nn.Identity(),
             [forecast_key, predicted_key, sensor_key, noise_variance_key],
             [(belief_key, name) for name in ("ensemble", "mean", "var")]
-            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
+            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
+            + [(belief_key, "cov")] * covariance,
             optional_keys=[observed_key],
-            noise_key=noise_key,
         )
         self.scheme, self.rotate = scheme, rotate
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             self.register_buffer(name, factors, persistent=False)
         self.inflation, self.relaxation = inflation, relaxation
-        self.ensemble_size, self.observation_dim = ensemble_size, observation_dim
+        self.angles, self.covariance, self.info_key = list(angles), covariance, info_key
+        self.reading_keys, self.noise_variance_key = self.in_keys[2:], unravel_key(noise_variance_key)
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        """Draws perturbations or rotations; ``None`` where the scheme needs none or the sizes are unknown."""
-        size = self.ensemble_size
-        if self.rotate and size is not None:
-            return random_rotation(size, tuple(batch_size), device=device, dtype=dtype, generator=generator)
-        if self.scheme == "perturbed" and None not in (size, self.observation_dim):
-            shape = (*batch_size, size, self.observation_dim)
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Perturbations or rotations, where the scheme needs any."""
+        return ("",) if self.rotate or self.scheme == "perturbed" else ()
+
+    def draw_noise(
+        self, batch_size, *, members=None, observation_dim=None, device=None, dtype=None, generator=None, **_
+    ):
+        """Draws standard-normal perturbations ``[*B, E, O]`` or rotations ``[*B, E, E]``."""
+        if self.rotate and members is not None:
+            return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+        if self.scheme == "perturbed" and None not in (members, observation_dim):
+            shape = (*batch_size, members, observation_dim)
             return torch.randn(shape, device=device, dtype=dtype, generator=generator)
         return None
 
-    runs_on_rows = True
+    def noise_sizes(self, forecast, predicted, *_):
+        """E and O, from the ensemble and its predicted observations."""
+        return {"members": forecast.shape[-2], "observation_dim": predicted.shape[-1]}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and the diagnostics."""
-        forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
-        noise = self.read_noise(tensordict)
-        if self.rotate and noise is None:
-            noise = random_rotation(
-                forecast.shape[-2], forecast.shape[:-2], device=forecast.device, dtype=forecast.dtype
-            )
-        observed = tensordict.get(self.optional_keys[0], None)
+    def without_reading(self, forecast, predicted, *_):
+        """The belief where there is no reading: the forecast."""
+        unseen = torch.zeros_like(predicted[..., 0, :1], dtype=torch.bool)
+        noise = torch.zeros_like(predicted) if self.scheme == "perturbed" else None
+        if self.rotate:
+            size = forecast.shape[-2]
+            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(*forecast.shape[:-2], size, size)
+        ones = torch.ones_like(predicted[..., 0, :])
+        return self.compute(forecast, predicted, torch.zeros_like(predicted), ones, unseen, noise=noise)
+
+    def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
+        """The belief and the diagnostics."""
+        scheme = self.scheme
+        if scheme == "perturbed" and noise is None:
+            raise ValueError('the scheme "perturbed" has no deterministic forward; use "etkf" or "sakov".')
+        predicted, observation = align_angles(predicted, observation, self.angles, observed)
         ensemble, innovation, nis, log_likelihood = analyse(
             forecast,
             predicted,
             observation,
             variance,
-            scheme=self.scheme,
+            scheme=scheme,
             observed=observed,
-            perturbation=noise if self.scheme == "perturbed" else None,
+            perturbation=noise if scheme == "perturbed" else None,
             rotation=noise if self.rotate else None,
             taper=None if self.state_taper is None else (self.state_taper, self.observation_taper),
         )
@@ -135,7 +154,5 @@ class EnsembleAnalysis(SubModel):
                 inflated = torch.where(observed.any(-1)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean = ensemble_mean(ensemble)
-        values = (ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood)
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        cov = (ensemble_cov(ensemble),) if self.covariance else ()
+        return ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood, *cov

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
@@ -25,27 +26,26 @@ class _InitialEnsemble(SubModel):
         out_keys: Sequence[NestedKey],
         optional_keys: Sequence[NestedKey] = (),
     ):
-        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys, noise_key=("noise", "initial"))
-        std = torch.as_tensor(std, dtype=torch.get_default_dtype())
+        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
+        std = as_floating(std)
         if std.ndim != 1 or not (std >= 0).all():
             raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+    noise_names = ("",)
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None, **_):
         """Draws standard-normal values ``[*batch_size, E, S]``."""
         shape = (*batch_size, self.ensemble_size, self.state_dim)
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
-    def _write(self, tensordict: TensorDictBase, center: torch.Tensor, std: torch.Tensor) -> TensorDictBase:
-        noise = self.read_noise(tensordict)
+    def _members(self, center: torch.Tensor, std: torch.Tensor, noise: torch.Tensor | None, batch_size):
+        """Ensemble, mean and variance."""
         if noise is None:
-            noise = self.draw_noise(tensordict.batch_size, device=center.device, dtype=center.dtype)
-        ensemble = center.unsqueeze(-2) + std.unsqueeze(-2) * noise
-        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
+            noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
+        ensemble = center.unsqueeze(-2) + std.unsqueeze(-2) * noise.to(center.dtype)
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
 
 
 _BELIEF_KEYS = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
@@ -76,14 +76,14 @@ class GaussianPrior(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [], out_keys)
-        mean = torch.as_tensor(mean, dtype=torch.get_default_dtype())
+        mean = as_floating(mean)
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
         self.register_buffer("mean", mean)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        return self._write(tensordict, self.mean.expand(*tensordict.batch_size, -1), self.std)
+    def compute(self, *, noise, batch_size):
+        """The belief."""
+        return self._members(self.mean.expand(*batch_size, -1), self.std, noise, batch_size)
 
 
 class AroundState(_InitialEnsemble):
@@ -115,9 +115,9 @@ class AroundState(_InitialEnsemble):
     ):
         super().__init__(std, ensemble_size, [state_key], out_keys)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        return self._write(tensordict, self.read(tensordict, self.in_keys[0]).to(self.std.dtype), self.std)
+    def compute(self, state, *, noise, batch_size):
+        """The belief."""
+        return self._members(state.to(self.std.dtype), self.std, noise, batch_size)
 
 
 class FromSensor(_InitialEnsemble):
@@ -159,23 +159,16 @@ class FromSensor(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
-        self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.get_default_dtype()))
+        register_constant(self, "mean", mean)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
-        self.observation_dim = len(self.dims)
+        self.observation_dim = self.input_dim = len(self.dims)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        reading = self.read(tensordict, self.in_keys[0])
-        if reading.ndim > tensordict.ndim + 1:
-            reading = reading.mean(-2)
-        std = self.read(tensordict, self.in_keys[1]).sqrt()
+    def compute(self, reading, variance, observed=None, *, noise, batch_size):
+        """The belief."""
+        reading, std = mean_of_members(reading, batch_size), variance.sqrt()
         mean, prior_std = (part.expand(*reading.shape[:-1], -1) for part in (self.mean, self.std))
-        observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
             reading = torch.where(observed, reading, mean.index_select(-1, self.dims))
             std = torch.where(observed, std, prior_std.index_select(-1, self.dims))
-        return self._write(
-            tensordict,
-            mean.index_copy(-1, self.dims, reading.to(mean.dtype)),
-            prior_std.index_copy(-1, self.dims, std.to(mean.dtype)),
-        )
+        center = mean.index_copy(-1, self.dims, reading.to(mean.dtype))
+        return self._members(center, prior_std.index_copy(-1, self.dims, std.to(mean.dtype)), noise, batch_size)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import as_floating
 
 __all__ = ["MemberGain"]
 
@@ -52,7 +53,7 @@ class MemberGain(SubModel):
         out_key: NestedKey | None = None,
     ):
         super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
-        std = torch.as_tensor(std, dtype=torch.get_default_dtype())
+        std = as_floating(std)
         if std.ndim != 1 or not (std > 0).all():
             raise ValueError(f"MemberGain needs one positive standard deviation a dimension; got {std}.")
         self.log_std = nn.Parameter(std.log())
@@ -63,14 +64,11 @@ class MemberGain(SubModel):
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the samples."""
-        samples = self.read(tensordict, self.in_keys[0])
+    def compute(self, samples):
+        """The samples, each with its member's gain."""
         if samples.shape[-2:] != self.quantiles.shape:
             raise ValueError(
                 f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}]; "
                 f"{self.in_keys[0]!r} has shape {list(samples.shape)}."
             )
-        return tensordict.set(self.out_keys[0], samples * (self.log_std.exp() * self.quantiles).exp())
+        return samples * (self.log_std.exp() * self.quantiles).exp()

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import kalman_update
-from torch_denkf.functional.unscented import wrap_angles
+from torch_denkf.functional import kalman_update, wrap_angles
+from torch_denkf.modules._base import Call, Entries, reads
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
@@ -67,11 +67,12 @@ class EKFTransition(GaussianTransition):
         )
         self.stop_jacobian_gradient = stop_jacobian_gradient
 
-    def _forecast(self, tensordict, mean, cov):
-        def move(rows, states):
-            return self._move(rows, states), None
+    def _forecast(self, entries, mean, cov, call):
+        def move(rows, states, call):
+            return self._move(rows, states, call), None
 
-        forecast, jacobian, _ = _linearise(move, tensordict, mean, mean.shape[-1])
+        entries = _needed(self, entries)
+        forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
         cov = jacobian @ cov @ jacobian.mT
@@ -111,17 +112,26 @@ class EKFAnalysis(GaussianAnalysis):
         tensor([0.0000, 0.5000])
     """
 
-    def _update(self, tensordict, mean, cov, observation, noise):
-        predicted, jacobian, observed = _linearise(self._observe, tensordict, mean, observation.shape[-1])
+    def _update(self, entries, mean, cov, observation, noise, call):
+        entries, size = _needed(self, entries), observation.shape[-1]
+        predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
         innovation = wrap_angles(observation - predicted, self.angles)
         # In deviations from the mean: H m would cost digits where the state is far from zero.
         update = kalman_update(torch.zeros_like(mean), cov, innovation, jacobian, noise, observed=observed)
         return update._replace(mean=mean + update.mean), observed
 
 
+def _needed(module, entries: Entries) -> Entries:
+    """What the model inside reads, and the mask."""
+    needed, optional = reads(module.module)
+    keys = dict.fromkeys([*needed, *optional, getattr(module, "observed_key", None)])
+    return {key: entries[key] for key in keys if key in entries}
+
+
 def _linearise(
-    model: Callable[[TensorDictBase, Tensor], tuple[Tensor, Tensor | None]],
-    tensordict: TensorDictBase,
+    model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
+    entries: Entries,
+    call: Call,
     mean: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -129,29 +139,36 @@ def _linearise(
 
     The model runs on N copies of the batch, and one backward pass goes from the n-th output of the n-th copy. This
     takes a quarter of the time of torch.func's forward mode, whose Python formulas dominate in small systems, and
-    maps over no dimension that the model could not know. Both results can be differentiated.
+    maps over no dimension that the model could not know. A compiled graph has no Python to save: there the model runs
+    once, and the backward passes are mapped over, which takes half the products. Both results can be differentiated.
 
     Args:
-        model: from a tensordict ``[N, *B]``, which it may change, and an ensemble ``[N, *B, 1, S]`` to images
-            ``[N, *B, 1, N]`` and a mask.
-        tensordict: what the model may read, ``[*B]``; left as it is.
+        model: from entries and an ensemble ``[*, 1, S]`` to images ``[*, 1, N]`` and a mask, with ``*`` any batch.
+        entries: what the model may read, ``[*B]``.
+        call: how it is called.
         mean: where.
         size: N, the dimension of the images.
 
     Returns:
         The image ``[*B, N]``, the Jacobian ``[*B, N, S]``, and the mask.
     """
-    rows = tensordict.expand(size, *tensordict.batch_size)
+    copies = () if torch.compiler.is_compiling() else (size,)
+    rows = {key: value.expand(*copies, *value.shape) for key, value in entries.items()}
+    call = call._replace(batch_size=torch.Size((*copies, *call.batch_size)))
 
     def run(states: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        images, mask = model(rows.copy(), states)
+        images, mask = model(rows, states, call)
         if images.shape[-1] != size:
             raise ValueError(f"the model of {mean.shape[-1]} states gives {images.shape[-1]} numbers; {size} are due.")
         return images, () if mask is None else (mask,)
 
-    states = mean.unsqueeze(-2).expand(size, *mean.shape[:-1], 1, mean.shape[-1])
-    images, pull_back, masks = torch.func.vjp(run, states, has_aux=True)
-    basis = torch.eye(size, dtype=images.dtype, device=images.device)
-    (jacobian,) = pull_back(basis.reshape(size, *[1] * mean.ndim, size).expand_as(images))
-    mask = masks[0][0] if masks else None
-    return images[0].squeeze(-2), jacobian.squeeze(-2).movedim(0, -2), mask
+    states = mean.unsqueeze(-2).expand(*copies, *mean.shape[:-1], 1, mean.shape[-1])
+    result = torch.func.vjp(run, states, has_aux=True)
+    images, pull_back, masks = result  # type: ignore[misc]  # torch does not say that has_aux makes it three
+    basis = torch.eye(size, dtype=images.dtype, device=images.device).reshape(size, *[1] * mean.ndim, size)
+    if copies:
+        (jacobian,) = pull_back(basis.expand_as(images))
+        images, masks = images[0], tuple(mask[0] for mask in masks)
+    else:
+        (jacobian,) = torch.func.vmap(pull_back)(basis.expand(size, *images.shape))
+    return images.squeeze(-2), jacobian.squeeze(-2).movedim(0, -2), masks[0] if masks else None

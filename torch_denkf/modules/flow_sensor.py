@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules.sensor import StochasticSensor
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
 
@@ -28,6 +28,11 @@ class _MotionTrunk(nn.Module):
     which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a network
     trusts that more, as on an empty motorway.
     """
+
+    distances: torch.Tensor
+    pitches: torch.Tensor
+    flow_grid: torch.Tensor
+    road_grid: torch.Tensor
 
     def __init__(self, features: int, dropout: float):
         super().__init__()
@@ -81,7 +86,7 @@ class _MotionTrunk(nn.Module):
         return moved, turned, torch.cat([code, torch.stack(facts, 1)], 1)
 
 
-class FlowSensor(SubModel):
+class FlowSensor(StochasticSensor):
     """Speed and turn rate of a car from optical flow and the road's correlation, for each ensemble member.
 
     Geometry gives a first reading: the distance at which the road of two frames agrees, for the camera's pitch that the
@@ -104,7 +109,6 @@ class FlowSensor(SubModel):
         encoding_key: where to write what the head reads, ``[*B, encoding_features]``; the noise model can tell a
             blurred frame from a sharp one by it. None for nowhere.
         observed_key: optional mask ``[*B, 1]``; frames that are not observed are not read.
-        noise_key: optional noise (see :class:`StochasticMLP`).
 
     Raises:
         ValueError: if an input does not have the shape above.
@@ -137,7 +141,6 @@ class FlowSensor(SubModel):
         out_key: NestedKey = ("sensor", "ensemble"),
         encoding_key: NestedKey | None = ("sensor", "encoding"),
         observed_key: NestedKey = "observed",
-        noise_key: NestedKey = ("noise", "sensor"),
     ):
         trunk = _MotionTrunk(features, trunk_dropout)
         head = StochasticMLP(trunk.out_features, 2, num_cells, layer=layer, rate=rate, output_gain=0.1)
@@ -146,50 +149,35 @@ class FlowSensor(SubModel):
             in_keys,
             [out_key] if encoding_key is None else [out_key, encoding_key],
             optional_keys=[observed_key],
-            noise_key=noise_key,
         )
         self.dt, self.ensemble_size, self.encoding_features = float(dt), ensemble_size, trunk.out_features
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        """Draws the head's noise for ``[*batch_size, E]`` rows."""
-        return self.module["head"].draw_noise(
-            batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator
-        )
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the learned observations of every member."""
-        flow, road = (self._read_frames(tensordict, *pair) for pair in zip(self.in_keys, (3, 2), strict=True))
-        batch_size, head = tensordict.batch_size, self.module["head"]
+    def compute(self, flow, road, observed=None, *, noise, batch_size):
+        """The learned observations of every member, and the encoding if it is asked for."""
+        flow, road = self._frames(flow, 0, observed, batch_size), self._frames(road, 1, observed, batch_size)
         moved, turned, encoding = self.module["trunk"](flow, road)
-        encoding = encoding.reshape(*batch_size, -1)
-        noise = self.read_noise(tensordict)
-        if noise is None and head.sample:
-            noise = self.draw_noise(batch_size, device=encoding.device, dtype=encoding.dtype)
-        correction = head(encoding.unsqueeze(-2), noise)
+        encoding = encoding.reshape(*batch_size, encoding.shape[-1])
+        correction = self.module["head"](encoding.unsqueeze(-2), noise, sample=noise is not None)
         moved, turned = (value.reshape(*batch_size, 1) for value in (moved, turned))
         distance = moved * (1 + correction[..., 0].tanh())
         angle = turned + _TURN_UNIT * correction[..., 1]
-        samples = torch.stack([distance, angle], -1) / self.dt
-        tensordict.set(self.out_keys[0], samples.expand(*batch_size, self.ensemble_size, -1))
-        if len(self.out_keys) > 1:
-            tensordict.set(self.out_keys[1], encoding)
-        return tensordict
+        samples = (torch.stack([distance, angle], -1) / self.dt).expand(*batch_size, self.ensemble_size, 2)
+        return (samples, encoding) if len(self.out_keys) > 1 else samples
 
-    def _read_frames(self, tensordict: TensorDictBase, key: NestedKey, event_ndim: int) -> torch.Tensor:
-        value = self.read(tensordict, key)
-        expected = FLOW_SHAPE if event_ndim == 3 else ROAD_SHAPE
-        if tuple(value.shape) != (*tensordict.batch_size, *expected):
+    def _frames(self, value: torch.Tensor, index: int, observed: torch.Tensor | None, batch_size) -> torch.Tensor:
+        """An input as ``[N, *event]``; zeros where nothing was observed."""
+        expected = (FLOW_SHAPE, ROAD_SHAPE)[index]
+        if tuple(value.shape) != (*batch_size, *expected):
             raise ValueError(
-                f"FlowSensor reads {key!r} of shape [*B, {', '.join(map(str, expected))}], got {list(value.shape)} in "
-                f"a batch {list(tensordict.batch_size)}. OpticalFlow and with_motion write it."
+                f"FlowSensor reads {self.in_keys[index]!r} of shape [*B, {', '.join(map(str, expected))}], got "
+                f"{list(value.shape)} in a batch {list(batch_size)}. OpticalFlow and with_motion write it."
             )
         value = value.to(self.module["trunk"].distances.dtype)
-        observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
             # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
-            seen = observed.any(-1).reshape(*tensordict.batch_size, *(1,) * event_ndim)
+            seen = observed.any(-1).reshape(*batch_size, *(1,) * len(expected))
             value = torch.where(seen, value, 0.0)
-        return value.reshape(-1, *expected)
+        return value.reshape(batch_size.numel(), *expected)
 
 
 def _grid(height: int, width: int) -> torch.Tensor:

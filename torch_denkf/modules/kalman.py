@@ -5,28 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional import kalman_predict, kalman_update
-from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._gaussian import as_covariance, further_keys, write_update
+from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
+from torch_denkf.modules._base import SubModel, run_module
+from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules._tensors import as_floating, register_constant
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
-
-
-def _matrix(value) -> torch.Tensor:
-    return torch.as_tensor(value, dtype=torch.get_default_dtype())
-
-
-def _keep(module: nn.Module, name: str, value, trainable: bool) -> None:
-    """Registers a matrix as a parameter or as a buffer; ``None`` as a buffer."""
-    value = None if value is None else _matrix(value)
-    if trainable and value is not None:
-        module.register_parameter(name, nn.Parameter(value.clone()))
-    else:
-        module.register_buffer(name, value)
 
 
 class MomentPrior(SubModel):
@@ -45,14 +33,14 @@ class MomentPrior(SubModel):
 
     def __init__(self, mean: torch.Tensor, cov: torch.Tensor, *, belief_key: str = "belief"):
         super().__init__(nn.Identity(), [], [(belief_key, name) for name in ("mean", "cov", "var")])
-        self.register_buffer("mean", _matrix(mean))
-        self.register_buffer("cov", _matrix(cov))
+        register_constant(self, "mean", mean)
+        register_constant(self, "cov", cov)
+        self.state_dim = self.mean.numel()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        for key, value in zip(self.out_keys, (self.mean, self.cov, self.cov.diagonal()), strict=True):
-            tensordict.set(key, value.expand(*tensordict.batch_size, *value.shape))
-        return tensordict
+    def compute(self, *, batch_size):
+        """The belief."""
+        values = (self.mean, self.cov, self.cov.diagonal())
+        return tuple(value.expand(*batch_size, *value.shape) for value in values)
 
 
 class GaussianAround(SubModel):
@@ -81,19 +69,17 @@ class GaussianAround(SubModel):
         self, std: Sequence[float] | torch.Tensor, *, state_key: NestedKey = "state", belief_key: str = "belief"
     ):
         super().__init__(nn.Identity(), [state_key], [(belief_key, name) for name in ("mean", "cov", "var")])
-        std = _matrix(std)
+        std = as_floating(std)
         if std.ndim != 1 or not (std >= 0).all():
             raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
         self.register_buffer("std", std)
         self.state_dim = std.numel()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        mean = self.read(tensordict, self.in_keys[0]).to(self.std.dtype)
+    def compute(self, state):
+        """The belief."""
+        mean = state.to(self.std.dtype)
         variance = self.std.square().expand_as(mean)
-        for key, value in zip(self.out_keys, (mean, variance.diag_embed(), variance), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return mean, variance.diag_embed(), variance
 
 
 class LinearTransition(SubModel):
@@ -115,6 +101,8 @@ class LinearTransition(SubModel):
         tensor([[5.]])
     """
 
+    noise: torch.Tensor | TensorDictModuleBase
+
     def __init__(
         self,
         matrix: torch.Tensor,
@@ -127,36 +115,35 @@ class LinearTransition(SubModel):
         forecast_key: str = "forecast",
     ):
         in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_key, forecast_key))
-        is_module = isinstance(noise, nn.Module)
         in_keys += [] if control is None else [action_key]
-        in_keys += further_keys([noise], [*in_keys, *out_keys]) if is_module else []
-        super().__init__(nn.Identity(), in_keys, out_keys)
-        self.action_key = action_key
-        _keep(self, "matrix", matrix, trainable)
-        _keep(self, "control", control, trainable)
-        if is_module:
+        modules = [noise] if isinstance(noise, nn.Module) else []
+        further, optional = further_keys(modules, [*in_keys, *out_keys])
+        super().__init__(nn.Identity(), in_keys + further, out_keys, optional_keys=optional)
+        self.action_key = unravel_key(action_key)
+        register_constant(self, "matrix", matrix, trainable=trainable)
+        register_constant(self, "control", control, trainable=trainable)
+        if isinstance(noise, nn.Module):
             self.noise = noise
         else:
-            self.register_buffer("noise", _matrix(noise))
+            register_constant(self, "noise", noise)
 
-    runs_on_rows = True
+    def parts(self):
+        """The noise, if it is a module."""
+        return {"noise": self.noise} if isinstance(self.noise, nn.Module) else {}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast."""
-        mean, cov = (self.read(tensordict, key) for key in self.in_keys[:2])
+    def on_entries(self, entries, call):
+        """The forecast."""
+        mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         noise = self.noise
-        if isinstance(noise, nn.Module):
-            # Added below, because it may read the forecast's mean.
-            forecast, forecast_cov = kalman_predict(mean, cov, self.matrix, torch.zeros_like(cov))
-        else:
-            forecast, forecast_cov = kalman_predict(mean, cov, self.matrix, noise)
+        constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
+        # A module's is added below, because it may read the forecast's mean.
+        forecast, forecast_cov = kalman_predict(mean, cov, self.matrix, constant)
         if self.control is not None:
-            forecast = forecast + self.read(tensordict, self.action_key).to(mean.dtype) @ self.control.mT
-        if isinstance(noise, nn.Module):
-            work = noise(tensordict.copy().set(self.out_keys[0], forecast))
-            forecast_cov = forecast_cov + as_covariance(self.read(work, noise.out_keys[0]), mean)
-        tensordict.set(self.out_keys[0], forecast)
-        return tensordict.set(self.out_keys[1], forecast_cov)
+            forecast = forecast + self.required(entries, self.action_key).to(mean.dtype) @ self.control.mT
+        if not isinstance(noise, torch.Tensor):
+            written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
+            forecast_cov = forecast_cov + as_covariance(written[unravel_key(noise.out_keys[0])], mean)
+        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
 
 
 class KalmanAnalysis(SubModel):
@@ -168,6 +155,7 @@ class KalmanAnalysis(SubModel):
         trainable: whether H is a parameter.
         inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
             observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
+        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
@@ -192,6 +180,7 @@ class KalmanAnalysis(SubModel):
         *,
         trainable: bool = False,
         inflation: float = 1.0,
+        angles: Sequence[int] = (),
         observation_key: NestedKey = "observation",
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
@@ -207,23 +196,28 @@ class KalmanAnalysis(SubModel):
             + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
             optional_keys=[observed_key],
         )
-        self.inflation = inflation
-        _keep(self, "matrix", matrix, trainable)
-        self.register_buffer("noise", None if noise is None else _matrix(noise))
+        self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
+        register_constant(self, "matrix", matrix, trainable=trainable)
+        register_constant(self, "noise", noise)
+        self.reading_keys = self.in_keys[2:]
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""
         return state @ self.matrix.mT
 
-    runs_on_rows = True
+    def without_reading(self, mean, cov, *_):
+        """The belief where there is no reading: the forecast; innovation and its kin are zero."""
+        zero = mean.new_zeros(*mean.shape[:-1], self.matrix.shape[0])
+        return mean, cov, cov.diagonal(dim1=-2, dim2=-1), zero, zero[..., :1], zero[..., :1]
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and the diagnostics."""
-        mean, cov, observation, *noise = (self.read(tensordict, key) for key in self.in_keys)
-        noise = noise[0] if noise else self.noise.expand(*tensordict.batch_size, *self.noise.shape)
+    def compute(self, mean, cov, observation, *rest):
+        """The belief and the diagnostics."""
+        *noise, observed = rest
+        noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:
-            observation = observation.mean(-2)
-        observed = tensordict.get(self.optional_keys[0], None)
+            observation = mean_observation(observation, self.angles)
+        if self.angles:  # the same turn as the prediction
+            predicted = self.observe(mean)
+            observation = predicted + wrap_angles(observation - predicted, self.angles)
         update = kalman_update(mean, cov, observation, self.matrix, noise, observed=observed)
-        write_update(self, tensordict, update, observed, self.inflation)
-        return tensordict
+        return updated(update, observed, self.inflation)

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf.functional import mean_observation, wrap_angles
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import as_floating, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
@@ -27,6 +29,7 @@ class GaussianLikelihood(SubModel):
     Dimensions that are not observed drop out; where nothing is observed it is zero for all particles.
 
     Args:
+        angles: components of the observation that are angles in radians.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: variances ``[*B, O]``, the diagonal of R.
@@ -50,6 +53,7 @@ class GaussianLikelihood(SubModel):
     def __init__(
         self,
         *,
+        angles: Sequence[int] = (),
         predicted_key: NestedKey = ("forecast", "observation"),
         sensor_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
@@ -60,26 +64,32 @@ class GaussianLikelihood(SubModel):
             nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
 
-    runs_on_rows = True
+        self.angles = list(angles)
+        self.reading_keys = self.in_keys[1:]
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the log-likelihoods."""
-        predicted, reading, variance = (self.read(tensordict, key) for key in self.in_keys)
-        if variance.ndim > tensordict.ndim + 1:
+    def without_reading(self, predicted, *_):
+        """The log-likelihoods where there is no reading: zero."""
+        return torch.zeros_like(predicted[..., 0])
+
+    def compute(self, predicted, reading, variance, observed=None, *, batch_size):
+        """The log-likelihoods."""
+        if variance.ndim > len(batch_size) + 1:
             raise ValueError(
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
-        reading, variance = _mean_of_members(reading, tensordict).unsqueeze(-2), variance.unsqueeze(-2)
-        observed = tensordict.get(self.optional_keys[0], None)
+        if reading.ndim > len(batch_size) + 1:
+            reading = mean_observation(reading, self.angles)
+        reading, variance = reading.unsqueeze(-2), variance.unsqueeze(-2)
         if observed is not None:
             # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
             observed = observed.unsqueeze(-2)
             reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
-        terms = -0.5 * ((reading - predicted).square() / variance + variance.log() + math.log(2 * math.pi))
+        residual = wrap_angles(reading - predicted, self.angles)
+        terms = -0.5 * (residual.square() / variance + variance.log() + math.log(2 * math.pi))
         if observed is not None:
             terms = torch.where(observed, terms, 0.0)
-        return tensordict.set(self.out_keys[0], terms.sum(-1))
+        return terms.sum(-1)
 
 
 class LearnedLikelihood(SubModel):
@@ -108,6 +118,7 @@ class LearnedLikelihood(SubModel):
         loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``reading_key``.
         scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``reading_key`` what a good
             reading errs by; one by default.
+        angles: components of the observation that are angles in radians; with a ``reading_key``.
         network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
@@ -119,7 +130,7 @@ class LearnedLikelihood(SubModel):
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
     Raises:
-        ValueError: on an unknown ``bound``, or with both ``loc`` and ``reading_key``.
+        ValueError: on an unknown ``bound``, with both ``loc`` and ``reading_key``, or with angles and no ``reading_key``.
         KeyError: if an entry is missing.
 
     Reference:
@@ -143,6 +154,7 @@ class LearnedLikelihood(SubModel):
         bound: Literal["scaled", "clipped"] = "scaled",
         loc: Sequence[float] | torch.Tensor | None = None,
         scale: Sequence[float] | torch.Tensor | None = None,
+        angles: Sequence[int] = (),
         network: nn.Module | None = None,
         encoding_key: NestedKey = ("sensor", "encoding"),
         reading_key: NestedKey | None = None,
@@ -154,27 +166,35 @@ class LearnedLikelihood(SubModel):
             raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
         if loc is not None and reading_key is not None:
             raise ValueError("with a reading_key the network sees the innovation, which has no loc; pass scale alone.")
+        if angles and reading_key is None:
+            raise ValueError("angles are those of an innovation, which needs a reading_key.")
         if network is None:
             network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
         in_keys = [key for key in (encoding_key, predicted_key, reading_key) if key is not None]
         super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
         self.bound, self.observation_dim = bound, observation_dim
-        dtype = torch.get_default_dtype()
+        self.angles = list(angles)
+        self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
-            value = torch.as_tensor(default if value is None else value, dtype=dtype)
+            value = as_floating(default if value is None else value)
             self.register_buffer(name, value.expand(observation_dim).clone())
 
-    runs_on_rows = True
+    def without_reading(self, encoding, predicted, *_):
+        """The log-likelihoods where there is no reading: zero."""
+        return torch.zeros_like(predicted[..., 0])
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the log-likelihoods."""
-        encoding, predicted, *readings = (self.read(tensordict, key) for key in self.in_keys)
-        encoding = _mean_of_members(encoding, tensordict)
+    def compute(self, encoding, predicted, *rest, batch_size):
+        """The log-likelihoods."""
+        *readings, observed = rest
+        encoding = mean_of_members(encoding, batch_size)
         if readings:
-            seen = (_mean_of_members(readings[0], tensordict).unsqueeze(-2) - predicted) / self.scale
+            (reading,) = readings
+            if reading.ndim > len(batch_size) + 1:
+                reading = mean_observation(reading, self.angles)
+            innovation = reading.unsqueeze(-2) - predicted
+            seen = wrap_angles(innovation, self.angles) / self.scale
         else:
             seen = (predicted - self.loc) / self.scale
-        observed = tensordict.get(self.optional_keys[0], None)
         if observed is not None:
             any_observed = observed.any(-1, keepdim=True)
             encoding = torch.where(any_observed, encoding, 0.0)
@@ -187,10 +207,4 @@ class LearnedLikelihood(SubModel):
             value = (_SMALLEST_LIKELIHOOD + (1 - _SMALLEST_LIKELIHOOD) * value.sigmoid()).log()
         else:
             value = nn.functional.logsigmoid(value).clamp(min=_SMALLEST_LOG_LIKELIHOOD)
-        if observed is not None:
-            value = torch.where(any_observed, value, 0.0)
-        return tensordict.set(self.out_keys[0], value)
-
-
-def _mean_of_members(value: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
-    return value.mean(-2) if value.ndim > tensordict.ndim + 1 else value
+        return value if observed is None else torch.where(any_observed, value, 0.0)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional import (
     Neighbours,
+    align_angles,
     ensemble_mean,
     ensemble_var,
     letkf,
@@ -40,7 +42,7 @@ class LocalEnsembleAnalysis(SubModel):
             is observed are not rotated.
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch, with L
             neighbours.
-        ensemble_size: E, needed only to draw rotations for a whole sequence in bulk; a filter sets it.
+        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         forecast_key: forecast ensemble ``[*B, E, S]``.
         predicted_key: predicted observations ``[*B, E, O]``.
         sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is taken.
@@ -52,7 +54,6 @@ class LocalEnsembleAnalysis(SubModel):
             The last two take each observation by itself, with the variance of its own forecast plus R: the
             correlations that E members show between observations are what localisation does not believe. The
             expectation of ``nis`` is the number of observations, if the filter is consistent.
-        noise_key: optional rotations ``[*B, E, E]``.
 
     Raises:
         ValueError: if a taper is not a matrix, or the sizes do not fit.
@@ -81,7 +82,7 @@ class LocalEnsembleAnalysis(SubModel):
         relaxation: float = 0.0,
         rotate: bool = False,
         tile: int = 4096,
-        ensemble_size: int | None = None,
+        angles: Sequence[int] = (),
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         sensor_key: NestedKey = ("sensor", "ensemble"),
@@ -89,7 +90,6 @@ class LocalEnsembleAnalysis(SubModel):
         observed_key: NestedKey = "observed",
         belief_key: str = "belief",
         info_key: str = "info",
-        noise_key: NestedKey = ("noise", "analysis"),
     ):
         super().__init__(
             nn.Identity(),
@@ -97,14 +97,13 @@ class LocalEnsembleAnalysis(SubModel):
             [(belief_key, name) for name in ("ensemble", "mean", "var")]
             + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
             optional_keys=[observed_key],
-            noise_key=noise_key,
         )
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.inflation, self.relaxation, self.rotate, self.tile = inflation, relaxation, rotate, tile
-        self.ensemble_size = ensemble_size
+        self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
 
     @classmethod
     def around(
@@ -131,29 +130,37 @@ class LocalEnsembleAnalysis(SubModel):
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        """Draws rotations; ``None`` without, or where E is unknown."""
-        if not self.rotate or self.ensemble_size is None:
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Rotations, if any."""
+        return ("",) if self.rotate else ()
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws rotations ``[*B, E, E]``; ``None`` without, or where E is not known."""
+        if not self.rotate or members is None:
             return None
-        return random_rotation(self.ensemble_size, tuple(batch_size), device=device, dtype=dtype, generator=generator)
+        return random_rotation(members, tuple(batch_size), device=device, dtype=dtype, generator=generator)
 
-    runs_on_rows = True
+    def noise_sizes(self, forecast, *_):
+        """E, from the ensemble."""
+        return {"members": forecast.shape[-2]}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and the diagnostics."""
-        forecast, predicted, observation, variance = (self.read(tensordict, key) for key in self.in_keys)
-        observed = tensordict.get(self.optional_keys[0], None)
+    def without_reading(self, forecast, predicted, *_):
+        """The belief where there is no reading: the forecast."""
+        unseen = torch.zeros_like(predicted[..., 0, :1], dtype=torch.bool)
+        ones = torch.ones_like(predicted[..., 0, :])
+        return self.compute(forecast, predicted, torch.zeros_like(ones), ones, unseen, noise=None)
+
+    def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
+        """The belief and the diagnostics."""
+        predicted, observation = align_angles(predicted, observation, self.angles, observed)
         if observation.ndim == forecast.ndim:
             observation = observation.mean(-2)
         near = Neighbours(self.index, self.taper)
         ensemble = letkf(forecast, predicted, observation, variance, near, observed=observed, tile=self.tile)
-        if self.rotate:
-            rotation = self.read_noise(tensordict)
-            if rotation is None:
-                options = {"device": forecast.device, "dtype": forecast.dtype}
-                rotation = random_rotation(forecast.shape[-2], forecast.shape[:-2], **options)
+        if noise is not None:
             mean = ensemble.mean(-2, keepdim=True)
-            ensemble = mean + rotation @ (ensemble - mean)
+            ensemble = mean + noise @ (ensemble - mean)
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
@@ -163,10 +170,7 @@ class LocalEnsembleAnalysis(SubModel):
         if observed is not None:
             ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
         diagnostics = _diagnostics(predicted, observation, variance, observed)
-        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics)
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
         """Whether anything is observed near each component, ``[S]`` or ``[*B, S]``."""

@@ -1,40 +1,44 @@
-r"""Learned Gaussian motion noise of an ensemble, where the transition has none or too little of its own."""
+r"""Process noise of an ensemble, where the transition has none or too little of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional import weighted_mean
-from torch_denkf.modules._base import SubModel
+from torch_denkf.functional import semidefinite_root, weighted_mean
+from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
 
 __all__ = ["NoisyTransition"]
 
 
 class NoisyTransition(SubModel):
-    r"""A transition with learned Gaussian motion noise :math:`N(0, Q)` in some dimensions of the state.
+    r"""A transition with Gaussian process noise :math:`N(0, Q)` in some or all dimensions of the state.
+
+    An ensemble without process noise collapses: its members come together, and its intervals become too narrow. Where
+    the transition has no noise of its own, or too little, this adds it; Q is written by the same modules as in a filter
+    with a covariance.
 
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
             kept.
-        noise: writes the diagonal of Q, variances ``[*B, len(dims)]``, e.g.
-            ``DiagonalNoise(2, in_features=5, in_key=("belief", "mean"))`` or ``ConstantNoise``. It may read the
-            belief's weighted mean at ``mean_key``, which is worked out for it.
-        dims: state dimensions that the noise acts on, in the order of Q.
+        noise: writes Q: variances ``[*B, N]`` or a covariance ``[*B, N, N]``, with N the number of ``dims``, e.g.
+            ``ConstantNoise([0.1, 0.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))`` or a module of
+            :mod:`torch_denkf.modules.process_noise`. It may read the belief's (weighted) mean at ``mean_key`` and,
+            unless ``before``, the forecast's at ``forecast_mean_key``, which are worked out for it.
+        dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
         before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
             their noise, such as the pose of a :class:`torch_denkf.modules.UnicycleTransition` with its velocities.
-        ensemble_size: E, needed only to draw noise for a whole sequence in bulk; a filter sets it.
         mean_key: the belief's mean ``[*B, S]``.
+        forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
-        noise_key: optional standard-normal noise ``[*B, E, len(dims)]``.
 
     Raises:
         KeyError: if an entry is missing.
-        ValueError: if ``noise`` does not write one variance for each of ``dims``.
+        ValueError: if ``noise`` does not write one variance for each dimension.
 
     Reference:
         Learned motion noise of a particle filter: Jonschkowski, Rastogi & Brock 2018, arXiv:1805.11122 (there a
@@ -50,66 +54,81 @@ class NoisyTransition(SubModel):
         tensor([False,  True])
     """
 
+    noise_names = ("",)
+
     def __init__(
         self,
-        transition: SubModel,
+        transition: TensorDictModuleBase,
         noise: TensorDictModuleBase,
-        dims: Sequence[int],
+        dims: Sequence[int] | None = None,
         *,
         before: bool = False,
-        ensemble_size: int | None = None,
         mean_key: NestedKey = ("belief", "mean"),
+        forecast_mean_key: NestedKey = ("forecast", "mean"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
-        noise_key: NestedKey = ("noise", "motion"),
     ):
-        self_made = {unravel_key(mean_key)}
-        keys = dict.fromkeys(map(unravel_key, [*transition.in_keys, *noise.in_keys]))
+        self_made = {unravel_key(mean_key), unravel_key(forecast_mean_key)}
+        needed, optional = reads(transition)
+        of_noise, of_noise_optional = reads(noise)
         super().__init__(
             nn.ModuleDict({"transition": transition, "noise": noise}),
-            [key for key in keys if key not in self_made],
+            list(dict.fromkeys([*needed, *(key for key in of_noise if key not in self_made)])),
             transition.out_keys,
-            optional_keys=[log_weight_key],
-            noise_key=noise_key,
+            optional_keys=[log_weight_key, *optional, *of_noise_optional],
         )
-        self.before, self.mean_key, self.ensemble_size = before, mean_key, ensemble_size
-        self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
+        self.log_weight_key = unravel_key(log_weight_key)
+        self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
+        self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        """Draws standard-normal values ``[*batch_size, E, len(dims)]``; needs ``ensemble_size``."""
-        if self.ensemble_size is None:
+    def draw_noise(
+        self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_
+    ):
+        """Draws standard-normal values ``[*batch_size, E, N]``; ``None`` where E or the state's size is not known."""
+        size = state_dim if self.dims is None else len(self.dims)
+        if members is None or size is None:
             return None
-        shape = (*batch_size, self.ensemble_size, len(self.dims))
+        shape = (*batch_size, members, size)
         return torch.randn(shape, device=device, dtype=dtype, generator=generator)
 
-    runs_on_rows = True
+    def parts(self):
+        """The transition and the noise module."""
+        return dict(self.module.items())
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast ensemble."""
-        key, out_key = self.in_keys[0], self.out_keys[0]
-        state = self.read(tensordict, key)
-        work = tensordict.copy().set(self.mean_key, self._mean(state, tensordict))
-        noise_model = self.module["noise"]
-        variance = noise_model(work).get(noise_model.out_keys[0])
-        if variance.shape[-1] != len(self.dims):
-            raise ValueError(
-                f"The noise model writes {variance.shape[-1]} variances in {noise_model.out_keys[0]!r} for "
-                f"{len(self.dims)} dims; give it an output for each of dims={self.dims.tolist()}."
-            )
-        normal = self.read_noise(tensordict)
-        if normal is None:
-            normal = torch.randn((*state.shape[:-1], len(self.dims)), device=state.device, dtype=state.dtype)
-        noise = variance.sqrt().unsqueeze(-2) * normal
+    def on_entries(self, entries, call):
+        """The forecast ensemble, and whatever else the transition writes."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state, entries = self.required(entries, key), dict(entries)
+        log_weights = entries.get(self.log_weight_key)
+        entries[self.mean_key] = state.mean(-2) if log_weights is None else weighted_mean(state, log_weights)
         if self.before:
-            work.set(key, state.index_add(-1, self.dims, noise))
-            return self._hand_over(self.module["transition"](work), tensordict)
-        tensordict = self._hand_over(self.module["transition"](work.set(key, state)), tensordict)
-        return tensordict.set(out_key, tensordict.get(out_key).index_add(-1, self.dims, noise))
+            entries[key] = self._add(state, entries, call)
+        written = run_module(self.module["transition"], entries, call.part("transition"))
+        if not self.before:
+            moved = written[out_key]
+            mean = moved.mean(-2) if log_weights is None else weighted_mean(moved, log_weights)
+            entries[self.forecast_mean_key] = mean
+            written = {**written, out_key: self._add(moved, entries, call)}
+        return written
 
-    def _mean(self, state: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor:
-        log_weights = tensordict.get(self.optional_keys[0], None)
-        return state.mean(-2) if log_weights is None else weighted_mean(state, log_weights)
-
-    def _hand_over(self, source: TensorDictBase, target: TensorDictBase) -> TensorDictBase:
-        for key in self.out_keys:
-            target.set(key, source.get(key))
-        return target
+    def _add(self, ensemble: torch.Tensor, entries: Entries, call: Call) -> torch.Tensor:
+        """The ensemble with process noise."""
+        model = self.module["noise"]
+        covariance = run_module(model, entries, call.part("noise"))[unravel_key(model.out_keys[0])]
+        size = ensemble.shape[-1] if self.dims is None else len(self.dims)
+        if covariance.shape[-1] != size:
+            dims = "all" if self.dims is None else self.dims.tolist()
+            raise ValueError(
+                f"The noise model writes {covariance.shape[-1]} variances in {model.out_keys[0]!r} for {size} dims; "
+                f"give it an output for each of dims={dims}."
+            )
+        if not call.sample:
+            return ensemble
+        normal = entries.get(("noise", call.place))
+        if normal is None:
+            normal = torch.randn((*ensemble.shape[:-1], size), device=ensemble.device, dtype=ensemble.dtype)
+        normal = normal[..., :size]  # drawn for a state that has more dimensions than this transition's part of it
+        if covariance.ndim == len(call.batch_size) + 1:
+            noise = covariance.sqrt().unsqueeze(-2) * normal
+        else:
+            noise = normal @ semidefinite_root(covariance).mT
+        return ensemble + noise if self.dims is None else ensemble.index_add(-1, self.dims, noise)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise"]
@@ -64,9 +65,8 @@ class DiagonalNoise(SubModel):
         network = StochasticMLP(in_features, observation_dim, num_cells, layer="none", output_gain=0.0)
         super().__init__(network, [in_key], [out_key])
         self.observation_dim = observation_dim
-        dtype = torch.get_default_dtype()
-        variance = torch.as_tensor(r, dtype=dtype).expand(observation_dim) ** 2
-        floor = 0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(observation_dim)
+        variance = as_floating(r).expand(observation_dim) ** 2
+        floor = 0.01 * variance if floor is None else as_floating(floor).expand(observation_dim)
         if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
             raise ValueError(
                 f"DiagonalNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
@@ -74,31 +74,27 @@ class DiagonalNoise(SubModel):
             )
         self.register_buffer("variance", (variance - floor).clone())
         self.register_buffer("floor", floor.clone())
-        self.register_buffer("loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype))
-        self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
+        register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
+        register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the variances."""
-        features = self.read(tensordict, self.in_keys[0])
-        if features.ndim > tensordict.ndim + 1:
-            features = features.mean(-2)
-        relative = 1 + self.module((features - self.loc) / self.scale)
-        return tensordict.set(self.out_keys[0], self.variance * relative**2 + self.floor)
+    def compute(self, features, *, batch_size):
+        """The variances."""
+        relative = 1 + self.module((mean_of_members(features, batch_size) - self.loc) / self.scale)
+        return self.variance * relative**2 + self.floor
 
 
 class ConstantNoise(SubModel):
     """A constant diagonal of R, learned or known.
 
     Args:
-        r: standard deviation of each observation dimension ``[O]``, in the observation's units.
+        r: standard deviation of each dimension ``[O]``, in the observation's units; 0 for none, as Q or in a
+            :class:`~torch_denkf.filters.KalmanFilter`: ensembles need R > 0.
         trainable: whether log R is a parameter.
         in_key: any entry of batch shape ``[*B, ...]``, read for its dtype alone.
         out_key: variances ``[*B, O]``.
 
     Raises:
-        ValueError: if ``r`` is not positive.
+        ValueError: if ``r`` is negative, or zero and trainable.
 
     Example:
         >>> from tensordict import TensorDict
@@ -116,9 +112,10 @@ class ConstantNoise(SubModel):
         out_key: NestedKey = ("sensor", "noise"),
     ):
         super().__init__(nn.Identity(), [in_key], [out_key])
-        r = torch.as_tensor(r, dtype=torch.get_default_dtype())
-        if r.ndim != 1 or not (r > 0).all():
-            raise ValueError(f"ConstantNoise needs one positive standard deviation a dimension; got r = {r}.")
+        r = as_floating(r)
+        if r.ndim != 1 or not (r >= 0).all() or (trainable and not (r > 0).all()):
+            what = "positive (it is trainable)" if trainable else "non-negative"
+            raise ValueError(f"ConstantNoise needs one {what} standard deviation a dimension; got r = {r}.")
         self.observation_dim = r.numel()
         log_variance = 2 * r.log()
         if trainable:
@@ -126,13 +123,10 @@ class ConstantNoise(SubModel):
         else:
             self.register_buffer("log_variance", log_variance)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the variances."""
-        like = self.read(tensordict, self.in_keys[0])
+    def compute(self, like, *, batch_size):
+        """The variances."""
         variance = self.log_variance.exp().to(like.dtype if like.is_floating_point() else self.log_variance.dtype)
-        return tensordict.set(self.out_keys[0], variance.expand(*tensordict.batch_size, -1))
+        return variance.expand(*batch_size, -1)
 
 
 class ScaledNoise(SubModel):
@@ -162,12 +156,15 @@ class ScaledNoise(SubModel):
     def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
         if factor < 0:
             raise ValueError(f"ScaledNoise needs a factor that is not negative; got {factor}.")
-        super().__init__(noise, noise.in_keys, noise.out_keys)
+        needed, optional = reads(noise)
+        super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
         self.factor = factor
 
-    runs_on_rows = True
+    def parts(self):
+        """The noise module."""
+        return {"noise": self.module}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the scaled variances or covariance."""
-        out, key = self.module(tensordict), self.out_keys[0]
-        return out.set(key, self.factor**2 * self.read(out, key))
+    def on_entries(self, entries, call):
+        """The scaled variances or covariance."""
+        out, key = run_module(self.module, entries, call.part("noise")), self.out_keys[0]
+        return {**out, key: self.factor**2 * out[key]}

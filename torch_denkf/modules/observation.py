@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._members import MemberNetwork
+from torch_denkf.modules._tensors import register_constant
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
 
@@ -28,18 +30,17 @@ class _Observation(SubModel):
         """Returns :math:`h` of states ``[*, S]``, as ``[*, O]``."""
         return self.module(state)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the predicted observations."""
-        return tensordict.set(self.out_keys[0], self.observe(self.read(tensordict, self.in_keys[0])))
+    def compute(self, ensemble):
+        """The predicted observations."""
+        return self.observe(ensemble)
 
 
-class LearnedObservation(_Observation):
-    """A learned observation model, deterministic as in Table I (``fc`` layers).
+class LearnedObservation(MemberNetwork):
+    """A learned observation model, deterministic as in Table I (``fc`` layers) or stochastic.
 
     Args:
-        network: maps ``[*, S]`` to ``[*, O]``, e.g. ``StochasticMLP(S, O, layer="none")``.
+        network: maps ``[*, S]`` to ``[*, O]``, e.g. ``StochasticMLP(S, O, layer="none")``; a stochastic one draws for
+            each member.
         loc: mean of each state dimension ``[S]``; the network reads standardised states.
         scale: standard deviation of each state dimension ``[S]``.
         in_key: ensemble to observe ``[*B, E, S]``.
@@ -61,18 +62,21 @@ class LearnedObservation(_Observation):
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        super().__init__(network, in_key, out_key)
-        dtype = torch.get_default_dtype()
-        self.register_buffer("loc", None if loc is None else torch.as_tensor(loc, dtype=dtype))
-        self.register_buffer("scale", None if scale is None else torch.as_tensor(scale, dtype=dtype))
+        super().__init__(network, [in_key], [out_key])
+        register_constant(self, "loc", loc)
+        register_constant(self, "scale", scale)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns the network's observation of states ``[*, S]``, as ``[*, O]``."""
+        """Returns the mean network's observation of states ``[*, S]``, as ``[*, O]``."""
+        return self.compute(state, noise=None)
+
+    def compute(self, ensemble, *, noise):
+        """The predicted observations."""
         if self.loc is not None:
-            state = state - self.loc
+            ensemble = ensemble - self.loc
         if self.scale is not None:
-            state = state / self.scale
-        return self.module(state)
+            ensemble = ensemble / self.scale
+        return self._run(ensemble, noise)
 
 
 class Select(_Observation):
@@ -128,7 +132,7 @@ class LinearObservation(_Observation):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(nn.Identity(), in_key, out_key)
-        self.register_buffer("matrix", torch.as_tensor(matrix, dtype=torch.get_default_dtype()))
+        register_constant(self, "matrix", matrix)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""

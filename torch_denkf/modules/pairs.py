@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, reads, run_module
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "WithHistory"]
 
@@ -50,15 +50,20 @@ class WithHistory(SubModel):
     ):
         if lags < 1:
             raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
-        super().__init__(initial, initial.in_keys, [*initial.out_keys, history_key])
-        self.ensemble_key, self.lags = ensemble_key, lags
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, [*initial.out_keys, history_key], optional_keys=optional)
+        self.ensemble_key, self.lags = unravel_key(ensemble_key), lags
         self.ensemble_size, self.state_dim = initial.ensemble_size, 5
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and its history."""
-        tensordict = self.module(tensordict)
-        velocity = self.read(tensordict, self.ensemble_key)[..., 3:]
-        return tensordict.set(self.out_keys[-1], velocity.unsqueeze(-2).repeat_interleave(self.lags, -2))
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief and its history."""
+        written = run_module(self.module, entries, call.part("initial"))
+        velocity = written[self.ensemble_key][..., 3:]
+        return {**written, unravel_key(self.out_keys[-1]): velocity.unsqueeze(-2).repeat_interleave(self.lags, -2)}
 
 
 class PairObservation(SubModel):
@@ -120,25 +125,19 @@ class PairObservation(SubModel):
         self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
         self.observation_dim = 2
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the predicted observations, the ensemble that the analysis is to update, and the mask."""
-        forecast, *history = (self.read(tensordict, key) for key in self.in_keys)
+    def compute(self, forecast, *rest):
+        """The predicted observations, the ensemble that the analysis is to update, and the mask."""
+        *history, steps, observed = rest
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
-        past = within_pair(tensordict.get(self.optional_keys[0], None), history)
+        past = within_pair(steps, history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
         # Neighbours are always read: a filter that believes itself too fast would otherwise stay blind.
         within_reach = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
         readable = within_reach | ~past.flatten(-2).any(-1)
-        for key in self.optional_keys:
-            value = tensordict.get(key, None)
+        for value in (steps, observed):
             if value is not None:
                 readable = readable & (value > 0)
-        clone = torch.cat([forecast[..., :5], history.flatten(-2)], -1)
-        for key, value in zip(self.out_keys, (self.module(way), clone, readable), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return self.module(way), torch.cat([forecast[..., :5], history.flatten(-2)], -1), readable
 
 
 class ClonedPrior(SubModel):
@@ -163,24 +162,28 @@ class ClonedPrior(SubModel):
     def __init__(self, initial: TensorDictModuleBase, lags: int):
         if lags < 1:
             raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
-        super().__init__(initial, initial.in_keys, initial.out_keys)
-        self.state_dim = 5
-        if hasattr(initial, "ensemble_size"):
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, initial.out_keys, optional_keys=optional)
+        self.input_dim, self.state_dim = 5, 5 + 2 * lags
+        if getattr(initial, "ensemble_size", None) is not None:
             self.ensemble_size = initial.ensemble_size
         eye = torch.eye(5, dtype=torch.get_default_dtype())
         self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        tensordict = self.module(tensordict)
-        for key in self.out_keys:
-            name, value = key[-1] if isinstance(key, tuple) else key, tensordict.get(key)
-            copies = self.copies.to(value.dtype)
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief."""
+        written = run_module(self.module, entries, call.part("initial"))
+        for key, value in written.items():
+            name, copies = key[-1] if isinstance(key, tuple) else key, self.copies.to(value.dtype)
             if name == "cov":
-                tensordict.set(key, copies @ value @ copies.mT)
+                written[key] = copies @ value @ copies.mT
             elif value.shape[-1] == 5:  # ensemble, mean, variances; weights have no state dimension
-                tensordict.set(key, value @ copies.mT)
-        return tensordict
+                written[key] = value @ copies.mT
+        return written
 
 
 class ClonedTransition(SubModel):
@@ -202,19 +205,22 @@ class ClonedTransition(SubModel):
 
     def __init__(self, transition: SubModel, *, history_key: NestedKey = ("belief", "history")):
         self_made = unravel_key(history_key)
-        in_keys = [key for key in transition.in_keys if unravel_key(key) != self_made]
-        super().__init__(transition, in_keys, transition.out_keys)
+        needed, optional = reads(transition)
+        in_keys = [key for key in needed if key != self_made]
+        super().__init__(transition, in_keys, transition.out_keys, optional_keys=optional)
         self.history_key = self_made
 
-    runs_on_rows = True
+    def parts(self):
+        """The transition."""
+        return {"transition": self.module}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast ensemble."""
-        state = self.read(tensordict, self.in_keys[0])
-        work = tensordict.copy().set(self.in_keys[0], state[..., :5])
-        work.set(self.history_key, state[..., 3:].unflatten(-1, (-1, 2)))
-        forecast = self.module(work).get(self.out_keys[0])
-        return tensordict.set(self.out_keys[0], torch.cat([forecast, state[..., 3:-2]], -1))
+    def on_entries(self, entries, call):
+        """The forecast ensemble."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state = self.required(entries, key)
+        work = {**entries, key: state[..., :5], self.history_key: state[..., 3:].unflatten(-1, (-1, 2))}
+        written = run_module(self.module, work, call.part("transition"))
+        return {**written, out_key: torch.cat([written[out_key], state[..., 3:-2]], -1)}
 
 
 def within_pair(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:

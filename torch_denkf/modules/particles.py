@@ -15,7 +15,7 @@ import math
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
@@ -27,7 +27,7 @@ from torch_denkf.functional import (
     weighted_mean,
     weighted_var,
 )
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, reads, run_module
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]
 
@@ -55,17 +55,23 @@ class WithWeights(SubModel):
         ensemble_key: NestedKey = ("belief", "ensemble"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
     ):
-        super().__init__(initial, initial.in_keys, [*initial.out_keys, log_weight_key])
-        self.ensemble_key = ensemble_key
-        for name in ("ensemble_size", "state_dim", "observation_dim"):
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, [*initial.out_keys, log_weight_key], optional_keys=optional)
+        self.ensemble_key = unravel_key(ensemble_key)
+        for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim"):
             if hasattr(initial, name):
                 setattr(self, name, getattr(initial, name))
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and its weights."""
-        tensordict = self.module(tensordict)
-        ensemble = self.read(tensordict, self.ensemble_key)
-        return tensordict.set(self.out_keys[-1], torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2])))
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief and its weights."""
+        written = run_module(self.module, entries, call.part("initial"))
+        ensemble = written[self.ensemble_key]
+        weights = torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2]))
+        return {**written, unravel_key(self.out_keys[-1]): weights}
 
 
 class ResampledTransition(SubModel):
@@ -87,7 +93,6 @@ class ResampledTransition(SubModel):
         log_weight_key: log-weights of the belief ``[*B, E]``.
         out_log_weight_key: log-weights of the forecast ``[*B, E]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.
-        noise_key: optional uniform numbers in [0, 1), ``[*B, 1]``.
 
     Raises:
         ValueError: on an unknown ``scheme``.
@@ -104,7 +109,7 @@ class ResampledTransition(SubModel):
 
     def __init__(
         self,
-        transition: SubModel,
+        transition: TensorDictModuleBase,
         scheme: Literal["systematic", "soft", "transport"] | None = "systematic",
         *,
         alpha: float = 0.05,
@@ -114,63 +119,63 @@ class ResampledTransition(SubModel):
         log_weight_key: NestedKey = ("belief", "log_weight"),
         out_log_weight_key: NestedKey = ("forecast", "log_weight"),
         observed_key: NestedKey = "observed",
-        noise_key: NestedKey = ("noise", "resampling"),
     ):
         if scheme not in ("systematic", "soft", "transport", None):
             raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
-        ensemble_key, *others = transition.in_keys
-        others = [key for key in others if unravel_key(key) != unravel_key(log_weight_key)]
+        (ensemble_key, *others), optional = reads(transition)
+        others = [key for key in others if key != unravel_key(log_weight_key)]
         super().__init__(
             transition,
             [ensemble_key, log_weight_key, *others],
-            # In the order of the carry, see Filter.
             [transition.out_keys[0], out_log_weight_key, *transition.out_keys[1:]],
-            optional_keys=[observed_key],
-            noise_key=noise_key,
+            optional_keys=[observed_key, *optional],
         )
         self.scheme, self.alpha, self.ess_threshold = scheme, alpha, ess_threshold
+        self.mask_key = unravel_key(observed_key)
         self.epsilon, self.iterations = epsilon, iterations
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """One uniform number, where the scheme needs it."""
+        return ("",) if self.scheme in ("systematic", "soft") else ()
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None, **_):
         """Draws uniform numbers ``[*batch_size, 1]``; ``None`` where the scheme needs none."""
-        if self.scheme not in ("systematic", "soft"):
+        if not self.noise_names:
             return None
         return torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
 
-    runs_on_rows = True
+    def parts(self):
+        """The transition."""
+        return {"transition": self.module}
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast ensemble and its weights."""
-        (key, weight_key), (_, out_weight_key) = self.in_keys[:2], self.out_keys[:2]
-        particles, log_weights = self.read(tensordict, key), self.read(tensordict, weight_key)
-        wanted = self._wanted(log_weights, tensordict)
-        moved, weights = self._resample(particles, log_weights, tensordict)
+    def on_entries(self, entries, call):
+        """The forecast ensemble and its weights."""
+        (key, weight_key), out_weight_key = map(unravel_key, self.in_keys[:2]), unravel_key(self.out_keys[1])
+        particles, log_weights = self.required(entries, key), self.required(entries, weight_key)
+        wanted = self._wanted(log_weights, entries.get(self.mask_key))
+        moved, weights = self._resample(particles, log_weights, self._noise(entries, [log_weights], call))
         if wanted is not None:
             moved = torch.where(wanted.unsqueeze(-1), moved, particles)
             weights = torch.where(wanted, weights, log_weights)
-        work = self.module(tensordict.copy().set(key, moved).set(weight_key, weights))
-        tensordict.set(out_weight_key, weights)
-        for out_key in self.module.out_keys:
-            tensordict.set(out_key, work.get(out_key))
-        return tensordict
+        written = run_module(self.module, {**entries, key: moved, weight_key: weights}, call.part("transition"))
+        return {**written, out_weight_key: weights}
 
-    def _wanted(self, log_weights: torch.Tensor, tensordict: TensorDictBase) -> torch.Tensor | None:
+    def _wanted(self, log_weights: torch.Tensor, observed: torch.Tensor | None) -> torch.Tensor | None:
         """Which rows to resample, ``[*B, 1]``; ``None`` for all."""
-        observed = tensordict.get(self.optional_keys[0], None)
         wanted = None if observed is None else observed.any(-1, keepdim=True)
         if self.ess_threshold is not None:
             few = effective_sample_size(log_weights) < self.ess_threshold * log_weights.shape[-1]
             wanted = few.unsqueeze(-1) if wanted is None else wanted & few.unsqueeze(-1)
         return wanted
 
-    def _resample(self, particles, log_weights, tensordict) -> tuple[torch.Tensor, torch.Tensor]:
+    def _resample(self, particles, log_weights, uniform) -> tuple[torch.Tensor, torch.Tensor]:
         if self.scheme is None:
             return particles, log_weights
         if self.scheme == "transport":
             return transport_resample(particles, log_weights, epsilon=self.epsilon, iterations=self.iterations)
-        uniform = self.read_noise(tensordict)
         if uniform is None:
-            uniform = self.draw_noise(log_weights.shape[:-1], device=log_weights.device, dtype=log_weights.dtype)
+            raise ValueError(f'resampling "{self.scheme}" has no deterministic forward; use "transport" or None.')
         if self.scheme == "systematic":
             return systematic_resample(particles, log_weights, uniform)
         return soft_resample(particles, log_weights, uniform, self.alpha)
@@ -222,19 +227,16 @@ class ParticleAnalysis(SubModel):
             [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
             + [(info_key, name) for name in ("ess", "log_likelihood")],
         )
-        self.tempering = tempering
+        self.tempering, self.info_key = tempering, info_key
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and the diagnostics."""
-        particles, prior, log_likelihood = (self.read(tensordict, key) for key in self.in_keys)
+    def compute(self, particles, prior, log_likelihood):
+        """The belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
         # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
         seen = (log_likelihood != 0).any(-1, keepdim=True)
         log_weights = torch.where(seen, joint - total, prior)
-        values = (
+        return (
             particles,
             log_weights,
             weighted_mean(particles, log_weights),
@@ -242,6 +244,3 @@ class ParticleAnalysis(SubModel):
             effective_sample_size(log_weights).unsqueeze(-1),
             torch.where(seen, total, torch.zeros_like(total)),
         )
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict

@@ -10,18 +10,51 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf.functional import unicycle_jacobians
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
+from torch_denkf.modules.unicycle import keys_of_dt
 
-__all__ = ["CholeskyNoise", "MappedNoise", "UnicycleNoise"]
+__all__ = ["CholeskyNoise", "MappedNoise", "UnicycleNoise", "as_process_noise"]
 
 _BELIEF_MEAN, _FORECAST_NOISE = ("belief", "mean"), ("forecast", "noise")
+
+
+def as_process_noise(
+    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | float, initial: TensorDictModuleBase
+) -> TensorDictModuleBase:
+    """A module that writes Q: as it is, or made of standard deviations ``[S]`` or one number for all dimensions.
+
+    Args:
+        noise: the module, or standard deviations in the state's units; 0 for a dimension without noise.
+        initial: the initial belief, which knows S where ``noise`` is one number.
+
+    Raises:
+        ValueError: if S is not known, or a standard deviation is negative.
+
+    Example:
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> q = as_process_noise(0.5, GaussianPrior([0.0, 0.0], [1.0, 1.0]))
+        >>> from tensordict import TensorDict
+        >>> q(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"]
+        tensor([0.2500, 0.2500])
+    """
+    if isinstance(noise, nn.Module):
+        return noise
+    std = as_floating(noise)
+    if std.ndim == 0:
+        size = getattr(initial, "state_dim", None)
+        if size is None:
+            raise ValueError("process_noise is one number, and the initial belief does not say for how many: give [S].")
+        std = std.expand(size)
+    return ConstantNoise(std, in_key=_BELIEF_MEAN, out_key=_FORECAST_NOISE)
 
 
 class CholeskyNoise(SubModel):
@@ -78,9 +111,8 @@ class CholeskyNoise(SubModel):
             nn.Identity() if constant else StochasticMLP(in_features, size, num_cells, layer="none", output_gain=0.0)
         )
         super().__init__(network, [in_key], [out_key])
-        dtype = torch.get_default_dtype()
-        variance = torch.as_tensor(r, dtype=dtype).expand(dim) ** 2
-        floor = 0.01 * variance if floor is None else torch.as_tensor(floor, dtype=dtype).expand(dim)
+        variance = as_floating(r).expand(dim) ** 2
+        floor = 0.01 * variance if floor is None else as_floating(floor).expand(dim)
         if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
             raise ValueError(
                 f"CholeskyNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
@@ -88,51 +120,57 @@ class CholeskyNoise(SubModel):
             )
         self.dim, self.constant = dim, constant
         if constant:
-            self.raw = nn.Parameter(torch.zeros(size, dtype=dtype))
+            self.raw = nn.Parameter(torch.zeros(size, dtype=variance.dtype))
         self.register_buffer("std", (variance - floor).sqrt())
         self.register_buffer("floor", floor.clone())
-        self.register_buffer("loc", torch.zeros(in_features) if loc is None else torch.as_tensor(loc, dtype=dtype))
-        self.register_buffer("scale", torch.ones(in_features) if scale is None else torch.as_tensor(scale, dtype=dtype))
+        register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
+        register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the covariance."""
-        features = self.read(tensordict, self.in_keys[0])
+    def compute(self, features, *, batch_size):
+        """The covariance."""
         if self.constant:
             dtype = features.dtype if features.is_floating_point() else self.raw.dtype
-            raw = self.raw.to(dtype).expand(*tensordict.batch_size, -1)
+            raw = self.raw.to(dtype).expand(*batch_size, -1)
         else:
-            features = features.mean(-2) if features.ndim > tensordict.ndim + 1 else features
-            raw = self.module((features - self.loc) / self.scale)
+            raw = self.module((mean_of_members(features, batch_size) - self.loc) / self.scale)
         row, column = self.rows
         # softplus grows like its input, so that a large output of a network does not blow the covariance up.
         positive = F.softplus(raw + 0.5413248546129181)  # log(e - 1): softplus of it is 1
         entries = torch.where(row == column, positive, raw) * self.std.to(raw.dtype)[row]
         factor = raw.new_zeros(*raw.shape[:-1], self.dim**2).index_copy(-1, row * self.dim + column, entries)
         factor = factor.unflatten(-1, (self.dim, self.dim))
-        return tensordict.set(self.out_keys[0], factor @ factor.mT + self.floor.to(raw.dtype).diag_embed())
+        return factor @ factor.mT + self.floor.to(raw.dtype).diag_embed()
 
 
 class _MappedNoise(SubModel):
-    """Runs another noise module and writes G Q G^T in its place, in the same entry."""
+    """Runs another noise module and writes G Q G^T in its place, in the same entry; a subclass gives G."""
 
     def __init__(self, noise: TensorDictModuleBase, in_keys: Sequence[NestedKey]):
-        out_key = unravel_key(noise.out_keys[0])
-        super().__init__(noise, dict.fromkeys([*map(unravel_key, noise.in_keys), *in_keys]), [out_key])
+        needed, optional = reads(noise)
+        keys = list(dict.fromkeys([*needed, *map(unravel_key, in_keys)]))
+        super().__init__(noise, keys, [unravel_key(noise.out_keys[0])], optional_keys=optional)
 
-    def _write(self, tensordict: TensorDictBase, matrix: torch.Tensor) -> TensorDictBase:
-        noise = self.read(self.module(tensordict.copy()), self.out_keys[0])
-        variances = noise.ndim == tensordict.ndim + 1
-        matrix = matrix.to(noise.dtype)
+    def parts(self):
+        """The noise module."""
+        return {"noise": self.module}
+
+    def on_entries(self, entries, call):
+        """The covariance."""
+        noise = run_module(self.module, entries, call.part("noise"))[self.out_keys[0]]
+        matrix = self._matrix(entries).to(noise.dtype)
         if noise.shape[-1] != matrix.shape[-1]:
             raise ValueError(
                 f"{type(self).__name__} maps noise of {matrix.shape[-1]} dimensions to {matrix.shape[-2]}; "
                 f"{type(self.module).__name__} writes {list(noise.shape)}."
             )
+        variances = noise.ndim == len(call.batch_size) + 1
         scaled = matrix * noise.unsqueeze(-2) if variances else matrix @ noise
-        return tensordict.set(self.out_keys[0], scaled @ matrix.mT)
+        return {self.out_keys[0]: scaled @ matrix.mT}
+
+    def _matrix(self, entries) -> torch.Tensor:
+        """G, ``[S, N]`` or ``[*B, S, N]``."""
+        raise NotImplementedError
 
 
 class MappedNoise(_MappedNoise):
@@ -155,13 +193,10 @@ class MappedNoise(_MappedNoise):
 
     def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
         super().__init__(noise, [])
-        self.register_buffer("matrix", torch.as_tensor(matrix, dtype=torch.get_default_dtype()))
+        register_constant(self, "matrix", matrix)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the covariance."""
-        return self._write(tensordict, self.matrix)
+    def _matrix(self, entries):
+        return self.matrix
 
 
 class UnicycleNoise(_MappedNoise):
@@ -175,7 +210,7 @@ class UnicycleNoise(_MappedNoise):
     Args:
         noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and
             (rad/s)^2; its keys are kept. In a filter it may read ``("belief", "mean")``.
-        dt: time step in seconds.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``, as of the transition.
         belief_key: mean at t-1, ``[*B, S]``, starting with [x, y, theta, v, theta_dot]; further dimensions, such as
             clones, get no noise.
         forecast_key: mean of the forecast, ``[*B, S]``; the filter puts it there.
@@ -195,20 +230,17 @@ class UnicycleNoise(_MappedNoise):
     def __init__(
         self,
         noise: TensorDictModuleBase,
-        dt: float,
+        dt: float | NestedKey,
         *,
         belief_key: NestedKey = _BELIEF_MEAN,
         forecast_key: NestedKey = ("forecast", "mean"),
     ):
-        super().__init__(noise, [belief_key, forecast_key])
-        self.belief_key, self.forecast_key, self.dt = belief_key, forecast_key, dt
+        super().__init__(noise, [belief_key, forecast_key, *keys_of_dt(dt)])
+        self.belief_key, self.forecast_key, self.dt = unravel_key(belief_key), unravel_key(forecast_key), dt
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the covariance."""
-        before, forecast = self.read(tensordict, self.belief_key), self.read(tensordict, self.forecast_key)
-        _, moved = unicycle_jacobians(before[..., :3], forecast[..., 3:5], self.dt)
+    def _matrix(self, entries):
+        before, forecast = self.required(entries, self.belief_key), self.required(entries, self.forecast_key)
+        dt = self.required(entries, self.dt) if keys_of_dt(self.dt) else self.dt
+        _, moved = unicycle_jacobians(before[..., :3], forecast[..., 3:5], dt)
         own = torch.eye(2, dtype=moved.dtype, device=moved.device).expand(*moved.shape[:-2], 2, 2)
-        matrix = torch.cat([moved, own], -2)
-        return self._write(tensordict, F.pad(matrix, (0, 0, 0, forecast.shape[-1] - 5)))
+        return F.pad(torch.cat([moved, own], -2), (0, 0, 0, forecast.shape[-1] - 5))

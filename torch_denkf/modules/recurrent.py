@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
 from torch_denkf.functional import unicycle_jacobians, unicycle_move
-from torch_denkf.modules._base import SubModel
-
+from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._tensors import as_floating, mean_of_members
+from torch_denkf.modules.unicycle import keys_of_dt
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
 
@@ -46,19 +47,22 @@ class WithMemory(SubModel):
         self, initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_key: str = "belief"
     ):
         out_keys = [(belief_key, name) for name in _MEMORY]
-        super().__init__(initial, initial.in_keys, [*initial.out_keys, *out_keys])
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, [*initial.out_keys, *out_keys], optional_keys=optional)
         self.belief_key, self.memory_shape = belief_key, (num_layers, hidden_size)
-        for name in ("state_dim", "observation_dim"):  # what the primer asks for
+        for name in ("state_dim", "observation_dim", "input_dim"):  # what the primer asks for
             if getattr(initial, name, None) is not None:
                 setattr(self, name, getattr(initial, name))
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief and its memory."""
-        tensordict = self.module(tensordict)
-        mean = self.read(tensordict, (self.belief_key, "mean"))
-        for key in self.out_keys[-2:]:
-            tensordict.set(key, mean.new_zeros(*tensordict.batch_size, *self.memory_shape))
-        return tensordict
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief and its memory."""
+        written = run_module(self.module, entries, call.part("initial"))
+        empty = written[self.belief_key, "mean"].new_zeros(*call.batch_size, *self.memory_shape)
+        return {**written, **dict.fromkeys(self.out_keys[-2:], empty)}
 
 
 class LSTMTransition(SubModel):
@@ -81,13 +85,9 @@ class LSTMTransition(SubModel):
         in_keys, out_keys = ([(key, name) for name in names] for key in (belief_key, forecast_key))
         super().__init__(nn.Identity(), in_keys, out_keys)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast."""
-        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            tensordict.set(out_key, self.read(tensordict, key))
-        return tensordict
+    def compute(self, *values):
+        """The forecast."""
+        return values
 
 
 class LSTMUpdate(SubModel):
@@ -184,22 +184,28 @@ class LSTMUpdate(SubModel):
         self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
-        dtype = torch.get_default_dtype()
+        self.reading_keys = inputs
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),
             ("observation_loc", observation_loc, observation_dim, 0.0),
             ("observation_scale", observation_scale, observation_dim, 1.0),
         ):
-            value = torch.as_tensor(default if value is None else value, dtype=dtype)
+            value = as_floating(default if value is None else value)
             self.register_buffer(name, value.expand(size).clone())
+        self.feature_sizes = [size for size in (features, observation_dim) if size]
 
-    runs_on_rows = True
+    def without_reading(self, hidden, cell, *rest):
+        """Memory and belief where there is no reading: the flags say so."""
+        batch_size, count = hidden.shape[:-2], len(self.reading_keys)
+        unseen = torch.zeros(*batch_size, 1, dtype=torch.bool, device=hidden.device)
+        blank = [hidden.new_zeros(*batch_size, size) for size in self.feature_sizes]
+        return self.compute(hidden, cell, *blank, *rest[count:-1], unseen, batch_size=batch_size)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the memory and the belief."""
-        hidden, cell = (self.read(tensordict, key) for key in self.in_keys[:2])
-        batch_size, features = hidden.shape[:-2], self._features(tensordict)
+    def compute(self, hidden, cell, *rest, batch_size):
+        """The memory and the belief."""
+        *inputs, observed = rest
+        features = self._features(inputs, observed, batch_size)
         # A cell takes one batch dimension; the tensordict may have none or many.
         output = features.reshape(-1, self.in_size)
         states = [part.reshape(-1, self.num_layers, self.hidden_size).unbind(-2) for part in (hidden, cell)]
@@ -207,31 +213,27 @@ class LSTMUpdate(SubModel):
         for layer, *state in zip(self.module["cells"], *states, strict=True):
             memory.append(layer(output, tuple(state)))
             output = memory[-1][0]
-        for key, parts in zip(self.out_keys[:2], zip(*memory, strict=True), strict=True):
-            tensordict.set(key, torch.stack(parts, -2).reshape(*batch_size, self.num_layers, self.hidden_size))
+        size = (*batch_size, self.num_layers, self.hidden_size)
+        kept = [torch.stack(parts, -2).reshape(size) for parts in zip(*memory, strict=True)]
         output = output.reshape(*batch_size, self.hidden_size)
         mean = self.loc + self.scale * self.module["mean"](output)
         variance = (self.inflation * self.scale).square() * (F.softplus(self.module["var"](output)) + self.floor)
-        for key, value in zip(self.out_keys[2:], (mean, variance.diag_embed(), variance), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return *kept, mean, variance.diag_embed(), variance
 
-    def _features(self, tensordict: TensorDictBase) -> torch.Tensor:
+    def _features(self, inputs: list[torch.Tensor], observed: torch.Tensor | None, batch_size) -> torch.Tensor:
         """What the LSTM reads, ``[*B, in_size]``."""
-        observed = tensordict.get(self.optional_keys[0], None)
         dtype, parts = self.loc.dtype, []
         if self.encoding_key is not None:
-            encoding = self.read(tensordict, self.encoding_key)
+            encoding, *inputs = inputs
             parts.append(encoding if observed is None else torch.where(observed.any(-1, keepdim=True), encoding, 0.0))
         if self.observation_key is not None:
-            reading = self.read(tensordict, self.observation_key)
-            reading = reading.mean(-2) if reading.ndim > tensordict.ndim + 1 else reading
-            reading = (reading - self.observation_loc) / self.observation_scale
+            reading, *inputs = inputs
+            reading = (mean_of_members(reading, batch_size) - self.observation_loc) / self.observation_scale
             parts.append(reading if observed is None else torch.where(observed, reading, 0.0))
             flag = torch.ones_like(reading) if observed is None else observed.expand_as(reading)
         else:
             flag = torch.ones_like(parts[0][..., :1]) if observed is None else observed.any(-1, keepdim=True)
-        parts += [flag, *(self.read(tensordict, key) for key in self.extra_keys)]
+        parts += [flag, *inputs]
         features = torch.cat([part.to(dtype) for part in parts], -1)
         if features.shape[-1] != self.in_size:
             sizes = [part.shape[-1] for part in parts]
@@ -256,7 +258,7 @@ class UnicyclePose(SubModel):
     not (a biased network), the pose is less certain than this says.
 
     Args:
-        dt: time step in seconds.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
         velocity_key: prefix of ``mean`` ``[*B, 2]`` and ``cov`` ``[*B, 2, 2]`` of (v m/s, theta_dot rad/s) at t.
         forecast_key: prefix of ``mean`` ``[*B, 5]`` and ``cov`` of [x m, y m, theta rad, v, theta_dot] at t-1, as
             :class:`LSTMTransition` hands them on.
@@ -274,22 +276,18 @@ class UnicyclePose(SubModel):
     """
 
     def __init__(
-        self, dt: float, *, velocity_key: str = "velocity", forecast_key: str = "forecast", belief_key: str = "belief"
+        self, dt: float | NestedKey, *, velocity_key: str = "velocity", forecast_key: str = "forecast", belief_key: str = "belief"
     ):
-        in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS]
+        in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS] + keys_of_dt(dt)
         super().__init__(nn.Identity(), in_keys, [(belief_key, name) for name in (*_MOMENTS, "var")])
         self.dt = dt
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        mean, cov, velocity, velocity_cov = (self.read(tensordict, key) for key in self.in_keys)
-        pose = mean[..., :3]
-        by_pose, by_velocity = unicycle_jacobians(pose, velocity, self.dt)
+    def compute(self, mean, cov, velocity, velocity_cov, dt=None):
+        """The belief."""
+        pose, dt = mean[..., :3], self.dt if dt is None else dt
+        by_pose, by_velocity = unicycle_jacobians(pose, velocity, dt)
         cross = by_velocity @ velocity_cov
         pose_cov = by_pose @ cov[..., :3, :3] @ by_pose.mT + cross @ by_velocity.mT
         cov = torch.cat([torch.cat([pose_cov, cross], -1), torch.cat([cross.mT, velocity_cov], -1)], -2)
-        moved = unicycle_move(pose, velocity, self.dt)
-        values = (torch.cat([moved, velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1))
-        for key, value in zip(self.out_keys, values, strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        moved = unicycle_move(pose, velocity, dt)
+        return torch.cat([moved, velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1)

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import as_floating, register_constant
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -39,7 +40,24 @@ def convolutional_trunk(in_channels: int, layers: Sequence[tuple[int, int, int]]
     return nn.Sequential(*parts, nn.Flatten())
 
 
-class _Sensor(SubModel):
+class StochasticSensor(SubModel):
+    """A sensor whose noise is that of its head ``self.module["head"]``, a stochastic network."""
+
+    ensemble_size: int
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Those of the head."""
+        return self.module["head"].noise_names
+
+    def draw_noise(self, batch_size, *, time=False, device=None, dtype=None, generator=None, **_):
+        """Draws the head's noise for ``[*batch_size, E]`` rows."""
+        return self.module["head"].draw_noise(
+            batch_size, self.ensemble_size, time=time, device=device, dtype=dtype, generator=generator
+        )
+
+
+class _Sensor(StochasticSensor):
     """A trunk that runs once a frame, and a stochastic head that runs for every member."""
 
     def __init__(
@@ -50,7 +68,6 @@ class _Sensor(SubModel):
         in_key: NestedKey,
         out_key: NestedKey,
         encoding_key: NestedKey | None,
-        noise_key: NestedKey,
         loc,
         scale,
         event_ndim: int,
@@ -61,18 +78,10 @@ class _Sensor(SubModel):
             [in_key],
             [out_key] if encoding_key is None else [out_key, encoding_key],
             optional_keys=[observed_key],
-            noise_key=noise_key,
         )
-        self.ensemble_size, self.event_ndim = ensemble_size, event_ndim
-        dtype = torch.get_default_dtype()
-        self.register_buffer("loc", torch.as_tensor(0.0 if loc is None else loc, dtype=dtype))
-        self.register_buffer("scale", torch.as_tensor(1.0 if scale is None else scale, dtype=dtype))
-
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None):
-        """Draws the head's noise for ``[*batch_size, E]`` rows."""
-        return self.module["head"].draw_noise(
-            batch_size, self.ensemble_size, device=device, dtype=dtype, generator=generator
-        )
+        self.ensemble_size, self.event_ndim, self.observation_dim = ensemble_size, event_ndim, head.out_features
+        register_constant(self, "loc", 0.0 if loc is None else loc)
+        register_constant(self, "scale", 1.0 if scale is None else scale)
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         return measurement
@@ -88,27 +97,19 @@ class _Sensor(SubModel):
     def _features(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
         return self._encode(measurement, seen)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the learned observations of every member."""
-        measurement = self.read(tensordict, self.in_keys[0])
+    def compute(self, measurement, observed=None, *, noise):
+        """The learned observations of every member, and the encoding if it is asked for."""
         batch_ndim = measurement.ndim - self.event_ndim
         batch_size, event_shape = measurement.shape[:batch_ndim], measurement.shape[batch_ndim:]
-        observed = tensordict.get(self.optional_keys[0], None)
         seen = None if observed is None else observed.any(-1).reshape(-1, *(1,) * self.event_ndim)
-        # A trunk takes one batch dimension; the tensordict may have none or many.
-        code = self._features(measurement.reshape(-1, *event_shape), seen).reshape(*batch_size, -1)
-        head, noise = self.module["head"], self.read_noise(tensordict)
-        if noise is None and head.sample:
-            noise = self.draw_noise(batch_size, device=code.device, dtype=code.dtype)
+        # A trunk takes one batch dimension; the entries may have none or many.
+        frames = measurement.reshape(batch_size.numel(), *event_shape)
+        code = self._features(frames, seen)
+        code = code.reshape(*batch_size, code.shape[-1])
         # [*B, 1, F] against noise [*B, E, N]: what is equal for all members is computed once.
-        samples, hidden = head.forward_with_hidden(code.unsqueeze(-2), noise)
-        samples = (self.loc + self.scale * samples).expand(*batch_size, self.ensemble_size, -1)
-        tensordict.set(self.out_keys[0], samples)
-        if len(self.out_keys) > 1:
-            tensordict.set(self.out_keys[1], hidden.mean(-2))
-        return tensordict
+        samples, hidden = self.module["head"].forward_with_hidden(code.unsqueeze(-2), noise, sample=noise is not None)
+        samples = (self.loc + self.scale * samples).expand(*batch_size, self.ensemble_size, self.observation_dim)
+        return (samples, hidden.mean(-2)) if len(self.out_keys) > 1 else samples
 
 
 class ImageSensor(_Sensor):
@@ -140,7 +141,6 @@ class ImageSensor(_Sensor):
         trunk_dtype: precision of the trunk's layers, ``torch.bfloat16`` for half the memory, and on recent
             processors half the time; parameters and features keep theirs. ``None``: that of the parameters.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; frames of which nothing is observed are not read.
-        noise_key: optional noise (see :class:`StochasticMLP`).
 
     Raises:
         ValueError: if an image does not have ``image_shape``, or ``trunk_memory`` is not positive.
@@ -173,23 +173,23 @@ class ImageSensor(_Sensor):
         recompute: bool = False,
         trunk_dtype: torch.dtype | None = None,
         observed_key: NestedKey = "observed",
-        noise_key: NestedKey = ("noise", "sensor"),
     ):
         if trunk_memory is not None and trunk_memory <= 0:
             raise ValueError(f"trunk_memory is in bytes and positive; got {trunk_memory}.")
         trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
-        trunk = trunk.to(memory_format=torch.channels_last)  # twice as fast on a CPU, and nothing else changes
+        # Twice as fast on a CPU, and nothing else changes. torch lacks this keyword among the overloads of Module.to.
+        trunk = trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         with torch.no_grad():
             features = trunk(torch.zeros(1, *image_shape)).shape[-1]
         head = StochasticMLP(features, observation_dim, num_cells, layer=layer, rate=rate)
         super().__init__(
-            trunk, head, ensemble_size, in_key, out_key, encoding_key, noise_key, loc, scale, 3, observed_key
+            trunk, head, ensemble_size, in_key, out_key, encoding_key, loc, scale, 3, observed_key
         )
         self.image_shape = tuple(image_shape)
         self.trunk_memory, self.recompute, self.trunk_dtype = trunk_memory, recompute, trunk_dtype
         self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
         for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
-            channels = torch.as_tensor(default if value is None else value, dtype=torch.get_default_dtype())
+            channels = as_floating(default if value is None else value)
             self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
 
@@ -235,7 +235,6 @@ class VectorSensor(_Sensor):
         in_key: measurements ``[*B, in_features]``.
         out_key: learned observations ``[*B, E, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; rows of which nothing is observed are not read.
-        noise_key: optional noise (see :class:`StochasticMLP`).
 
     Example:
         >>> from tensordict import TensorDict
@@ -258,9 +257,8 @@ class VectorSensor(_Sensor):
         in_key: NestedKey = "measurement",
         out_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
-        noise_key: NestedKey = ("noise", "sensor"),
     ):
         head = StochasticMLP(in_features, observation_dim, num_cells, layer=layer, rate=rate)
         super().__init__(
-            nn.Identity(), head, ensemble_size, in_key, out_key, None, noise_key, loc, scale, 1, observed_key
+            nn.Identity(), head, ensemble_size, in_key, out_key, None, loc, scale, 1, observed_key
         )

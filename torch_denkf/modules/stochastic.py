@@ -14,13 +14,12 @@ gives the deterministic forward, the mean network.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torch.nn import functional as F
 
@@ -43,7 +42,8 @@ class FlipoutLinear(nn.Module):
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``; ``signs`` bool ``[*, in_features + out_features]``;
-        ``perturbation`` ``[out_features * in_features + out_features]``, standard normal.
+        ``perturbation`` ``[out_features * in_features + out_features]``, standard normal, or one for each element of
+        a batch, ``[*B, out_features * in_features + out_features]`` with input ``[*B, E, in_features]``.
 
     Reference:
         Wen, Vicol, Ba, Tran, Grosse, "Flipout: efficient pseudo-independent weight perturbations on
@@ -80,10 +80,13 @@ class FlipoutLinear(nn.Module):
         if perturbation is None:
             perturbation = torch.randn(self.perturbation_size, device=x.device, dtype=x.dtype)
         sign_in, sign_out = (signs.to(x.dtype) * 2 - 1).split([self.in_features, self.out_features], -1)
-        weight_eps, bias_eps = perturbation.split([self.weight.numel(), self.bias.numel()])
-        weight = F.softplus(self.weight_rho) * weight_eps.view_as(self.weight)
+        weight_eps, bias_eps = perturbation.split([self.weight.numel(), self.bias.numel()], -1)
+        weight = F.softplus(self.weight_rho) * weight_eps.unflatten(-1, self.weight.shape)
         bias = F.softplus(self.bias_rho) * bias_eps
-        return mean + F.linear(x * sign_in, weight, bias) * sign_out
+        if perturbation.ndim == 1:
+            return mean + F.linear(x * sign_in, weight, bias) * sign_out
+        change = torch.einsum("...ei,...oi->...eo", x * sign_in, weight) + bias.unsqueeze(-2)
+        return mean + change * sign_out
 
     def kl(self) -> torch.Tensor:
         """KL divergence of the weights' posterior from the prior, in nats, a scalar."""
@@ -112,8 +115,8 @@ class StochasticMLP(nn.Module):
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
         ``[*, noise_size]``, units are kept where they are at least ``256 * rate``, or a boolean mask of the units to
-        keep; for flipout, a TensorDict of ``signs`` bool ``[*, noise_size]`` and ``perturbation``
-        ``[*, P]``, one draw a call, expanded over the batch.
+        keep; for flipout, a dictionary of ``signs`` bool ``[*, noise_size]`` and ``perturbation`` ``[P]``, one draw for
+        all rows, or ``[*B, P]`` with ``x`` ``[*B, E, in_features]``.
 
     Raises:
         ValueError: if ``layer`` is none of the three.
@@ -145,16 +148,17 @@ class StochasticMLP(nn.Module):
         sizes = [in_features, *num_cells, out_features]
         self.in_features, self.out_features = in_features, out_features
 
-        def make(n_in: int, n_out: int) -> nn.Module:
+        def make(n_in: int, n_out: int) -> nn.Linear | FlipoutLinear:
             if layer == "flipout":
                 return FlipoutLinear(n_in, n_out, posterior_std=posterior_std)
             return nn.Linear(n_in, n_out)
 
-        self.layers = nn.ModuleList(make(n_in, n_out) for n_in, n_out in pairwise(sizes))
+        layers = [make(n_in, n_out) for n_in, n_out in pairwise(sizes)]
+        self.layers = nn.ModuleList(layers)
         self.activation = activation()
         with torch.no_grad():
-            self.layers[-1].weight.mul_(output_gain)
-            self.layers[-1].bias.mul_(output_gain)
+            layers[-1].weight.mul_(output_gain)
+            layers[-1].bias.mul_(output_gain)
         if layer == "dropout":
             self.noise_splits = list(num_cells)
         elif layer == "flipout":
@@ -167,31 +171,41 @@ class StochasticMLP(nn.Module):
         """Number of random bits that one row of the input needs."""
         return sum(self.noise_splits)
 
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """The tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        if not self.noise_size or not self.sample:
+            return ()
+        return ("",) if self.layer == "dropout" else ("signs", "perturbation")
+
     def draw_noise(
-        self, batch_size: Sequence[int], *members: int, device=None, dtype=None, generator=None
-    ) -> torch.Tensor | TensorDictBase | None:
+        self, batch_size: Sequence[int], *members: int, time: bool = False, device=None, dtype=None, generator=None
+    ) -> torch.Tensor | dict[str, torch.Tensor] | None:
         """Draws the noise of one call on rows ``[*batch_size, *members]``, in bulk.
 
         Args:
             batch_size: batch dimensions (the tensordict's).
             members: event dimensions in front of the features, usually the ensemble size.
+            time: whether the last of ``batch_size`` is time. All rows of one time share flipout's perturbation of the
+                weights; another time has another, as if the sequence were taken step by step.
             device: where to draw.
             dtype: of the flipout perturbation.
             generator: source of randomness; torch's global one by default.
 
         Returns:
-            See the class: bytes, a TensorDict, or ``None`` for a deterministic network.
+            See the class: bytes, a dictionary, or ``None`` for a deterministic network.
         """
-        rows = (*batch_size, *members, self.noise_size)
         if not self.noise_size:
             return None
+        rows = (*batch_size, *members, self.noise_size)
         if self.layer == "dropout":
             return random_bytes(rows, device=device, generator=generator)
-        size = sum(layer.perturbation_size for layer in self.layers)
-        # One draw of the weights' perturbation for the call: the expanded batch dimensions take no memory.
-        perturbation = torch.randn(size, device=device, dtype=dtype, generator=generator).expand(*batch_size, size)
+        size = sum(self._perturbation_sizes())
+        times = batch_size[-1:] if time else ()
+        perturbation = torch.randn((*times, size), device=device, dtype=dtype, generator=generator)
         signs = random_signs(rows, device=device, generator=generator)
-        return TensorDict({"signs": signs, "perturbation": perturbation}, batch_size=list(batch_size), device=device)
+        # Expanded dimensions take no memory.
+        return {"signs": signs, "perturbation": perturbation.expand(*batch_size, size)}
 
     def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None) -> torch.Tensor:
         """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn."""
@@ -201,9 +215,10 @@ class StochasticMLP(nn.Module):
         """Like ``forward``; returns the output and the last hidden layer ``[*, num_cells[-1]]``."""
         sample = self.sample if sample is None else sample
         if sample and noise is None and self.noise_size:
-            noise = self.draw_noise(x.shape[:-1], device=x.device, dtype=x.dtype)
+            noise = self.draw_noise((), *x.shape[:-1], device=x.device, dtype=x.dtype)
+        run: Sequence[tuple[Callable[..., torch.Tensor], torch.Tensor | None]]
         if self.layer == "flipout":
-            run = self._flipout(noise, sample)
+            run = self._flipout(noise) if sample else [(partial(layer, sample=False), None) for layer in self.layers]
         elif self.layer == "dropout" and sample:
             run = self._dropout(noise, x.dtype)
         else:
@@ -223,14 +238,19 @@ class StochasticMLP(nn.Module):
         factors = dropout_factor(draws, self.rate, dtype).split(self.noise_splits, -1)
         return list(zip(self.layers, (*factors, None), strict=True))
 
-    def _flipout(self, noise: TensorDictBase | None, sample: bool) -> list[tuple[Callable, None]]:
-        if not sample:
-            return [(partial(layer, sample=False), None) for layer in self.layers]
+    def _perturbation_sizes(self) -> list[int]:
+        """Numbers of perturbed weights and biases; those of flipout's layers."""
+        return [layer.perturbation_size for layer in self.layers if isinstance(layer, FlipoutLinear)]
+
+    def _flipout(self, noise: Mapping[str, torch.Tensor]) -> list[tuple[Callable[..., torch.Tensor], None]]:
         perturbation = noise["perturbation"]
-        while perturbation.ndim > 1:  # the same draw for the whole call
-            perturbation = perturbation[0]
+        for dim in range(perturbation.ndim - 1):  # rows that share a draw share the product with it
+            if perturbation.stride(dim) == 0 or perturbation.shape[dim] == 1:
+                perturbation = perturbation.narrow(dim, 0, 1)
+        if perturbation.numel() == perturbation.shape[-1]:
+            perturbation = perturbation.flatten()
         signs = noise["signs"].split(self.noise_splits, -1)
-        perturbations = perturbation.split([layer.perturbation_size for layer in self.layers])
+        perturbations = perturbation.split(self._perturbation_sizes(), -1)
         return [
             (partial(layer, signs=sign, perturbation=eps), None)
             for layer, sign, eps in zip(self.layers, signs, perturbations, strict=True)
@@ -238,9 +258,8 @@ class StochasticMLP(nn.Module):
 
     def kl(self) -> torch.Tensor:
         """KL divergence of the weights from their prior, in nats; zero where the layers have none."""
-        if self.layer != "flipout":
-            return self.layers[0].weight.new_zeros(())
-        return sum(layer.kl() for layer in self.layers)
+        zero = next(self.layers.parameters()).new_zeros(())
+        return sum((layer.kl() for layer in self.layers if isinstance(layer, FlipoutLinear)), zero)
 
 
 class deterministic:

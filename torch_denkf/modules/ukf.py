@@ -90,9 +90,9 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         )
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
-    def _forecast(self, tensordict, mean, cov):
+    def _forecast(self, entries, mean, cov, call):
         points, weights = self._points(mean, cov)
-        return unscented_moments(self._move(tensordict.copy(), points), weights)
+        return unscented_moments(self._move(entries, points, call), weights)
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
@@ -152,8 +152,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         )
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
-    def _update(self, tensordict, mean, cov, observation, noise):
+    def _update(self, entries, mean, cov, observation, noise, call):
         points, weights = self._points(mean, cov)
-        predicted, observed = self._observe(tensordict.copy(), points)
+        predicted, observed = self._observe(entries, points, call)
         update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=self.angles)
         return update, observed

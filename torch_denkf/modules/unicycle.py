@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._members import MemberNetwork
+from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.pairs import within_pair
-from torch_denkf.modules.transition import StochasticTransition
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
 
 
-class UnicycleTransition(StochasticTransition):
+class UnicycleTransition(MemberNetwork):
     r"""Known motion of a vehicle, learned change of its velocities (the paper's section IV-A).
 
     .. math::
@@ -30,7 +31,7 @@ class UnicycleTransition(StochasticTransition):
 
     Args:
         velocity: maps standardised ``[*, 2]`` velocities to the standardised change ``[*, 2]``.
-        dt: time step in seconds.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
         loc: mean of (v, theta_dot), in m/s and rad/s.
         scale: standard deviation of (v, theta_dot), in m/s and rad/s.
         drift: False takes the ensemble's mean change away: the velocities walk at random, with learned steps, and a
@@ -38,10 +39,8 @@ class UnicycleTransition(StochasticTransition):
         history_key: velocities of past steps ``[*B, E, L, 2]``, see :class:`torch_denkf.modules.WithHistory`, L at
             least 2. With them the velocities go on changing as they last did, by a learned share :math:`\rho` of that
             (Gardner's damped trend): a random walk lags behind a car that brakes.
-        ensemble_size: see :class:`LearnedTransition`.
         in_key: ensemble ``[*B, E, 5]`` of [x m, y m, theta rad, v m/s, theta_dot rad/s].
         out_key: forecast ensemble ``[*B, E, 5]``.
-        noise_key: optional noise (see :class:`StochasticMLP`).
 
     Raises:
         ValueError: if the state does not have five dimensions.
@@ -57,45 +56,40 @@ class UnicycleTransition(StochasticTransition):
     def __init__(
         self,
         velocity: nn.Module,
-        dt: float,
+        dt: float | NestedKey,
         *,
         loc: Sequence[float] | torch.Tensor = (0.0, 0.0),
         scale: Sequence[float] | torch.Tensor = (1.0, 1.0),
         drift: bool = True,
         history_key: NestedKey | None = None,
-        ensemble_size: int | None = None,
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
-        noise_key: NestedKey = ("noise", "transition"),
     ):
-        in_keys = [in_key] if history_key is None else [in_key, history_key]
-        super().__init__(velocity, in_keys, [out_key], ensemble_size, noise_key)
+        histories = [] if history_key is None else [history_key]
+        super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])
         self.dt, self.drift = dt, drift
         self.raw_trend = None if history_key is None else nn.Parameter(torch.full((2,), -2.0))
-        self.register_buffer("loc", torch.as_tensor(loc, dtype=torch.get_default_dtype()))
-        self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.get_default_dtype()))
+        register_constant(self, "loc", loc)
+        register_constant(self, "scale", scale)
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the forecast ensemble."""
-        state = self.read(tensordict, self.in_keys[0])
+    def compute(self, state, *others, noise):
+        """The forecast ensemble."""
+        *history, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
         if state.shape[-1] != 5:
             raise ValueError(
                 f"UnicycleTransition moves [x, y, theta, v, theta_dot]; {self.in_keys[0]!r} has "
                 f"{state.shape[-1]} state dimensions."
             )
         pose, velocity = state.split([3, 2], -1)
-        change = self._run((velocity - self.loc) / self.scale, tensordict)
+        change = self._run((velocity - self.loc) / self.scale, noise)
         if not self.drift:
             change = change - change.mean(-2, keepdim=True)
         change = self.scale * change
         if self.raw_trend is not None:
-            history = self.read(tensordict, self.in_keys[1])
-            change = change + self.raw_trend.sigmoid() * (history[..., 0, :] - history[..., 1, :])
+            (past,) = history
+            change = change + self.raw_trend.sigmoid() * (past[..., 0, :] - past[..., 1, :])
         velocity = velocity + change
-        tensordict.set(self.out_keys[0], torch.cat([unicycle_move(pose, velocity, self.dt), velocity], -1))
-        return tensordict
+        return torch.cat([unicycle_move(pose, velocity, for_members(dt)), velocity], -1)
 
 
 class UnicycleMotion(SubModel):
@@ -112,7 +106,8 @@ class UnicycleMotion(SubModel):
     Use with ``EnsembleAnalysis(..., belief_key="analysis")``, and not with ``update_at_reset``.
 
     Args:
-        dt: time step in seconds.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step; a number
+            with a history, whose steps must all be alike.
         before_key: ensemble of the belief at t-1, ``[*B, E, 5]``, see :class:`UnicycleTransition`.
         analysis_key: ensemble of the analysis at t, ``[*B, E, 5]``, with a history ``[*B, E, 5 + 2L]``.
         belief_key: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
@@ -137,7 +132,7 @@ class UnicycleMotion(SubModel):
 
     def __init__(
         self,
-        dt: float,
+        dt: float | NestedKey,
         *,
         before_key: NestedKey = ("belief", "ensemble"),
         analysis_key: NestedKey = ("analysis", "ensemble"),
@@ -149,33 +144,41 @@ class UnicycleMotion(SubModel):
         if smooth and history_key is None:
             raise ValueError("UnicycleMotion(smooth=True) corrects a history; pass its history_key.")
         histories = [] if history_key is None else [history_key]
+        if histories and keys_of_dt(dt):
+            raise ValueError(f"UnicycleMotion with a history needs steps of one length; got dt={dt!r}, a key.")
         out_keys = [(belief_key, name) for name in ("ensemble", "mean", "var")] + histories
-        optional_keys = [steps_key] if histories else []
-        super().__init__(nn.Identity(), [before_key, analysis_key, *histories], out_keys, optional_keys=optional_keys)
+        in_keys = [before_key, analysis_key, *histories, *keys_of_dt(dt)]
+        super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=[steps_key] if histories else [])
         self.dt, self.history_key, self.smooth = dt, history_key, smooth
 
-    runs_on_rows = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the belief."""
-        before, analysis = (self.read(tensordict, key) for key in self.in_keys[:2])
+    def compute(self, before, analysis, *others):
+        """The belief, and its history."""
         pose, velocity = before[..., :3], analysis[..., 3:5]
+        dt = for_members(others[0] if keys_of_dt(self.dt) else self.dt)
+        histories: tuple[torch.Tensor, ...] = ()
         if self.history_key is not None:
-            history = self.read(tensordict, self.history_key)
-            past = within_pair(tensordict.get(self.optional_keys[0], None), history)
+            history, steps = others
+            past = within_pair(steps, history)
             past = torch.ones_like(past) if self.smooth else past
             analysed = analysis[..., 5:].unflatten(-1, (-1, 2))
             corrected = torch.where(past, analysed, history)
             moved = pose
             for step in history.unbind(-2):  # back to where the history begins
-                moved = unicycle_move(moved, step, -self.dt)
+                moved = unicycle_move(moved, step, -dt)
             for step in reversed(corrected.unbind(-2)):
-                moved = unicycle_move(moved, step, self.dt)
+                moved = unicycle_move(moved, step, dt)
             # Where the pair is of neighbours nothing moves, not even by rounding.
             pose = torch.where(past.flatten(-2).any(-1, keepdim=True), moved, pose)
-            tensordict.set(self.out_keys[-1], torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2))
-        ensemble = torch.cat([unicycle_move(pose, velocity, self.dt), velocity], -1)
-        values = (ensemble, ensemble_mean(ensemble), ensemble_var(ensemble))
-        for key, value in zip(self.out_keys, values, strict=False):
-            tensordict.set(key, value)
-        return tensordict
+            histories = (torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2),)
+        ensemble = torch.cat([unicycle_move(pose, velocity, dt), velocity], -1)
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *histories
+
+
+def keys_of_dt(dt: float | NestedKey) -> list[NestedKey]:
+    """The key of the time step, if it is no number."""
+    return [] if isinstance(dt, (int, float)) else [dt]
+
+
+def for_members(dt: float | torch.Tensor) -> float | torch.Tensor:
+    """A time step ``[*B, 1]`` as ``[*B, 1, 1]``, beside ensembles ``[*B, E, S]``."""
+    return dt.unsqueeze(-2) if isinstance(dt, torch.Tensor) else dt

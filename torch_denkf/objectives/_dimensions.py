@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from torch_denkf.filters import Filter
+from torch_denkf.objectives._base import Scale
 from torch_denkf.objectives._sequence import SequenceLoss
 
 
@@ -39,10 +40,10 @@ class DimensionsLoss(SequenceLoss):
     def __init__(
         self,
         filter: Filter,
-        weights: Mapping[str, float],
+        weights: Mapping[str, float | None],
         *,
         dims: Sequence[int] | None,
-        state_scale: Sequence[float] | torch.Tensor | None,
+        state_scale: Scale,
         angles: Sequence[int],
         **kwargs,
     ):
@@ -53,18 +54,10 @@ class DimensionsLoss(SequenceLoss):
             angles = [position for position, dim in enumerate(dims) if dim in angles]
         super().__init__(filter, weights, state_scale=state_scale, angles=angles, **kwargs)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
-        # Chosen here, once: a boolean index in forward would wait for the device.
-        counting = None if self.state_scale is None else self.state_scale.isfinite().nonzero().flatten()
-        self.register_buffer("counting", counting, persistent=False)
 
     def _errors(self, estimate: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Scaled errors of the dimensions that count."""
         estimate = estimate[..., : target.shape[-1]]
         if self.dims is not None:
             estimate, target = estimate.index_select(-1, self.dims), target.index_select(-1, self.dims)
-        errors = self._state_error(estimate, target)
-        return errors if self.counting is None else errors.index_select(-1, self.counting)
-
-    def _log_units(self) -> torch.Tensor | float:
-        """What turns nats of the scaled state into nats of the state in its own units: the log of all scales."""
-        return 0.0 if self.counting is None else self.state_scale[self.counting].log().sum()
+        return self._state_error(estimate, target)

@@ -10,8 +10,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_ensemble, energy_score
 from torch_denkf.modules import StochasticMLP
+from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._scores import MEMBER_SCORES, score_members
 from torch_denkf.objectives._sequence import SequenceLoss
 
 __all__ = ["DEnKFLoss"]
@@ -40,22 +41,25 @@ class DEnKFLoss(SequenceLoss):
 
     Args:
         filter: the filter to train; its parameters are the loss's.
-        score: ``"crps"`` (fair), ``"energy"`` (fair energy score, multivariate) or ``"mse"`` (of the mean).
+        score: ``"crps"`` (fair), ``"energy"`` (fair energy score, multivariate) or ``"mse"`` (of the mean). Of one
+            member the first two are its absolute error, and the length of its error: the scores of a point.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
-        sensor: weight of ``loss_sensor``.
+        sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
+            ``set_keys(sensor=...)`` names them), else the term is left out.
         observation: weight of ``loss_observation``.
         nll: weight of ``loss_nll``.
         kl: weight of ``loss_kl``.
         state_scale: ``[S]``; errors of the state are divided by it, so that dimensions with different units count
-            alike. A dimension with infinite scale does not count.
+            alike. A dimension with infinite scale does not count: means are taken over the others.
         observation_scale: ``[O]``, likewise.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        observation_angles: likewise, dimensions of observations.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score.
+        ValueError: on an unknown score, a scale that is not positive, or slices that are not marked.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -90,7 +94,7 @@ class DEnKFLoss(SequenceLoss):
 
     default_keys = _AcceptedKeys
     SUPERVISED = ("state", "transition", "sensor", "observation")
-    SCORES = ("crps", "energy", "mse")
+    SCORES = MEMBER_SCORES
     TERMS = ("state", "transition", "sensor", "observation", "nll", "kl")
 
     def __init__(
@@ -100,13 +104,14 @@ class DEnKFLoss(SequenceLoss):
         score: Literal["crps", "energy", "mse"] = "crps",
         state: float = 1.0,
         transition: float = 1.0,
-        sensor: float = 1.0,
+        sensor: float | None = None,
         observation: float = 0.0,
         nll: float = 0.0,
         kl: float = 0.0,
-        state_scale: Sequence[float] | torch.Tensor | None = None,
-        observation_scale: Sequence[float] | torch.Tensor | None = None,
+        state_scale: Scale = None,
+        observation_scale: Scale = None,
         angles: Sequence[int] = (),
+        observation_angles: Sequence[int] = (),
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
@@ -117,6 +122,7 @@ class DEnKFLoss(SequenceLoss):
             state_scale=state_scale,
             observation_scale=observation_scale,
             angles=angles,
+            observation_angles=observation_angles,
             detach_every=detach_every,
             reduction=reduction,
         )
@@ -164,17 +170,6 @@ class DEnKFLoss(SequenceLoss):
     def _transition(self, tensordict, out):
         return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
 
-    def _observation(self, tensordict, out):
-        model = self._observation_model()
-        if model is None:
-            raise KeyError(
-                "loss_observation is of a model with an observe() method, and the filter has no observation model with "
-                "one. Set the weight observation=0."
-            )
-        target = self._entry(tensordict, self.tensor_keys.target_observation)
-        error = self._observation_error(model.observe(self._true_state(tensordict)), target)
-        return error.square().mean(-1), torch.ones_like(error[..., 0], dtype=torch.bool)
-
     def _kl(self, tensordict, out):
         return sum(
             (part.kl() for part in self.filter.modules() if isinstance(part, StochasticMLP)), torch.zeros(())
@@ -183,11 +178,4 @@ class DEnKFLoss(SequenceLoss):
     # ------------------------------------------------------------------------------------------------------ helpers
 
     def _score(self, out: TensorDictBase, key: NestedKey, target: torch.Tensor) -> torch.Tensor:
-        return self._score_samples(self._state_error(self._entry(out, key), target.unsqueeze(-2)))
-
-    def _score_samples(self, errors: torch.Tensor) -> torch.Tensor:
-        """Score of members that are off by ``[*, E, N]``."""
-        if self.score == "mse":
-            return errors.mean(-2).square().mean(-1)
-        zero = torch.zeros_like(errors[..., 0, :])
-        return energy_score(errors, zero) if self.score == "energy" else crps_ensemble(errors, zero).mean(-1)
+        return score_members(self._state_error(self._entry(out, key), target.unsqueeze(-2)), self.score)

@@ -10,8 +10,9 @@ import torch
 from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_gaussian, gaussian_log_prob
+from torch_denkf.objectives._base import Scale
 from torch_denkf.objectives._dimensions import DimensionsLoss
+from torch_denkf.objectives._scores import GAUSSIAN_SCORES, score_gaussian
 
 __all__ = ["GaussianLoss"]
 
@@ -25,8 +26,8 @@ class GaussianLoss(DimensionsLoss):
     ========================  =====================================================================================
     ``loss_state``            score of the belief against the true state
     ``loss_transition``       score of the forecast against the true state
-    ``loss_sensor``           fair CRPS of the sensor's samples against the true observation; squared error of their
-                              mean with ``score="mse"``, where there is one sample, or where it writes one reading
+    ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
+                              error of one sample or one reading; squared error of their mean with ``score="mse"``
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
     ========================  =====================================================================================
 
@@ -39,7 +40,8 @@ class GaussianLoss(DimensionsLoss):
             dimensions together, in nats; ``"mse"`` of the mean.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
-        sensor: weight of ``loss_sensor``.
+        sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
+            ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
         dims: state dimensions that count; all of the truth's by default. The belief may have more dimensions than the
             truth, which must then come first.
@@ -47,11 +49,13 @@ class GaussianLoss(DimensionsLoss):
             with infinite scale does not count.
         observation_scale: ``[O]``, likewise, for the sensor.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        observation_angles: likewise, dimensions of observations.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score, or a scale of another length than ``dims``.
+        ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``,
+            or slices that are not marked.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -83,7 +87,7 @@ class GaussianLoss(DimensionsLoss):
         """
 
     default_keys = _AcceptedKeys
-    SCORES = ("crps", "nll", "mse")
+    SCORES = GAUSSIAN_SCORES
     TERMS = ("state", "transition", "sensor", "nll")
 
     def __init__(
@@ -93,12 +97,13 @@ class GaussianLoss(DimensionsLoss):
         score: Literal["crps", "nll", "mse"] = "crps",
         state: float = 1.0,
         transition: float = 1.0,
-        sensor: float = 1.0,
+        sensor: float | None = None,
         nll: float = 0.0,
         dims: Sequence[int] | None = None,
-        state_scale: Sequence[float] | torch.Tensor | None = None,
-        observation_scale: Sequence[float] | torch.Tensor | None = None,
+        state_scale: Scale = None,
+        observation_scale: Scale = None,
         angles: Sequence[int] = (),
+        observation_angles: Sequence[int] = (),
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
@@ -110,6 +115,7 @@ class GaussianLoss(DimensionsLoss):
             state_scale=state_scale,
             observation_scale=observation_scale,
             angles=angles,
+            observation_angles=observation_angles,
             detach_every=detach_every,
             reduction=reduction,
         )
@@ -126,23 +132,8 @@ class GaussianLoss(DimensionsLoss):
 
     def _score(self, out: TensorDictBase, prefix: str, target: torch.Tensor) -> torch.Tensor:
         mean, cov = self._entry(out, (prefix, "mean")), self._entry(out, (prefix, "cov"))
-        errors = self._errors(mean, target)
-        if self.score == "mse":
-            return errors.square().mean(-1)
-        zero, cov = torch.zeros_like(errors), self._cov_of_errors(cov, target.shape[-1])
-        if self.score == "nll":
-            # The density of the state in its own units, so that the scale only conditions the arithmetic.
-            return self._log_units() - gaussian_log_prob(errors, zero, cov)
-        # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
-        variance = cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
-        return crps_gaussian(zero, variance, errors).mean(-1)
-
-    def _cov_of_errors(self, cov: torch.Tensor, size: int) -> torch.Tensor:
-        cov = cov[..., :size, :size]
+        cov = cov[..., : target.shape[-1], : target.shape[-1]]
         if self.dims is not None:
             cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
-        if self.counting is not None:
-            scale = self.state_scale[self.counting]
-            cov = cov.index_select(-1, self.counting).index_select(-2, self.counting)
-            cov = cov / scale.unsqueeze(-1) / scale
-        return cov
+        cov = self._counting("state", cov, -1, -2)
+        return score_gaussian(self._errors(mean, target), cov, self.score, self._scale("state"))

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_weighted, weighted_mean
+from torch_denkf.objectives._base import Scale
 from torch_denkf.objectives._dimensions import DimensionsLoss
 
 __all__ = ["MixtureLoss"]
@@ -29,8 +30,8 @@ class MixtureLoss(DimensionsLoss):
     ``loss_state``            score of the belief against the true state
     ``loss_transition``       score of the forecast, with its weights, against the true state
     ``loss_mean``             squared error of the belief's weighted mean
-    ``loss_sensor``           fair CRPS of the sensor's samples against the true observation; squared error where it
-                              writes one sample or one reading
+    ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
+                              error of one sample or one reading
     ``loss_nll``              negative log-likelihood of the reading, nats; needs no true state
     ========================  =====================================================================================
 
@@ -54,11 +55,13 @@ class MixtureLoss(DimensionsLoss):
             with infinite scale does not count. The mixture is a density of the state in its own units all the same.
         observation_scale: ``[O]``, likewise, for the sensor.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        observation_angles: likewise, dimensions of observations.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score, a width that is not positive, or a scale of another length than ``dims``.
+        ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``, or
+            slices that are not marked.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -114,9 +117,10 @@ class MixtureLoss(DimensionsLoss):
         sensor: float = 0.0,
         nll: float = 0.0,
         dims: Sequence[int] | None = None,
-        state_scale: Sequence[float] | torch.Tensor | None = None,
-        observation_scale: Sequence[float] | torch.Tensor | None = None,
+        state_scale: Scale = None,
+        observation_scale: Scale = None,
         angles: Sequence[int] = (),
+        observation_angles: Sequence[int] = (),
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
@@ -128,6 +132,7 @@ class MixtureLoss(DimensionsLoss):
             state_scale=state_scale,
             observation_scale=observation_scale,
             angles=angles,
+            observation_angles=observation_angles,
             detach_every=detach_every,
             reduction=reduction,
         )
@@ -164,9 +169,12 @@ class MixtureLoss(DimensionsLoss):
         if self.score == "crps":
             return crps_weighted(errors, log_weights, torch.zeros_like(errors[..., 0, :])).mean(-1)
         std = self.component_std
-        if self.counting is not None and std.numel() > 1:
-            std = std.index_select(-1, self.counting)
+        if std.numel() > 1:
+            std = self._counting("state", std)
+        # In the state's own units the density is one of the scaled state, divided by all scales.
+        scale = self._scale("state")
+        units = 0.0 if scale is None else scale.expand(errors.shape[-1]).log().sum()
         std = std.expand(errors.shape[-1])
         log_density = log_weights - 0.5 * (errors / std).square().sum(-1)
-        constant = std.log().sum() + 0.5 * math.log(2 * math.pi) * errors.shape[-1] + self._log_units()
+        constant = std.log().sum() + 0.5 * math.log(2 * math.pi) * errors.shape[-1] + units
         return constant - torch.logsumexp(log_density, -1)

@@ -68,7 +68,7 @@ class HookPoints:
         return batch
 
     def _hooked_values(self, place: str, batch: TensorDictBase) -> dict[str, float]:
-        values = {}
+        values: dict[str, float] = {}
         for op, kwargs in self._ops[place]:
             values.update(op(batch, **kwargs) or {})
         values.pop("log_pbar", None)  # torchrl's wish to be in the bar, not a value

@@ -42,7 +42,8 @@ class RunLogs:
     """
 
     def __init__(self, folder: Path | str, loggers: Iterable[str | Logger] = ("csv",)):
-        self.folder, self._wanted, self._own = Path(folder), list(loggers), []
+        self.folder, self._wanted = Path(folder), list(loggers)
+        self._own: list[Logger] = []
         for logger in self._wanted:
             if isinstance(logger, str) and logger not in _KINDS:
                 raise ValueError(f"Unknown logger {logger!r}: give one of {sorted(_KINDS)} or a torchrl Logger.")

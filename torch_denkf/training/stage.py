@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -95,11 +96,13 @@ class Stage:
         Raises:
             ValueError: if there are none, or ``model`` lacks some: no checkpoint would hold them.
         """
-        parameters = self.parameters
-        if parameters is None:
+        given: list[Any]
+        if self.parameters is None:
             source = self.loss if isinstance(self.loss, nn.Module) else model
-            parameters = [parameter for parameter in source.parameters() if parameter.requires_grad]
-        groups = parameters if parameters and isinstance(parameters[0], dict) else [{"params": parameters}]
+            given = [parameter for parameter in source.parameters() if parameter.requires_grad]
+        else:
+            given = list(self.parameters)
+        groups = given if given and isinstance(given[0], dict) else [{"params": given}]
         groups = [dict(group) for group in groups]  # the optimiser adds its settings to them
         trained, held = [p for group in groups for p in group["params"]], {id(p) for p in model.parameters()}
         if not trained:

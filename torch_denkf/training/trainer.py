@@ -150,7 +150,7 @@ class FilterTrainer(HookPoints):
             ValueError: if the checkpoint is damaged, or of another training; the message names the file.
             FloatingPointError: if too many updates in a row are not finite; names stage and update.
         """
-        state = self.processes.share(self._open(resume) if self.processes.is_main else None)
+        state = self.processes.share(self._open(resume) if self.processes.is_main else {})
         self._load_model(state["model"], str(self.last_checkpoint))
         self._results, self._best = state["results"], state["best"]
         self._last_metrics = state["last_metrics"]
@@ -248,7 +248,7 @@ class FilterTrainer(HookPoints):
         stage = updates.stage
         if self.processes.is_main and self._best is None:  # no validation, or never a finite value
             self._set_best(stage, stage.updates, None, {})
-        best = self.processes.share(self._best)
+        best = self.processes.share(self._best or {})
         self._load_model(best["model"], f"best_{stage.name}.pt")
         result = {key: best[key] for key in ("value", "update", "metrics")}
         self._results[stage.name] = {**result, "path": f"best_{stage.name}.pt", "skipped": updates.skipped}

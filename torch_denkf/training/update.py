@@ -82,7 +82,8 @@ class Updates:
             whether the step was made; the same in all processes.
         """
         terms = self._terms(batch)
-        total = sum(value for name, value in terms.items() if name.startswith("loss"))
+        first, *others = [value for name, value in terms.items() if name.startswith("loss")]
+        total = sum(others, first)
         if not total.requires_grad:
             raise ValueError(f"Stage {self.stage.name!r}: its loss does not depend on the parameters it trains.")
         self.optimiser.zero_grad()

@@ -1,5 +1,6 @@
 """What torchrl environments see of a filter, and what disturbs its frames."""
 
+from torch_denkf.filters.base import LastAction
 from torch_denkf.transforms.denkf import DEnKFTransform
 from torch_denkf.transforms.disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 from torch_denkf.transforms.flow import OpticalFlow
@@ -10,6 +11,7 @@ __all__ = [
     "Blur",
     "Brightness",
     "DEnKFTransform",
+    "LastAction",
     "MissingFrames",
     "OccludingBox",
     "OpticalFlow",

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-__all__ = ["PackagedRun"]
+__all__ = ["PackagedRun", "Step"]
+
+
+class Step(Protocol):
+    """A packaged step, such as :class:`torch_denkf.deployment.PackagedStep`."""
+
+    @property
+    def inputs(self) -> Mapping[str, tuple[tuple[int, ...], str]]:
+        """What a call needs, by name: shape and dtype."""
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """Names of what it returns."""
+
+    def __call__(self, entries: Mapping[str, Tensor], /) -> Mapping[str, Tensor]:
+        """Takes one step."""
 
 
 class PackagedRun:
@@ -29,7 +45,7 @@ class PackagedRun:
 
     def __init__(
         self,
-        step: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]],
+        step: Step,
         *,
         carry: Mapping[NestedKey, NestedKey],
         controls: Sequence[NestedKey],

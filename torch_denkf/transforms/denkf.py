@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 
 import torch
@@ -13,9 +13,9 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters._parts import submodels
-from torch_denkf.filters._recursion import where_rows
-from torch_denkf.transforms._packaged import PackagedRun
+from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters.base import where_rows
+from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
 
@@ -37,6 +37,11 @@ class DEnKFTransform(Transform):
 
     In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
     :class:`~torch_denkf.filters.Filter`.
+
+    A filter belongs either here or into the policy, not both: a policy's filter carries its own belief, under
+    ``("previous", ...)``, and would overwrite this one. Behind this transform, torchrl's ``FrameSkipTransform`` makes
+    one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
+    groups of agents, the belief is the environment's, and starts anew where any agent does.
 
     Args:
         filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
@@ -79,7 +84,7 @@ class DEnKFTransform(Transform):
         store_ensemble: bool = True,
         no_grad: bool = True,
         check_finite: bool = True,
-        packaged: Callable[[Mapping[str, torch.Tensor]], Mapping[str, torch.Tensor]] | None = None,
+        packaged: Step | None = None,
     ):
         if not isinstance(filter, Filter):
             if not isinstance(filter, TensorDictSequential) or initial is None:
@@ -91,32 +96,32 @@ class DEnKFTransform(Transform):
         elif initial is not None:
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
         self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
-        unknown = [key for key in self._keep if key not in map(unravel_key, filter.out_keys)]
+        unknown = [key for key in self._keep if key not in filter.out_keys]
         if unknown:
             raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(filter.out_keys)}.")
-        reads = [key for key in map(unravel_key, filter.in_keys) if key not in filter.carry_keys]
+        structure = filter.structure
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
         dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var")]
         super().__init__(
-            in_keys=[key for key in reads if key not in filter.control_keys],
+            in_keys=list(structure.needed),
             out_keys=[key for key in self._keep if key not in dropped],
         )
         self._dropped_keys = dropped
         self._names = {key: (*key[:-1], "_" + key[-1]) if key in dropped else key for key in self._keep}
         self.filter = filter
-        self._controls = [key for key in reads if key in filter.control_keys]
-        optional = [key for part in submodels(filter.module) for key in part.optional_keys]
-        self._optional = list(dict.fromkeys(optional))
+        self._controls, self._optional = list(structure.controls), list(structure.optional)
         if packaged is not None and not no_grad:
             raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
-        self._packaged = packaged and PackagedRun(
-            packaged,
-            carry={key: self._names[key] for key in filter.carry_keys},
-            controls=self._controls,
-            frames=self.in_keys,
-            optional=self._optional,
-            keep=self._keep,
-        )
+        self._packaged = None
+        if packaged is not None:
+            self._packaged = PackagedRun(
+                packaged,
+                carry={key: self._names[key] for key in filter.carry_keys},
+                controls=self._controls,
+                frames=self.in_keys,
+                optional=self._optional,
+                keep=self._keep,
+            )
 
     # ----------------------------------------------------------------------------------------- in an environment
 
@@ -128,11 +133,11 @@ class DEnKFTransform(Transform):
             kept = self._packaged(tensordict, next_tensordict)
             if kept is not None:  # otherwise what follows says what is missing
                 if self.check_finite and not all(torch.isfinite(kept[key]).all() for key in self.filter.carry_keys):
-                    self._assert_finite(next_tensordict.copy().update(kept))
+                    self._assert_finite({**_present(next_tensordict, self.in_keys), **kept})
                 for key, name in self._names.items():
                     next_tensordict.set(name, kept[key])
                 return next_tensordict
-        row = next_tensordict.empty()
+        entries = {}
         for key in self.filter.carry_keys:
             name = self._names[key]
             value = tensordict.get(name, None)
@@ -141,19 +146,19 @@ class DEnKFTransform(Transform):
                     f"DEnKFTransform carries the belief in {name!r}, but the tensordict passed to env.step() lacks it. "
                     "Start from env.reset(), and pass on what step_mdp() or env.step_and_maybe_reset() return."
                 )
-            row.set(key, value)
-        self._copy(tensordict, row, self._controls, "the tensordict passed to env.step()")
-        self._copy(next_tensordict, row, self.in_keys, "the environment")
+            entries[key] = value
+        self._copy(tensordict, entries, self._controls, "the tensordict passed to env.step()")
+        self._copy(next_tensordict, entries, self.in_keys, "the environment")
         for key in self._optional:
             value = next_tensordict.get(key, None)
             if value is not None:
-                row.set(key, value)
+                entries[key] = value
         with self._grad_mode(), set_recurrent_mode(False):
-            row = self.filter.step(row)
+            written = self.filter.take_step(entries, next_tensordict.batch_size)
         if self.check_finite:
-            self._assert_finite(row)
+            self._assert_finite({**entries, **written})
         for key, name in self._names.items():
-            next_tensordict.set(name, row.get(key))
+            next_tensordict.set(name, written[key])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -161,9 +166,9 @@ class DEnKFTransform(Transform):
             start = self.filter.initialise(tensordict_reset.copy())
             if any(start.get(key, None) is None for key in self._keep):
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
-                template = self.filter.step(self._with_zero_controls(start.copy()))
+                template = self._trial(start.copy())
                 for key in self._keep:
-                    start.set(key, start.get(key, torch.zeros_like(template.get(key))))
+                    start.set(key, start.get(key, torch.zeros_like(template[key])))
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
         if given and all(value is not None for value in given.values()):
             mask = self._reset_mask(tensordict)
@@ -171,7 +176,7 @@ class DEnKFTransform(Transform):
                 start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
             start = self.filter.summarise(start)
         if self.check_finite:
-            self._assert_finite(start)
+            self._assert_finite(_present(start, (*self.in_keys, *self.filter.carry_keys)))
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(key))
         return tensordict_reset
@@ -182,15 +187,19 @@ class DEnKFTransform(Transform):
     def _reset_mask(self, tensordict: TensorDictBase) -> torch.Tensor | None:
         keys = ["_reset"] if self.parent is None else self.parent.reset_keys
         masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
-        return masks[0].reshape(*tensordict.batch_size, -1).any(-1) if masks else None
+        if not masks:
+            return None
+        # The belief is the environment's: it starts anew where any group or agent does.
+        return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
-    def _with_zero_controls(self, row: TensorDictBase) -> TensorDictBase:
+    def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
+        """All that a step from ``row`` without actions writes."""
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
-        return row
+        return self.filter.take_step(self.filter.entries_of(row), row.batch_size)
 
-    def _copy(self, source: TensorDictBase, target: TensorDictBase, keys, owner: str) -> None:
+    def _copy(self, source: TensorDictBase, target: dict | TensorDictBase, keys, owner: str) -> None:
         for key in keys:
             value = source.get(key, None)
             if value is None:
@@ -199,12 +208,16 @@ class DEnKFTransform(Transform):
                     f"{sorted(map(str, source.keys(True, True)))}. Rename the key in the filter's sub-model, or put a "
                     "transform that writes it before DEnKFTransform."
                 )
-            target.set(key, value)
+            if isinstance(target, dict):
+                target[key] = value
+            else:
+                target.set(key, value)
 
-    def _assert_finite(self, row: TensorDictBase) -> None:
-        if all(torch.isfinite(row.get(key)).all() for key in self.filter.carry_keys):
+    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor]) -> None:
+        if all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys):
             return
-        inputs = [key for key in self.in_keys if not torch.isfinite(row.get(key)).all()]
+        given = {key: entries[key] for key in self.in_keys if key in entries}
+        inputs = [key for key, value in given.items() if not torch.isfinite(value).all()]
         if inputs:
             raise ValueError(
                 f"The belief became non-finite because of NaN or infinity in {inputs}. Where a frame is missing or "
@@ -234,9 +247,9 @@ class DEnKFTransform(Transform):
         row.update(probe)
         # The shapes come from a trial; it must not use up random numbers.
         with torch.no_grad(), torch.random.fork_rng(devices=_cuda_devices(row)), set_recurrent_mode(False):
-            row = self.filter.step(self._with_zero_controls(self.filter.initialise(row)))
+            written = self._trial(self.filter.initialise(row))
         for key in keys:
-            value = row.get(key)
+            value = written[key]
             spec[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
         return spec
 
@@ -280,7 +293,15 @@ class DEnKFTransform(Transform):
     # ------------------------------------------------------------------------------------------ in a replay buffer
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`."""
+        """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`.
+
+        torchrl's buffers apply their transforms before ``SliceSampler`` marks the slices: a buffer of flat slices is
+        refused. Filter what it returns, or store whole windows ``[T]`` as its items.
+
+        Raises:
+            ValueError: if a flat batch seems to hold several sequences that are not marked.
+        """
+        refuse_unmarked_slices(tensordict, self.filter.init_key)
         with self._grad_mode(), set_recurrent_mode(True):
             return self.filter(tensordict)
 
@@ -288,3 +309,8 @@ class DEnKFTransform(Transform):
 def _cuda_devices(tensordict: TensorDictBase) -> list[torch.device]:
     device = tensordict.device
     return [device] if device is not None and device.type == "cuda" else []
+
+
+def _present(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> dict[NestedKey, torch.Tensor]:
+    """The entries that are there."""
+    return {key: value for key in keys if (value := tensordict.get(key, None)) is not None}

@@ -157,8 +157,8 @@ class Brightness(ImageDisturbance):
     def _disturb(self, frames: Tensor) -> Tensor:
         values = to_float(frames)
         draw = torch.rand(2, len(frames), 1, 1, 1, generator=self.generator, device=frames.device).to(values.dtype)
-        gain = torch.lerp(*values.new_tensor(self.gain), draw[0])
-        offset = torch.lerp(*values.new_tensor(self.offset), draw[1])
+        (weakest, strongest), (darkest, brightest) = values.new_tensor(self.gain), values.new_tensor(self.offset)
+        gain, offset = torch.lerp(weakest, strongest, draw[0]), torch.lerp(darkest, brightest, draw[1])
         return to_dtype(gain * values + offset * scale_of(frames), frames)
 
 

@@ -25,11 +25,12 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
     Returns:
         ``[H, W, 2]``, float32: motion to the right and down, in units of the focal length (tangents).
     """
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV refuses cut-outs
     # Searched from the current image, so that the vectors stand on its grid.
-    return -dis.calc(current, previous, None) / camera.focal
+    flow = dis.calc(current, previous, None)  # type: ignore[call-overload]  # cv2 does not say that None is one to make
+    return -flow / camera.focal
 
 
 def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:

@@ -76,7 +76,8 @@ def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
     forward = lanes * np.sin(left) + ahead[:, None] * np.cos(left)
     depth = forward * np.cos(pitch) - height * np.sin(pitch)
     down = height * np.cos(pitch) + forward * np.sin(pitch)
-    plan = cv2.remap(image, *camera.pixels(right / depth, down / depth - up), cv2.INTER_LINEAR)
+    columns, rows = camera.pixels(right / depth, down / depth - up)
+    plan = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
     # Shading that varies slowly would match at any distance.
     return plan - cv2.GaussianBlur(plan, (0, 0), sigmaX=3.2, sigmaY=10)
 

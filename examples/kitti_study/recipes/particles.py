@@ -46,7 +46,6 @@ class _Particles(Recipe):
             ),
             [3, 4],
             before=True,
-            ensemble_size=PARTICLES,
         )
         modules = OrderedDict()
         if self.learned:

@@ -49,7 +49,8 @@ class DEnKF(Recipe):
         return AroundState(std, ensemble_size=self.ensemble_size, state_key=state_key)
 
     def loss(self, model):
-        loss = DEnKFLoss(model, sensor=0.0, state_scale=self.state_scale)
+        share = self.state_scale.isfinite().float().mean().item()  # a score is the mean over what counts
+        loss = DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
         loss.set_keys(state="motion_and_bias" if self.bias else "motion")
         return loss
 

@@ -40,22 +40,10 @@ class LSTM(Recipe):
 
     def belief(self, std, state_key):
         # Of ten numbers: it has no use for rates.
-        return WithMemory(_FirstTen(GaussianAround(std[:STATE], state_key=state_key), state_key), HIDDEN)
+        return WithMemory(AtRest(GaussianAround(std[:STATE], state_key=state_key), state_key, STATE), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=range(STATE), state_scale=ERRORS)
 
     def set_inflation(self, model, factor):
         model["lstm"].inflation = factor
-
-
-class _FirstTen(AtRest):
-    """A belief around the table's part of a state."""
-
-    def forward(self, tensordict):
-        """Writes the belief."""
-        state = self.read(tensordict, self.in_keys[0])[..., :STATE]
-        out = self.module(tensordict.copy().set(self.in_keys[0], state))
-        for key in self.out_keys:
-            tensordict.set(key, out.get(key))
-        return tensordict

@@ -29,9 +29,7 @@ class _Particles(Recipe):
     bias = False  # a hundred particles do not fill ten dimensions more
 
     def modules(self):
-        noisy = NoisyTransition(
-            self.transition(), self.process_noise(), self.noisy, before=True, ensemble_size=PARTICLES
-        )
+        noisy = NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True)
         modules = OrderedDict()
         if not self.learned:
             modules["noise"] = self.noise()

@@ -1,0 +1,165 @@
+"""Filters out of features that nobody combined before, and an environment that replays frames to them."""
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from tests.filters.factories import FixedEnsemble
+from torch_denkf.filters import Filter
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    LearnedObservation,
+    LearnedTransition,
+    StochasticMLP,
+    VectorSensor,
+)
+
+E, S, A, B, T = 5, 3, 2, 3, 9
+FEATURES = (
+    "two sensors",
+    "two analyses",
+    "mask on one",
+    "flipout",
+    "dropout",
+    "actions",
+    "extra outputs",
+    "foreign module",
+    "stored carry",
+    "resets",
+)
+
+
+class TransitionWithSpeed(LearnedTransition):
+    """Writes one entry more than the forecast."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.out_keys = [("forecast", "speed"), *self.out_keys]
+
+    def compute(self, state, *args, noise):
+        forecast = super().compute(state, *args, noise=noise)
+        return (forecast - state).norm(dim=-1), forecast
+
+
+def compose(features, *, frozen_start=True):
+    """A filter with some of ``FEATURES``, float64, free of randomness but that of its sub-models."""
+    torch.manual_seed(0)
+    layer = "flipout" if "flipout" in features else "dropout" if "dropout" in features else "none"
+    kind = TransitionWithSpeed if "extra outputs" in features else LearnedTransition
+    width = S + A * ("actions" in features)
+    network = StochasticMLP(width, S, (8,), layer=layer, rate=0.3, output_gain=0.5)
+    modules = {
+        "transition": kind(network, action_key="action" if "actions" in features else None),
+        "sensor": VectorSensor(4, 2, ensemble_size=E, num_cells=(8,), layer=layer, rate=0.3, in_key="a"),
+        "noise": ConstantNoise([0.4, 0.6]),
+        "observation": LearnedObservation(StochasticMLP(S, 2, (8,), layer="none")),
+    }
+    if "foreign module" in features:
+        pull = nn.Linear(S, S)
+        key = ("forecast", "ensemble")
+        modules["pull"] = TensorDictSequential(TensorDictModule(pull, [key], [key]))
+        modules["observation"] = TensorDictModule(nn.Linear(S, 2), [key], [("forecast", "observation")])
+        order = ["transition", "pull", "sensor", "noise", "observation"]
+        modules = {name: modules[name] for name in order}
+    names = ["belief"] + ["first"] * ("two sensors" in features) + ["second"] * ("two analyses" in features)
+    observed = "seen" if "mask on one" in features else "observed"
+    modules["analysis"] = EnsembleAnalysis("perturbed", observed_key=observed, belief_key=names[-1])
+    if "two sensors" in features:
+        modules["sensor_b"] = VectorSensor(
+            4, 3, ensemble_size=E, num_cells=(8,), layer=layer, rate=0.3, in_key="b", out_key=("other", "ensemble")
+        )
+        modules["noise_b"] = ConstantNoise([0.3] * 3, in_key=("other", "ensemble"), out_key=("other", "noise"))
+        before = names[-1]
+        names.pop()
+        modules["observation_b"] = LearnedObservation(
+            nn.Linear(S, 3), in_key=(before, "ensemble"), out_key=("other", "predicted")
+        )
+        modules["analysis_b"] = EnsembleAnalysis(
+            "perturbed",
+            forecast_key=(before, "ensemble"),
+            predicted_key=("other", "predicted"),
+            sensor_key=("other", "ensemble"),
+            noise_variance_key=("other", "noise"),
+            belief_key=names[-1],
+        )
+    if "two analyses" in features:
+        before = names[-1]
+        names.pop()
+        modules["noise_c"] = ConstantNoise([0.5, 0.5], in_key="c", out_key=("c_noise"))
+        modules["observation_c"] = LearnedObservation(
+            nn.Linear(S, 2), in_key=(before, "ensemble"), out_key=("c_predicted")
+        )
+        modules["analysis_c"] = EnsembleAnalysis(
+            "perturbed",
+            forecast_key=(before, "ensemble"),
+            predicted_key="c_predicted",
+            sensor_key="c",
+            noise_variance_key="c_noise",
+            belief_key=names[-1],
+        )
+    assert names == ["belief"]
+    return Filter(modules, initial=FixedEnsemble(torch.randn(E, S)))
+
+
+def frames_for(features):
+    """Readings for every sensor, masks, actions and starts, ``[B, T]``."""
+    torch.manual_seed(1)
+    frames = TensorDict({"a": torch.randn(B, T, 4), "b": torch.randn(B, T, 4), "c": torch.randn(B, T, 2)}, [B, T])
+    frames["action"] = torch.randn(B, T, A)
+    if "mask on one" in features:
+        frames["seen"] = torch.rand(B, T, 2) < 0.6
+    frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = True
+    if "resets" in features:
+        frames["is_init"][0, 4] = frames["is_init"][2, 6] = True
+    return frames
+
+
+class ReplayedFrames(EnvBase):
+    """Emits frames ``[B, T]`` one after the other; an episode ends where the next frame starts one."""
+
+    def __init__(self, frames):
+        super().__init__(batch_size=frames.batch_size[:-1])
+        self.frames, self.keys = frames, sorted(set(frames.keys()) - {"is_init", "action", "noise"})
+        self.observation_spec = Composite(
+            {
+                key: (Binary if frames[key].dtype == torch.bool else Unbounded)(
+                    shape=frames[key][:, 0].shape, dtype=frames[key].dtype
+                )
+                for key in self.keys
+            },
+            index=Unbounded(shape=(*self.batch_size, 1), dtype=torch.int64),
+            shape=self.batch_size,
+        )
+        self.state_spec = Composite(shape=self.batch_size)
+        self.action_spec = Unbounded(shape=frames["action"][:, 0].shape, dtype=frames["action"].dtype)
+        self.reward_spec = Unbounded(shape=(*self.batch_size, 1))
+        self.now = 0
+
+    def _emit(self):
+        out = self.frames[:, self.now].select(*self.keys).copy()
+        return out.set("index", torch.full((*self.batch_size, 1), self.now))
+
+    def _reset(self, tensordict, **kwargs):
+        reset = None if tensordict is None else tensordict.get("_reset", None)
+        if reset is None or reset.all():
+            self.now = 0
+        out = self._emit()
+        return out.set("done", torch.zeros(*self.batch_size, 1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        self.now = min(self.now + 1, self.frames.shape[-1] - 1)
+        done = self.frames["is_init"][:, self.now].clone()
+        return self._emit().update({"done": done, "reward": torch.zeros(*self.batch_size, 1)})
+
+    def _set_seed(self, seed):
+        return seed
+
+    def player(self):
+        """A policy that plays the recorded actions."""
+        actions = self.frames["action"]
+        return TensorDictModule(lambda index: actions[:, index.flatten()[0]], ["index"], ["action"])

@@ -1,0 +1,152 @@
+"""Flat batches of torchrl's replay buffers. Oracle: the same data as [B, T], and slice by slice."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler, TensorDictReplayBuffer
+
+from tests.filters.factories import linear_denkf
+from torch_denkf.objectives import DEnKFLoss, TransitionLoss
+
+LENGTHS = (9, 7, 12)
+CURE = r"TensorDictReplayBuffer.*reshape.*batch\[None\]"
+
+
+def episodes(*, following=True, init=False):
+    """Episodes end to end, as they are stored."""
+    rows = []
+    for index, count in enumerate(LENGTHS):
+        values = torch.randn(count + 1, 2)
+        last = torch.arange(count).unsqueeze(-1) == count - 1
+        row = {"observation": values[:-1], "state": torch.randn(count, 2), "next": {"done": last}}
+        row["episode"] = torch.full((count,), index)
+        if following:
+            row["next"]["observation"] = values[1:]
+        if init:
+            row["is_init"] = torch.arange(count).unsqueeze(-1) == 0
+        rows.append(TensorDict(row, [count]))
+    return torch.cat(rows)
+
+
+def buffer(kind, rows, key, *, strict=True):
+    ways = {"traj_key": {"traj_key": "episode"}, "end_key": {"end_key": ("next", "done")}}
+    sampler = SliceSampler(num_slices=4, strict_length=strict, **ways[key])
+    out = kind(storage=LazyTensorStorage(len(rows)), sampler=sampler, batch_size=20 if strict else 40)
+    out.extend(rows)
+    return out
+
+
+def objective(**kwargs):
+    return DEnKFLoss(linear_denkf(), **kwargs)
+
+
+@pytest.mark.parametrize("key", ["traj_key", "end_key"])
+@pytest.mark.parametrize("init", [False, True])
+def test_slices_of_one_length_with_marks(float64, key, init):
+    batch = buffer(TensorDictReplayBuffer, episodes(init=init), key).sample()
+    side_by_side = batch.select("observation", "state").reshape(4, 5)
+    loss = objective(nll=1.0)
+    expected, got = loss(side_by_side), loss(batch)
+    assert set(got.keys()) == {"loss_state", "loss_transition", "loss_nll"}
+    for name in list(expected.keys()):
+        torch.testing.assert_close(got[name], expected[name], rtol=1e-10, atol=1e-12)
+    steps = TransitionLoss(linear_denkf())
+    torch.testing.assert_close(steps(batch)["loss_transition"], steps(side_by_side)["loss_transition"])
+    assert (objective(reduction="none")(batch)["loss_state"].reshape(4, 5)[:, 0] == 0).all()
+
+
+@pytest.mark.parametrize("init", [False, True])
+def test_slices_of_different_lengths(float64, init):
+    batch = buffer(TensorDictReplayBuffer, episodes(init=init), "traj_key", strict=False).sample()
+    done = batch["next", "done"].squeeze(-1)
+    lengths = (done.nonzero().flatten() + 1).diff(prepend=torch.zeros(1, dtype=torch.long))
+    assert lengths.numel() == 4
+    assert lengths.unique().numel() > 1
+    plain = batch.select("observation", "state").split(lengths.tolist())
+    loss, alone = objective(reduction="sum"), objective(reduction="sum")
+    expected = sum(alone(part)["loss_state"] for part in plain)
+    torch.testing.assert_close(loss(batch)["loss_state"], expected, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("key", ["traj_key", "end_key"])
+@pytest.mark.parametrize("init", [False, True])
+@pytest.mark.parametrize("kept", ["next", "episode", "flags"])
+def test_without_marks_slices_are_refused(key, init, kept):
+    data = buffer(ReplayBuffer, episodes(init=init, following=kept != "flags"), key)
+    batch = data.sample()
+    while not batch["episode"].diff().any():  # slices of one episode: its number says nothing
+        batch = data.sample()
+    if kept == "next":
+        batch = batch.exclude("episode")
+    elif kept == "episode":
+        batch = batch.exclude("next")
+    else:  # nothing is left that could tell
+        batch = batch.exclude("episode").set(("next", "done"), torch.zeros(20, 1, dtype=torch.bool))
+        if init:
+            batch["is_init"] = torch.zeros(20, 1, dtype=torch.bool)
+    for loss in (objective(), TransitionLoss(linear_denkf())):
+        with pytest.raises(ValueError, match=CURE):
+            loss(batch)
+        assert loss(batch.reshape(4, 5))["loss_transition"].isfinite()
+
+
+def test_two_slices_of_one_episode_are_refused_where_a_clock_tells():
+    loss = objective()
+    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
+    loss(rows)  # nothing says that these are several
+    for key, clock, refused in (
+        ("step", torch.arange(12), False),
+        ("step", 3 * torch.arange(12).unsqueeze(-1), False),
+        ("step", torch.arange(6).repeat(2), True),
+        ("step", torch.cat([torch.arange(6), torch.arange(9, 15)]), True),
+        ("time", torch.arange(12) * 0.1 + 0.01 * torch.rand(12), False),
+        ("time", torch.cat([torch.arange(6), torch.arange(40, 46)]) * 0.1, True),
+        (("collector", "traj_ids"), torch.zeros(12, dtype=torch.long), False),
+        (("collector", "traj_ids"), torch.arange(12) // 6, True),
+    ):
+        batch = rows.copy().set(key, clock)
+        if refused:
+            with pytest.raises(ValueError, match=r"seems to hold several sequences.* at 6, and"):
+                loss(batch)
+            marked = batch.set("is_init", torch.arange(12) % 6 == 0)
+            torch.testing.assert_close(loss(marked)["loss_state"], loss(rows.reshape(2, 6))["loss_state"])
+        else:
+            torch.testing.assert_close(loss(batch)["loss_state"], loss(rows)["loss_state"])
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_rollout_is_one_sequence(ended):
+    loss = objective()
+    values = torch.randn(10, 2)
+    done = torch.zeros(9, 1, dtype=torch.bool)
+    done[-1] = ended
+    following = {"observation": values[1:], "done": done, "truncated": done}
+    rollout = TensorDict({"observation": values[:-1], "state": torch.randn(9, 2), "next": following}, [9])
+    expected = loss(rollout.select("observation", "state"))["loss_state"]
+    torch.testing.assert_close(loss(rollout)["loss_state"], expected)
+    # A robot that stands still, a pixel-wise change of the sampled frames alone, and numbers that are missing.
+    rollout["camera"], rollout["next", "camera"] = torch.randn(9, 1), torch.randn(9, 1)
+    torch.testing.assert_close(loss(rollout)["loss_state"], expected)
+    flags = rollout.copy()
+    flags["next"] = flags["next"].select("done", "truncated")
+    if ended:
+        torch.testing.assert_close(loss(flags)["loss_state"], expected)
+    else:
+        with pytest.raises(ValueError, match="may hold several sequences"):
+            loss(flags)
+        torch.testing.assert_close(loss(flags[None])["loss_state"], expected)
+
+
+def test_truncated_ends_a_slice_like_done():
+    loss = objective()
+    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
+    cut = rows.copy().set(("next", "truncated"), (torch.arange(12) % 6 == 5).unsqueeze(-1))
+    torch.testing.assert_close(loss(cut)["loss_state"], loss(rows.reshape(2, 6))["loss_state"])
+
+
+def test_an_episode_that_is_done_needs_a_mark_after_it():
+    rows = TensorDict({"observation": torch.randn(12, 2), "state": torch.randn(12, 2)}, [12])
+    rows["is_init"] = torch.arange(12).unsqueeze(-1) == 0
+    rows["next", "done"] = (torch.arange(12) % 6 == 5).unsqueeze(-1)
+    with pytest.raises(ValueError, match=r"is done, and the next begins, at 6"):
+        objective()(rows)

@@ -1,0 +1,190 @@
+"""Infinite scales, filters without a sensor, one member. Oracles: the loss without those dimensions, by hand."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from tests.filters.factories import (
+    OBS,
+    NoisyLinear,
+    S,
+    linear_denkf,
+    linear_kalman,
+    toy_denkf,
+    toy_frames,
+)
+from tests.filters.particle_for_tests import toy_filter
+from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
+from tests.objectives.problem_for_tests import only, problem, stepped
+from torch_denkf.filters import Filter
+from torch_denkf.modules import SubModel
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+
+SCORES = ["crps", "energy", "mse"]
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_a_dimension_with_infinite_scale_does_not_count(score):
+    filter = toy_denkf()
+    frames, out = problem(filter)
+    scale, kept = torch.tensor([0.5, math.inf, 4.0]), [0, 2]
+    by_hand = lambda ensemble, truth, scale, dims: score_by_hand(  # noqa: E731
+        score, ensemble[..., dims] / scale[dims], truth[..., dims] / scale[dims]
+    )
+    steps, observed = stepped(frames), frames["observed"].all(-1)
+    expected = by_hand(out["belief", "ensemble"], frames["state"], scale, kept)[steps].mean()
+    losses = DEnKFLoss(filter, score=score, state_scale=scale, observation_scale=[math.inf, 3.0])(frames)
+    torch.testing.assert_close(losses["loss_state"], expected, **CLOSE)
+    units = torch.tensor([math.inf, 3.0])
+    expected = by_hand(out["sensor", "ensemble"], frames["target_observation"], units, [1])[observed].mean()
+    torch.testing.assert_close(losses["loss_sensor"], expected, **CLOSE)
+    alone = SensorLoss(filter, score=score, observation_scale=units)(frames)["loss_sensor"]
+    torch.testing.assert_close(alone, expected, **CLOSE)
+    # What does not count may hold anything, and an angle keeps its place.
+    frames["state"][..., 1] = math.inf
+    again = DEnKFLoss(filter, score=score, **ONLY_STATE, state_scale=scale, angles=[1])(frames)["loss_state"]
+    assert again.equal(losses["loss_state"])
+    again.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())
+    one_step = TransitionLoss(filter, score=score, state_scale=scale)
+    frames["state"][..., 1] = 0.0
+    first = one_step(frames)["loss_transition"]
+    frames["state"][:, -1, 1] = 5.0  # where no step begins
+    assert one_step(frames)["loss_transition"].equal(first)
+
+
+def test_infinite_scales_of_the_observation_model():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    error = (filter["observation"].module(frames["state"]) - frames["target_observation"])[..., 1] / 3
+    loss = ObservationLoss(filter, observation_scale=[math.inf, 3.0])
+    torch.testing.assert_close(loss(frames)["loss_observation"], error.square().mean(), **CLOSE)
+
+
+def test_infinite_scales_of_a_mixture_are_those_of_fewer_dimensions():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    for score in ("mixture", "crps"):
+        some = MixtureLoss(filter, score=score, state_scale=[0.5, math.inf, 4.0])(frames)["loss_state"]
+        chosen = MixtureLoss(filter, score=score, state_scale=[0.5, 4.0], dims=[0, 2])(frames)["loss_state"]
+        torch.testing.assert_close(some, chosen, **CLOSE)
+
+
+def test_a_loaded_scale_counts_other_dimensions():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    first = DEnKFLoss(filter, **ONLY_STATE, state_scale=[1.0, math.inf, 2.0])
+    second = DEnKFLoss(filter, **ONLY_STATE, state_scale=[1.0, 1.0, 1.0])
+    assert not second(frames)["loss_state"].equal(first(frames)["loss_state"])
+    second.load_state_dict(first.state_dict())
+    assert second(frames)["loss_state"].equal(first(frames)["loss_state"])
+
+
+@pytest.mark.parametrize("scale", [[1.0, 0.0, 1.0], [1.0, -1.0, 1.0], [math.inf] * 3, [1.0, math.nan, 1.0]])
+def test_scales_that_are_none(scale):
+    for loss in (DEnKFLoss, MixtureLoss, TransitionLoss):
+        with pytest.raises(ValueError, match="state_scale is positive"):
+            loss(toy_denkf(), state_scale=scale)
+    with pytest.raises(ValueError, match="observation_scale is positive"):
+        SensorLoss(toy_denkf(), observation_scale=scale)
+
+
+# ------------------------------------------------------------------------------------- filters without a sensor
+
+
+@pytest.mark.parametrize(("loss", "make"), [(DEnKFLoss, linear_denkf), (GaussianLoss, linear_kalman)])
+def test_a_filter_without_a_sensor_has_no_term_of_one(loss, make):
+    filter = make()
+    frames = TensorDict({"observation": torch.randn(2, 5, 2), "state": torch.randn(2, 5, 2)}, [2, 5])
+    default, zero = loss(filter), loss(filter, sensor=0.0)
+    assert default.out_keys == zero.out_keys == ["loss_state", "loss_transition"]
+    assert all(default(frames)[key].equal(zero(frames)[key]) for key in default.out_keys)
+    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing.*sensor=0\.0"):
+        loss(filter, sensor=1.0)(frames)
+    # Samples that lie in the data, once they are named.
+    frames["samples"] = torch.randn(2, 5, 4, 2)
+    frames["target_observation"] = torch.randn(2, 5, 2)
+    default.set_keys(sensor="samples")
+    assert default.out_keys == ["loss_state", "loss_transition", "loss_sensor"]
+    expected = score_by_hand("crps", frames["samples"], frames["target_observation"]).mean()
+    torch.testing.assert_close(default(frames)["loss_sensor"], expected, **CLOSE)
+
+
+def test_a_missing_target_names_the_cures():
+    filter = toy_denkf()
+    frames, _ = problem(filter)
+    assert DEnKFLoss(filter).weights["sensor"] == 1.0
+    for loss in (DEnKFLoss(filter), SensorLoss(filter)):
+        with pytest.raises(KeyError, match=r"target_observation.*Add the entry.*sensor=0\.0"):
+            loss(frames.exclude("target_observation"))
+    loss = SensorLoss(filter, noise=1.0)
+    loss.set_keys(noise=("forecast", "noise"))
+    with pytest.raises(KeyError, match="R must follow from frames alone"):
+        loss(frames)
+
+
+# --------------------------------------------------------------------------------------------------- one member
+
+
+class Point(SubModel):
+    """An initial belief of one member; it has no variance."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [], [("belief", "ensemble")])
+        self.ensemble_size = 1
+
+    def compute(self, *, batch_size):
+        return torch.ones(*batch_size, 1, 2)
+
+
+class Believe(SubModel):
+    """The belief is the forecast."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("belief", "ensemble")])
+
+    def compute(self, ensemble):
+        return ensemble.clone()
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_one_member_is_a_point(score):
+    move = NoisyLinear(torch.tensor([[0.5, 1.0], [0.0, 0.9]]))
+    move.matrix.requires_grad_()
+    filter = Filter(move, Believe(), initial=Point())
+    frames = TensorDict({"state": torch.randn(2, 5, 2), "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)}, [2, 5])
+    member = filter.sequence(frames.copy())["belief", "ensemble"].squeeze(-2)
+    scale = torch.tensor([2.0, 0.5])
+    error = ((member - frames["state"]) / scale)[:, 1:]
+    expected = {"crps": error.abs().mean(), "mse": error.square().mean()}
+    expected["energy"] = error.square().sum(-1).sqrt().mean()
+    value = DEnKFLoss(filter, score=score, state_scale=scale)(frames)["loss_state"]
+    torch.testing.assert_close(value, expected[score], **CLOSE)
+    (gradient,) = torch.autograd.grad(value, move.matrix, retain_graph=True)
+    (by_hand,) = torch.autograd.grad(expected[score], move.matrix)
+    torch.testing.assert_close(gradient, by_hand)
+    step = TransitionLoss(filter, score="crps")(frames)["loss_transition"]
+    moved = frames["state"][:, :-1] @ move.matrix.mT - frames["state"][:, 1:]
+    torch.testing.assert_close(step, moved.abs().mean(), **CLOSE)
+
+
+@pytest.mark.parametrize("make", [DEnKFLoss, MixtureLoss, SensorLoss])
+def test_one_sample_of_the_sensor_is_a_point(make):
+    filter = toy_filter()
+    filter["sensor"].ensemble_size = 1
+    frames = toy_frames((2, 7))
+    frames["state"], frames["target_observation"] = torch.randn(2, 7, S), torch.randn(2, 7, OBS)
+    filter.draw_noise(frames)
+    out = filter.sequence(frames.copy())
+    assert out["sensor", "ensemble"].shape == (2, 7, 1, OBS)
+    error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"])[frames["observed"].all(-1)]
+    weights = {} if make is SensorLoss else only(TERMS if make is DEnKFLoss else ["state", "sensor"], "sensor")
+    torch.testing.assert_close(make(filter, **weights)(frames)["loss_sensor"], error.abs().mean(), **CLOSE)

@@ -1,0 +1,193 @@
+"""torchrl's losses on a policy with a filter inside: the oracle is the loss written out, step by step."""
+
+import pytest
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import nn
+from torch.distributions import Independent, Normal
+from torchrl.envs import TransformedEnv
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules.utils import get_env_transforms_from_module
+from torchrl.objectives import ClipPPOLoss, DDPGLoss, SACLoss
+
+from tests.filters.composed import A, B, ReplayedFrames, S, T, compose, frames_for
+
+MEAN = ("belief", "mean")
+
+
+def filter_and_frames(actions=True):
+    features = ["resets", "mask on one", "two sensors"] + ["actions"] * actions
+    filter = compose(features)
+    for name in ("analysis", "analysis_b"):
+        filter[name].scheme = "sakov"  # without noise of its own, so that both computations are the same numbers
+    return filter, frames_for(features)
+
+
+class SummedNormal(Independent):
+    """Independent actions."""
+
+    def __init__(self, loc, scale):
+        super().__init__(Normal(loc, scale), 1)
+
+
+class Player(nn.Module):
+    """The recorded actions, so that data do not depend on the networks."""
+
+    def __init__(self, frames):
+        super().__init__()
+        self.actions = frames["action"]
+
+    def forward(self, index):
+        return self.actions[:, index.flatten()[0]]
+
+
+def collected(filter, frames):
+    """Data as a collector's: the filter is in the policy, its belief is carried by the primer."""
+    env = ReplayedFrames(frames)
+    policy = TensorDictSequential(filter, TensorDictModule(Player(frames), ["index"], ["action"]))
+    env = TransformedEnv(env, get_env_transforms_from_module(policy))
+    torch.manual_seed(0)
+    with torch.no_grad():
+        data = env.rollout(T, policy, break_when_any_done=False)
+    data["next", "reward"] = torch.randn_like(data["next", "reward"])
+    data["next", "terminated"] = data["next", "done"].clone()
+    return data[:, 2:]  # windows that begin in the middle of an episode
+
+
+def beliefs_by_hand(filter, data):
+    """The belief's mean at every root and every next observation, one step after the other."""
+    roots, nexts, carry = [], [], None
+    for t in range(data.shape[1]):
+        row = data[:, t]
+        resumed = {key: row["previous", *key] for key in filter.carry_keys}
+        if t == 0:
+            carry = {key: value.clone() for key, value in resumed.items()}
+        now = filter.step(one_step(filter, row, row["previous", "action"], carry))
+        start = filter.initialise(one_step(filter, row, row["previous", "action"], carry))
+        is_new = row["is_init"] & ~row["previous", "known"]
+        pick = lambda key: torch.where(is_new.reshape(B, *[1] * (now[key].ndim - 1)), start[key], now[key])  # noqa: E731, B023
+        carry, mean = {key: pick(key) for key in filter.carry_keys}, pick(MEAN)
+        roots.append(mean)
+        nexts.append(filter.step(one_step(filter, row["next"], row["action"], carry))[MEAN])
+    return torch.stack(roots, 1), torch.stack(nexts, 1)
+
+
+def one_step(filter, row, action, carry):
+    out = row.select("a", "b", "seen").copy().set("action", action)
+    for key, value in carry.items():
+        out[key] = value
+    return out
+
+
+def gradients(loss, modules):
+    parameters = [p for module in modules for p in module.parameters()]
+    found = torch.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+    return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
+
+
+def assert_same_gradients(ours, by_hand, modules):
+    first, second = gradients(ours, modules), gradients(by_hand, modules)
+    assert any((gradient != 0).any() for gradient in second)
+    for gradient, expected in zip(first, second, strict=True):
+        torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12)
+
+
+def q_network():
+    class Q(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layers = nn.Sequential(nn.Linear(S + A, 8), nn.Tanh(), nn.Linear(8, 1))
+
+        def forward(self, mean, action):
+            return self.layers(torch.cat([mean, action], -1))
+
+    return ValueOperator(Q(), in_keys=[MEAN, "action"])
+
+
+@pytest.mark.parametrize("slices", [False, True])
+def test_ddpg(float64, slices):
+    filter, frames = filter_and_frames()
+    data = collected(filter, frames)
+    head = nn.Linear(S, A)
+    actor = TensorDictSequential(filter, TensorDictModule(head, [MEAN], ["action"]))
+    value = q_network()
+    loss = DDPGLoss(actor, value, delay_actor=False, delay_value=False, loss_function="l2")
+    loss.make_value_estimator(gamma=0.9)
+    sample = data.copy()
+    if slices:  # flat, with the marks that SliceSampler puts
+        sample["is_init"][:, 0] = True
+        sample["next", "done"][:, -1] = True
+        sample = sample.reshape(-1)
+    out = loss(sample)
+
+    roots, nexts = beliefs_by_hand(filter, data)
+    by_hand = -value.module(roots, head(roots)).mean()
+    torch.testing.assert_close(out["loss_actor"], by_hand)
+    assert_same_gradients(out["loss_actor"], by_hand, [filter, head])
+
+    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * value.module(nexts, head(nexts))
+    predicted = value.module(data[MEAN], data["action"])  # of the stored belief: the critic reads no frames
+    by_hand = nn.functional.mse_loss(predicted, target.detach())
+    torch.testing.assert_close(out["loss_value"], by_hand)
+
+
+def test_clipped_ppo(float64):
+    filter, frames = filter_and_frames()
+    data = collected(filter, frames)
+    head, critic_head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor()), nn.Linear(S, 1)
+    critic = ValueOperator(critic_head, in_keys=[MEAN])
+    data["advantage"], data["value_target"] = torch.randn(B, T - 2, 1), torch.randn(B, T - 2, 1)
+    data["state_value"] = torch.randn(B, T - 2, 1)
+
+    roots, _ = beliefs_by_hand(filter, data)
+    loc, scale = head(roots)
+    log_prob = Normal(loc, scale).log_prob(data["action"])
+    stored = log_prob.sum(-1).detach() + 0.3 * torch.randn(B, T - 2)
+    data["action_log_prob"] = stored
+    actor = ProbabilisticActor(
+        TensorDictSequential(filter, TensorDictModule(head, [MEAN], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=SummedNormal,
+        return_log_prob=True,
+    )
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_bonus=False, normalize_advantage=False)
+    loss.set_keys(sample_log_prob="action_log_prob")
+    out = loss(data.copy())
+    ratio = (log_prob.sum(-1) - stored).exp().unsqueeze(-1)
+    advantage = data["advantage"]
+    by_hand = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
+    torch.testing.assert_close(out["loss_objective"], by_hand)
+    assert_same_gradients(out["loss_objective"], by_hand, [filter, head])
+
+
+def test_sac(float64):
+    filter, frames = filter_and_frames()
+    data = collected(filter, frames)
+    data["action"] = data["action"].tanh() * 0.9
+    head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictSequential(filter, TensorDictModule(head, [MEAN], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    value = q_network()
+    loss = SACLoss(actor, value, num_qvalue_nets=1, fixed_alpha=True, alpha_init=0.3, target_entropy=-2.0)
+    torch.manual_seed(3)
+    actor_loss, _ = loss.actor_loss(data.copy())
+    actor_loss = actor_loss.mean()
+
+    torch.manual_seed(3)
+    roots, _ = beliefs_by_hand(filter, data)
+    distribution = TanhNormal(*head(roots))
+    action = distribution.rsample()
+    q = q_of(loss, roots, action)
+    by_hand = (0.3 * distribution.log_prob(action).unsqueeze(-1) - q).mean()
+    torch.testing.assert_close(actor_loss, by_hand)
+    assert_same_gradients(actor_loss, by_hand, [filter, head])
+
+
+def q_of(loss, mean, action):
+    params = loss.qvalue_network_params[0].detach()
+    with params.to_module(loss.qvalue_network):
+        return loss.qvalue_network.module(mean, action)

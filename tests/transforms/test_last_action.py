@@ -1,0 +1,40 @@
+"""The action that led to an observation: beside it, zero after a reset, in every kind of environment."""
+
+import torch
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+
+from tests.filters.composed import ReplayedFrames, compose, frames_for
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.transforms import LastAction
+
+
+def test_it_is_the_action_before_and_zero_where_an_episode_begins(float64):
+    frames = frames_for(["resets"])
+    env = ReplayedFrames(frames)
+    player = env.player()
+    rollout = TransformedEnv(env, LastAction()).rollout(9, player, break_when_any_done=False)
+    expected = torch.cat([torch.zeros(3, 1, 2), frames["action"][:, :-1]], 1)
+    expected = torch.where(frames["is_init"], 0.0, expected)
+    assert rollout["previous", "action"].equal(expected)
+    assert rollout["next", "previous", "action"].equal(rollout["action"])
+
+
+def test_specs_alone_and_with_a_filters_primer():
+    check_env_specs(TransformedEnv(base_env(seed=0, batch_size=[2]), LastAction()))
+    check_env_specs(TransformedEnv(base_env(seed=0), LastAction({"action": "last"})))
+    primer = compose(["actions"]).float().make_tensordict_primer()
+    env = TransformedEnv(base_env(seed=0, batch_size=[2]), primer)
+    check_env_specs(env)
+    keys = {("previous", "belief", "ensemble"), ("previous", "known"), ("previous", "action")}
+    assert keys <= set(env.reset().keys(True, True))
+
+
+def test_workers_have_their_own():
+    def make(seed):
+        return lambda: TransformedEnv(base_env(seed=seed), LastAction())
+
+    env = SerialEnv(2, [make(0), make(1)])
+    torch.manual_seed(0)
+    rollout = env.rollout(4)
+    assert rollout["previous", "action"][:, 1:].equal(rollout["action"][:, :-1])
+    assert (rollout["previous", "action"][:, 0] == 0).all()

@@ -1,0 +1,132 @@
+"""What a filter refuses, and what it says: missing entries, beliefs that are not finite, mixed precision."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+
+from torch_denkf.filters._steps import previous_key
+from torch_denkf.filters._structure import Structure
+from torch_denkf.modules._base import Entries, random_parts
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = [
+    "check_inputs",
+    "refuse_non_finite",
+    "refuse_two_precisions",
+    "refuse_unknown_noise",
+    "refuse_unknown_readings",
+]
+
+
+def check_inputs(
+    filter: Filter,
+    entries: Entries,
+    tensordict: TensorDictBase,
+    without: Collection[NestedKey] = (),
+    *,
+    carry: bool = True,
+) -> None:
+    """Raises a ``KeyError`` that names what the modules miss, who reads it, and what is there.
+
+    Args:
+        filter: the filter.
+        entries: what was found.
+        tensordict: where.
+        without: readings that are missing on purpose.
+        carry: whether the belief must be there.
+    """
+    structure, name = filter._structure, type(filter).__name__
+    for key in structure.carry if carry else ():
+        if key not in entries:
+            raise KeyError(
+                f"{name} carries its belief in {key!r}, which the tensordict lacks. Call "
+                "filter.initialise(tensordict) at the start of an episode; in an environment append "
+                "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
+                "part of the policy."
+            )
+    missing = [
+        key
+        for key in (*structure.needed, *structure.required_controls)
+        if key not in entries and key not in without and previous_key(key) not in entries
+    ]
+    if missing:
+        modules = (*structure.frames, structure.transition, *structure.update)
+        readers = [type(m).__name__ for _, m in modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))]
+        present = ", ".join(sorted(map(str, tensordict.keys(True, True)))) or "nothing"
+        raise KeyError(
+            f"{', '.join(readers) or name} reads {', '.join(map(repr, missing))}, which the tensordict lacks. It holds "
+            f"{present}. Rename the key in the constructor, or put the module that writes it in front. A reading that "
+            "is missing on purpose: step(..., without=[key]), predict(...), or a mask."
+        )
+
+
+def refuse_non_finite(structure: Structure, entries: Entries, written: Entries) -> None:
+    """Raises a ``ValueError`` where the new belief is not finite; the message names the input that is not."""
+    if all(torch.isfinite(written[key]).all() for key in structure.carry if key in written):
+        return
+    given = {key: value for key, value in entries.items() if value.is_floating_point() and key[0] != "noise"}
+    bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
+    why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+    raise ValueError(
+        f"The new belief is not finite, because of {why}. The tensordict was left as it is. Hide what is broken or "
+        f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
+        "predict(...); check_finite=False switches this off."
+    )
+
+
+def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool) -> None:
+    """Raises a ``KeyError`` where a step resumes from a policy's belief, and the action before it is not there."""
+    missing = [key for key in structure.required_controls if previous_key(key) not in entries]
+    if resumed and missing:
+        raise KeyError(
+            f"The belief is that of a policy, one step before, and {missing} drives the step. The action before it is "
+            f"missing: {[previous_key(key) for key in missing]}. Put filter.make_tensordict_primer(), which brings it, "
+            "into the environment."
+        )
+
+
+def refuse_unknown_noise(filter: Filter, noise: Entries) -> None:
+    """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
+    structure = filter.structure
+    modules = (*structure.frames, structure.transition, *structure.update, ("initial", filter.initial))
+    places = {place for name, module in modules for place, _ in random_parts(module, name)}
+    unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
+    if unknown:
+        raise KeyError(
+            f"{unknown} is noise of no module of {type(filter).__name__}; noise is drawn at {sorted(places)}."
+        )
+
+
+def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) -> list[NestedKey]:
+    """The readings to leave out, unravelled.
+
+    Raises:
+        KeyError: if no module reads one of them.
+        TypeError: if it is a string and no list of them.
+    """
+    if isinstance(without, str):
+        raise TypeError(f"without is a list of keys: [{without!r}].")
+    keys = [unravel_key(key) for key in without]
+    unknown = [key for key in keys if key not in structure.needed]
+    if unknown:
+        raise KeyError(f"without names {unknown}, which no module must find; they read {list(structure.needed)}.")
+    return keys
+
+
+def refuse_two_precisions(filter: Filter) -> None:
+    """Raises a ``TypeError`` where parameters or constants are of float32 and float64."""
+    named = [*filter.named_parameters(), *filter.named_buffers()]
+    doubles = [name for name, value in named if value.dtype == torch.float64]
+    singles = [name for name, value in named if value.dtype == torch.float32]
+    if doubles and singles:
+        raise TypeError(
+            f"The parts of a filter compute in one precision; {', '.join(doubles[:5])} is float64 and "
+            f"{', '.join(singles[:5])} float32. Convert what you passed in with .float(), or build everything under "
+            "torch.set_default_dtype(torch.float64)."
+        )

@@ -1,0 +1,81 @@
+"""The noise of all modules of a filter, drawn in bulk: for a whole sequence at once, or in front of a compiled step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import torch
+
+from torch_denkf.filters._structure import Placed
+from torch_denkf.modules._base import Entries, SubModel, flat_noise, random_parts
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["draw_noise"]
+
+
+def draw_noise(
+    filter: Filter,
+    entries: Entries,
+    batch_size: torch.Size,
+    modules: Iterable[Placed],
+    *,
+    time: bool = False,
+    generator: torch.Generator | None = None,
+    as_far_as_known: bool = False,
+) -> Entries | None:
+    """The noise of ``modules`` that is not among the entries.
+
+    Args:
+        filter: theirs.
+        entries: what is known of the step: the carry and the frames' outputs tell sizes.
+        batch_size: ``[*B]``, or ``[*B, T]``.
+        modules: with their places.
+        time: whether the last of ``batch_size`` is time.
+        generator: source of randomness; torch's global one by default.
+        as_far_as_known: what to do about noise whose size the step alone knows: leave it out, or return ``None``.
+    """
+    like, complete = filter.like(), True
+    drawn: Entries = {}
+    device = next((value.device for value in entries.values()), None if like is None else like.device)
+    dtype = None if like is None else like.dtype
+    members, state_dim = _sizes(filter, entries)
+    for place, module in modules:
+        for part_place, part in random_parts(module, place):
+            keys = [("noise", part_place, name) if name else ("noise", part_place) for name in part.noise_names]
+            if not all(key in entries for key in keys):
+                noise = part.draw_noise(
+                    batch_size,
+                    members=members,
+                    state_dim=state_dim,
+                    observation_dim=_observation_dim(filter, part, entries),
+                    time=time,
+                    device=device,
+                    dtype=dtype,
+                    generator=generator,
+                )
+                complete = complete and noise is not None
+                drawn.update(flat_noise(noise, part_place))
+    return drawn if complete or as_far_as_known else None
+
+
+def _sizes(filter: Filter, entries: Entries) -> tuple[int | None, int | None]:
+    """E and S of the belief."""
+    for key in filter._structure.carry:
+        if key[-1] == "ensemble" and key in entries:
+            members, state_dim = entries[key].shape[-2:]
+            return members, state_dim
+    initial = filter.initial
+    return getattr(initial, "ensemble_size", None), getattr(initial, "state_dim", None)
+
+
+def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | None:
+    """O of the reading that a sub-model uses: from the entry, or from the module that writes it."""
+    key = getattr(part, "noise_variance_key", None)
+    if key is None:
+        return None
+    if key in entries:
+        return entries[key].shape[-1]
+    return filter._structure.observation_dims.get(key)

@@ -1,0 +1,90 @@
+"""What an environment must carry where a filter is part of the policy: the last belief, and the action since."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+
+from torch_denkf.filters._steps import previous_key
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["LastAction", "belief_primer"]
+
+
+class LastAction(TensorDictPrimer):
+    """Keeps the action that led to an observation, as ``("previous", "action")`` beside it; zero after a reset.
+
+    A filter in a policy runs before the next action is chosen, and needs the last one.
+    :meth:`torch_denkf.filters.Filter.make_tensordict_primer` brings it where actions drive the filter; append it
+    yourself where a policy reads the last action for another reason.
+
+    Args:
+        actions: names of actions, and where to keep the last one; ``{"action": ("previous", "action")}`` by default.
+        primers: further entries to carry, see :class:`torchrl.envs.transforms.TensorDictPrimer`.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> rollout = TransformedEnv(ContinuousActionVecMockEnv(), LastAction()).rollout(3)
+        >>> bool((rollout["previous", "action"][1:] == rollout["action"][:-1]).all())
+        True
+    """
+
+    def __init__(self, actions: dict[NestedKey, NestedKey] | None = None, *, primers: Composite | None = None):
+        actions = {"action": ("previous", "action")} if actions is None else actions
+        self.actions = {unravel_key(key): unravel_key(kept) for key, kept in actions.items()}
+        super().__init__(Composite() if primers is None else primers, expand_specs=True)
+
+    def _with_actions(self) -> None:
+        """Adds the actions' shapes, which only the environment knows."""
+        for key, kept in self.actions.items():
+            if kept not in self.primers.keys(True, True):
+                spec = self.parent.full_action_spec[key]
+                batch = self.parent.batch_size
+                shape = spec.shape if self.primers.shape == batch else spec.shape[len(batch) :]
+                self.primers[kept] = Unbounded(shape=shape, dtype=spec.dtype, device=spec.device)
+                self.default_value[kept] = 0.0
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds what is carried."""
+        self._with_actions()
+        return super().transform_observation_spec(observation_spec)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Adds what is carried to the state."""
+        self._with_actions()
+        return super().transform_input_spec(input_spec)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self._with_actions()
+        return super()._reset(tensordict, tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict = super()._step(tensordict, next_tensordict)
+        for key, kept in self.actions.items():
+            next_tensordict.set(kept, tensordict.get(key))
+        return next_tensordict
+
+
+def belief_primer(filter: Filter) -> TensorDictPrimer:
+    """The transform behind :meth:`Filter.make_tensordict_primer`."""
+    initial = filter.initial
+    size = getattr(initial, "input_dim", getattr(initial, "state_dim", 1))
+    tensors = chain(filter.parameters(), filter.buffers(), (torch.zeros(()),))
+    like = next(tensor for tensor in tensors if tensor.is_floating_point())
+    probe = TensorDict({key: torch.zeros(size, dtype=like.dtype, device=like.device) for key in initial.in_keys})
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        belief = initial(probe)
+    primers = Composite()
+    for key in filter.carry_keys:
+        value = belief.get(key)
+        primers[previous_key(key)] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+    primers["previous", "known"] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
+    return LastAction({key: previous_key(key) for key in filter.structure.controls}, primers=primers)

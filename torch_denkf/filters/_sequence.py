@@ -1,0 +1,143 @@
+"""A whole sequence: frames first, all at once; then one step after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.modules import set_recurrent_mode
+
+from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
+from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._steps import Steps, blank, previous_key
+from torch_denkf.filters._structure import Structure
+from torch_denkf.filters._summaries import summaries
+from torch_denkf.modules._base import Call, Entries
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["Rows", "filter_rows"]
+
+_KNOWN = ("previous", "known")
+
+
+class Rows(NamedTuple):
+    """What the steps of a sequence read.
+
+    Attributes:
+        size: ``[*B, T]``.
+        inputs: entries ``[*B, T, ...]``, with their noise as far as it was drawn.
+        shifted: inputs that are read one step earlier.
+        begins: elements that start from ``starts``, ``[*B, T, 1]``; ``None`` for the first alone.
+        starts: initial or stored beliefs ``[*B, T]``, or ``[*B, 1]`` where ``begins`` is ``None``.
+        resumed: whether the first element, too, is a step, from the belief before it.
+        detach_every: the belief is detached every so many steps.
+        keep: what to return of each step.
+    """
+
+    size: torch.Size
+    inputs: Entries
+    shifted: tuple[NestedKey, ...]
+    begins: Tensor | None
+    starts: Entries
+    resumed: bool
+    detach_every: int | None
+    keep: tuple[NestedKey, ...]
+
+
+def filter_rows(
+    filter: Filter, rows: TensorDictBase, new: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
+) -> Entries:
+    """The outputs ``keep`` of a sequence ``[*B, T]``.
+
+    Args:
+        filter: the filter.
+        rows: frames, and what else its modules read.
+        new: marks of first elements, see :func:`~torch_denkf.filters._slices.starts_of`.
+        detach_every: the belief is detached every so many steps.
+        keep: keys.
+    """
+    structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
+    entries, call = filter.entries_of(rows), Call(size, time=True)
+    check_inputs(filter, entries, rows, carry=False)
+    with set_recurrent_mode(True):  # for modules that are not this package's
+        frames = filter.steps().frames(entries, call)
+    entries.update(frames)
+
+    resumed = all(previous_key(key) in entries for key in structure.carry)
+    stored = not resumed and all(key in entries for key in structure.carry)
+    begins, fresh = new, None
+    resumes: Entries = {}
+    if resumed:
+        begins, resumes = _beginnings(structure, entries, new, size)
+        fresh = begins
+    if stored:  # these have seen their frame
+        starts = summaries({key: entries[key] for key in structure.carry}, structure.belief)
+    elif begins is None:  # where only the first element starts, only its initial belief is needed
+        head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
+        starts = filter.initial_belief(head, call._replace(batch_size=torch.Size((*size[:-1], 1))))
+    else:
+        starts = filter.initial_belief(entries, call)
+    steps = filter.steps(filter.update_at_reset and not stored)
+
+    reads = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys)
+    inputs = {key: entries[key] for key in reads if key in entries}
+    inputs.update({key: value for key, value in entries.items() if key[0] == "noise"})
+    inputs.update({key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries})
+    inputs.update(resumes)
+    drawn = draw_noise(filter, {**entries, **starts}, size, (structure.transition, *structure.update), time=True)
+    inputs.update(drawn or {})
+    shifted = tuple(key for key in structure.controls if previous_key(key) not in entries)
+    step_keys = tuple(key for key in keep if key in structure.step_keys)
+    todo = Rows(size, inputs, shifted, begins, starts, resumed, detach_every, step_keys)
+    compiled = filter.compiled if drawn is not None and not resumed else None
+    with set_recurrent_mode(False):
+        outputs = _eagerly(steps, todo) if compiled is None else compiled.sequence(steps, todo)
+    if fresh is None:
+        fresh = _or_first(begins, size, next(iter(starts.values())).device)
+    blank(steps, outputs, fresh)
+    return {**{key: frames[key] for key in keep if key in frames}, **outputs}
+
+
+def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:
+    """Marks ``[*B, T, 1]``, and the first element of each sequence."""
+    first = torch.zeros(*size, 1, dtype=torch.bool, device=device)
+    first.narrow(len(size) - 1, 0, 1).fill_(True)
+    return first if marks is None else first | marks.reshape(*size, 1)
+
+
+def _beginnings(structure: Structure, entries: Entries, new: Tensor | None, size) -> tuple[Tensor, Entries]:
+    """Which elements of a policy's data start anew, and what the others resume from where a slice begins."""
+    refuse_missing_actions(structure, entries, resumed=True)
+    new = _or_first(new, size, entries[previous_key(structure.carry[0])].device)
+    known = entries.get(_KNOWN, torch.ones_like(new))
+    resumes = {previous_key(key): entries[previous_key(key)] for key in structure.carry}
+    return ~known, {**resumes, ("previous", "resumes"): new & known}
+
+
+def _eagerly(steps: Steps, todo: Rows) -> Entries:
+    """What steps write on a sequence, ``[*B, T, ...]`` each."""
+    time, count = len(todo.size) - 1, todo.size[-1]
+    columns = {key: value.unbind(time) for key, value in todo.inputs.items()}
+    for key in todo.shifted:
+        columns[key] = (columns[key][0], *columns[key][:-1])
+    rows = [{key: column[t] for key, column in columns.items()} for t in range(count)]
+    columns = {key: value.unbind(time) for key, value in todo.starts.items()}
+    starts = [{key: column[min(t, len(column) - 1)] for key, column in columns.items()} for t in range(count)]
+    resets = None if todo.begins is None else todo.begins.unbind(time)
+    call, cut = Call(torch.Size(todo.size[:-1])), todo.detach_every or 0
+    cuts = [bool(cut) and t > 0 and t % cut == 0 for t in range(count)]
+    if todo.resumed:
+        carry, outputs = {key: starts[0][key] for key in steps.structure.carry}, []
+    else:
+        out = steps.first(rows[0], call, starts[0])
+        carry, outputs = {key: out[key] for key in steps.structure.carry}, [{key: out[key] for key in todo.keep}]
+    done = len(outputs)
+    resets = None if resets is None else resets[done:]
+    _, later = steps.roll(carry, rows[done:], call, resets, starts[done:], cuts[done:], todo.keep)
+    outputs += later
+    return {key: torch.stack([output[key] for output in outputs], time) for key in todo.keep}

@@ -1,0 +1,75 @@
+"""Where sequences begin in data: marks of episodes and slices, and slices that lie end to end."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+
+__all__ = ["as_rows", "starts_of"]
+
+
+def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = False) -> Tensor | None:
+    """Marks the first elements of episodes or slices, ``[*B, T, 1]``; ``None`` where nothing says.
+
+    An element is a first one where ``is_init`` says so, and after one with a ``done`` at its root, as in the ``"next"``
+    part of data, which torchrl's losses filter, too. Where there is no ``is_init``, after one that is done next.
+    ``"truncated"`` counts like ``"done"``, and marks in groups of agents like those at the root.
+
+    Args:
+        tensordict: ``[*B, T]``.
+        init_key: the mark.
+        step: whether ``tensordict`` is one step ``[*B]``, of which ``is_init`` alone says something.
+    """
+    is_init = _marks(tensordict, tensordict, init_key)
+    if step:
+        return is_init
+    done, following = _ends(tensordict, tensordict), tensordict.get("next", None)
+    if is_init is None and isinstance(following, TensorDictBase):
+        done = _either(done, _ends(following, tensordict))
+    if done is None:
+        return is_init
+    time = tensordict.ndim - 1
+    after = torch.cat([torch.zeros_like(done.narrow(time, 0, 1)), done.narrow(time, 0, done.shape[time] - 1)], time)
+    return after if is_init is None else is_init | after
+
+
+def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictBase, Tensor | None]:
+    """Slices of one length in a flat ``[N]`` as ``[N / L, L]``; anything else as it is."""
+    if tensordict.ndim != 1 or new is None or torch.compiler.is_compiling():
+        return tensordict, new
+    size, marks = tensordict.batch_size[0], new.reshape(-1).cpu()  # waits for the device once
+    if not marks[1:].any():
+        return tensordict, new
+    for length in range(1, size // 2 + 1):
+        if size % length == 0 and marks[::length][1:].all():
+            return tensordict.reshape(-1, length), new.reshape(-1, length, 1)
+    return tensordict, new
+
+
+def _ends(source: TensorDictBase, tensordict: TensorDictBase) -> Tensor | None:
+    """The last elements of episodes or slices, ``[*B, T, 1]``."""
+    return _either(_marks(source, tensordict, "done"), _marks(source, tensordict, "truncated"))
+
+
+def _either(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    return second if first is None else first if second is None else first | second
+
+
+def _marks(source: TensorDictBase, tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """A mark ``[*B, T, 1]``: that of the root, or of any agent in any group."""
+    value = source.get(key, None)
+    if value is None:
+        name = key if isinstance(key, str) else key[-1]
+        found = [
+            source.get(other)
+            for other in map(unravel_key, source.keys(True, True))
+            if isinstance(other, tuple) and other[-1] == name and other[0] not in ("next", "previous")
+        ]
+        return torch.stack([_any(mark, tensordict.ndim) for mark in found]).any(0) if found else None
+    return _any(value, tensordict.ndim)
+
+
+def _any(mark: Tensor, ndim: int) -> Tensor:
+    """Whether any agent's mark is set, ``[*B, T, 1]``."""
+    return mark.flatten(ndim).any(-1, keepdim=True) if mark.ndim > ndim else mark.unsqueeze(-1)

@@ -1,0 +1,255 @@
+"""One step of a filter on a flat dictionary of tensors; a sequence, a compiled graph and an export are made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from math import sqrt
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import expand_as_right
+from torch import Tensor
+
+from torch_denkf.filters._structure import Placed, Structure
+from torch_denkf.modules._base import Call, Entries, SubModel, named_modules_of, run_module
+
+__all__ = ["Steps", "blank", "previous_key", "where_rows"]
+
+#: The mean is held within so many of the largest standard deviations that a variance ceiling allows.
+_FARTHEST = 1000.0
+
+
+def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Takes ``new`` in the rows that ``mask`` ``[*B]`` or ``[*B, 1]`` marks, ``old`` ``[*B, ...]`` in the others."""
+    return torch.where(expand_as_right(mask, old), new, old)
+
+
+class Steps(NamedTuple):
+    """The steps of a filter.
+
+    Attributes:
+        structure: its modules.
+        update_at_reset: whether an initial belief is updated with its frame.
+        ceiling: largest variance of the belief; ``None`` for any.
+        say: told the key of a variance that is held at the ceiling.
+    """
+
+    structure: Structure
+    update_at_reset: bool
+    ceiling: float | None
+    say: Callable[[NestedKey], None]
+
+    def run(
+        self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
+    ) -> Entries:
+        """What modules write, one after the other.
+
+        ``missing`` names readings that are not there. What a module that needs them would have written is added to it,
+        unless the module knows what to write without a reading.
+        """
+        entries, written = dict(entries), {}
+        for place, module in modules:
+            if missing and not missing.isdisjoint(module.in_keys):
+                if type(module) is TensorDictSequential:
+                    out = self.run(named_modules_of(module), entries, call.part(place), missing)
+                else:
+                    out = _without_reading(module, entries)
+                missing.update(key for key in map(unravel_key, module.out_keys) if key not in out)
+            else:
+                out = run_module(module, entries, call.part(place))
+            names = self.structure.own_info.get(place)
+            if names:
+                out = {names.get(key, key): value for key, value in out.items()}
+            entries.update(out)
+            written.update(out)
+        for key, parts in self.structure.totals.items():
+            if all(part in written for part in parts):
+                written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
+        return written
+
+    def frames(self, entries: Entries, call: Call, missing: set[NestedKey] | None = None) -> Entries:
+        """What the modules that read frames alone write."""
+        return self.run(self.structure.frames, entries, call, missing)
+
+    def advance(
+        self,
+        entries: Entries,
+        call: Call,
+        reset: Tensor | None = None,
+        start: Entries | None = None,
+        missing: set[NestedKey] | None = None,
+    ) -> Entries:
+        """One step: the carry in ``entries`` is the belief at t-1, the frame that of t.
+
+        Args:
+            entries: what the frame modules wrote, too.
+            call: batch size and whether noise is drawn.
+            reset: rows ``[*B]`` or ``[*B, 1]`` that forecast their ``start``, and believe it; ``None`` for none.
+            start: initial beliefs, read only with ``reset``.
+            missing: readings that are not there, see :meth:`run`.
+
+        Returns:
+            What transition and update write.
+        """
+        structure, start = self.structure, {} if start is None else start
+        written = self.run([structure.transition], entries, call)
+        entries = dict(entries)
+        if reset is not None:
+            for key in structure.carry:
+                start_value = start[key]
+                if key in structure.forecast_of:
+                    forecast_key = structure.forecast_of[key]
+                    written[forecast_key] = where_rows(reset, start_value, written[forecast_key])
+                entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
+        return self._update(entries, written, call, reset, start, missing)
+
+    def first(self, entries: Entries, call: Call, start: Entries, *, in_sequence: bool = True) -> Entries:
+        """The first step of a sequence: its belief is ``start``; the update is made if that is to see its frame."""
+        structure = self.structure
+        entries = {**entries, **{key: start[key] for key in structure.carry}}
+        forecast = {forecast_key: start[key] for key, forecast_key in structure.forecast_of.items()}
+        if structure.beside and in_sequence:  # their shapes follow from a step out of the start
+            out = self.run([structure.transition], entries, call)
+            forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
+        every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
+        return self._update(entries, forecast, call, every, start, None)
+
+    def _update(
+        self,
+        entries: Entries,
+        written: Entries,
+        call: Call,
+        reset: Tensor | None,
+        start: Entries,
+        missing: set[NestedKey] | None,
+    ) -> Entries:
+        structure = self.structure
+        entries.update(written)
+        written.update(self.run(structure.update, entries, call, missing))
+        if reset is not None and not self.update_at_reset:
+            for key in structure.belief:
+                written[key] = where_rows(reset, start[key], written[key])
+        if self.ceiling is not None:
+            self._limit(written, self.ceiling)
+        return written
+
+    def roll(
+        self,
+        carry: Entries,
+        rows: Sequence[Entries],
+        call: Call,
+        resets: Sequence[Tensor] | None,
+        starts: Sequence[Entries],
+        cuts: Sequence[bool],
+        keep: Sequence[NestedKey],
+    ) -> tuple[Entries, list[Entries]]:
+        """Advances through ``rows``, one a step.
+
+        Args:
+            carry: the belief before the first of them.
+            rows: what each step reads beside the carry. A carried entry among them is where the step begins in rows
+                that ``("previous", "resumes")`` marks.
+            call: of one step.
+            resets: which rows start anew at each step; ``None`` for none ever.
+            starts: their beliefs, read only with ``resets``.
+            cuts: where the belief is detached before the step.
+            keep: what to return of each step.
+
+        Returns:
+            The carry after the last step, and what each step wrote.
+        """
+        outputs = []
+        for t, row in enumerate(rows):
+            if cuts[t]:
+                carry = {key: value.detach() for key, value in carry.items()}
+            row = {**row, **self._resume(carry, row)}
+            out = self.advance(row, call) if resets is None else self.advance(row, call, resets[t], starts[t])
+            carry = {key: out.get(key, row[key]) for key in self.structure.carry}
+            outputs.append({key: out[key] for key in keep})
+        return carry, outputs
+
+    def _resume(self, carry: Entries, row: Entries) -> Entries:
+        resumes = row.get(("previous", "resumes"))
+        if resumes is None:
+            return carry
+        return {key: where_rows(resumes, row[previous_key(key)], value) for key, value in carry.items()}
+
+    # ------------------------------------------------------------------------------------------ a belief that explodes
+
+    def variance_keys(self) -> list[NestedKey]:
+        """The variances among the belief's entries."""
+        return [key for key in self.structure.belief if key[-1] == "var"]
+
+    def _limit(self, written: Entries, ceiling: float) -> None:
+        """Holds the variances at the ceiling, in place of the entries; the correlations stay."""
+        for key in self.variance_keys():
+            variance = written.get(key)
+            if variance is None:
+                continue
+            exceeded = _exceeds(variance, ceiling)
+            if exceeded is False:
+                continue
+            if exceeded:
+                self.say(key)
+            prefix, farthest = key[:-1], _FARTHEST * sqrt(ceiling)
+            mean_key = (*prefix, "mean")
+            mean = written.get(mean_key)
+            if mean is None:
+                continue
+            factor = (variance / ceiling).clamp(min=1).rsqrt()
+            held = mean.clamp(-farthest, farthest)
+            written[key] = variance * factor.square()
+            written[mean_key] = held
+            cov = written.get((*prefix, "cov"))
+            if cov is not None:
+                written[*prefix, "cov"] = cov * factor.unsqueeze(-1) * factor.unsqueeze(-2)
+            ensemble = written.get((*prefix, "ensemble"))
+            if ensemble is not None:
+                deviations = (ensemble - mean.unsqueeze(-2)) * factor.unsqueeze(-2)
+                limited = held.unsqueeze(-2) + deviations
+                # Where nothing is held, nothing moves, not even by rounding.
+                same = ((factor == 1) & (held == mean)).unsqueeze(-2)
+                written[*prefix, "ensemble"] = torch.where(same, ensemble, limited)
+
+
+def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
+    """Zero for what a step writes, and a belief that starts does not have: innovations and the like.
+
+    Args:
+        steps: the filter's.
+        written: by a step, or by those of a sequence; changed.
+        fresh: elements that start from an initial or stored belief, ``[*B, 1]`` or ``[*B, T, 1]``.
+    """
+    structure = steps.structure
+    at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
+    for key in structure.beside if steps.update_at_reset else structure.step_keys:
+        if key in written and key not in at_start:
+            written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
+
+
+def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
+    """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
+    if torch.compiler.is_compiling() or variance.is_cuda:
+        return None
+    try:
+        return bool((variance > ceiling).any())
+    except RuntimeError:  # under vmap a number has no value
+        return None
+
+
+def previous_key(key: NestedKey) -> NestedKey:
+    """Where a policy's filter finds what was ``key`` one step before."""
+    return ("previous", key) if isinstance(key, str) else ("previous", *key)
+
+
+def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
+    """What a module writes where its reading is missing; nothing if it does not know."""
+    readings = set(getattr(module, "reading_keys", ()))
+    if not isinstance(module, SubModel) or not readings:
+        return {}
+    values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
+    values += [entries.get(key) for key in module.optional_keys]
+    out = module.without_reading(*values)
+    return dict(zip(module.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))

@@ -1,0 +1,285 @@
+"""What a filter's modules say about themselves: who reads frames alone, who the belief, and what is carried on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+
+from torch_denkf.modules._base import SubModel, reads
+
+__all__ = ["Placed", "Structure", "submodels"]
+
+#: A module and its place in the filter, which names its noise.
+Placed = tuple[str, TensorDictModuleBase]
+
+_SUMMARIES = ("mean", "var", "cov")
+
+
+def submodels(module: torch.nn.Module) -> list[SubModel]:
+    """Returns the sub-models inside ``module``, also those inside others."""
+    return [part for part in module.modules() if isinstance(part, SubModel)]
+
+
+class Structure(NamedTuple):
+    """A filter's modules in their order, sorted by what they read.
+
+    Attributes:
+        frames: modules that read frames alone, and not the belief.
+        transition: the module that forecasts the carry: the first that depends on the belief.
+        update: the modules between the forecast and the belief.
+        needed: keys that must be there beside the carry and the controls.
+        optional: keys that are used where they are there.
+        controls: keys that drive the transition.
+        required_controls: those of them that must be there.
+        carry: keys of the belief that go on from step to step.
+        belief: keys of the belief; the carry, and what follows from it.
+        forecast_of: the forecast of each carried entry, as far as the transition writes one.
+        beside: what else the transition writes.
+        observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
+        readings: raw entries that the analyses' readings are made of.
+        own_info: new names for diagnostics that several analyses would write under one.
+        totals: sums of those over the analyses.
+        likelihoods: the log-likelihood of each analysis' reading.
+        frame_keys: what the frame modules write.
+        step_keys: what transition and update write.
+    """
+
+    frames: tuple[Placed, ...]
+    transition: Placed
+    update: tuple[Placed, ...]
+    needed: tuple[NestedKey, ...]
+    optional: tuple[NestedKey, ...]
+    controls: tuple[NestedKey, ...]
+    required_controls: tuple[NestedKey, ...]
+    carry: tuple[NestedKey, ...]
+    belief: tuple[NestedKey, ...]
+    forecast_of: dict[NestedKey, NestedKey]
+    beside: tuple[NestedKey, ...]
+    observation_dims: dict[NestedKey, int]
+    readings: tuple[NestedKey, ...]
+    own_info: dict[str, dict[NestedKey, NestedKey]]
+    totals: dict[NestedKey, tuple[NestedKey, ...]]
+    likelihoods: tuple[NestedKey, ...]
+    frame_keys: tuple[NestedKey, ...]
+    step_keys: tuple[NestedKey, ...]
+
+    @classmethod
+    def of(
+        cls,
+        modules: Sequence[Placed],
+        initial: TensorDictModuleBase,
+        control_keys: Sequence[NestedKey],
+        forecast_keys: Mapping[NestedKey, NestedKey],
+    ) -> Structure:
+        """Sorts modules.
+
+        Raises:
+            ValueError: if no module depends on the initial belief, one module would undo another, or it is not clear
+                what the forecast is.
+        """
+        provided = [unravel_key(key) for key in initial.out_keys]
+        needed, optional = _inputs(modules)
+        carry = [key for key in (*needed, *optional) if key in provided]
+        if not carry:
+            raise ValueError(
+                f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
+                f"{needed}. Give both the same keys."
+            )
+        dependent, frames, steps = {*carry, *control_keys}, [], []
+        for place, module in modules:
+            must, may = reads(module)
+            if dependent.isdisjoint((*must, *may)):
+                frames.append((place, module))
+            else:
+                steps.append((place, module))
+                dependent.update(map(unravel_key, module.out_keys))
+        _refuse_overwriting([*frames, *steps])
+        _refuse_nesting([*needed, *optional], [key for _, module in modules for key in _out(module)])
+        own_info, totals = _apart(steps)
+        written = [own_info.get(place, {}).get(key, key) for place, module in steps for key in _out(module)]
+        step_keys = tuple(dict.fromkeys([*written, *totals]))
+        still = [key for key in carry if key not in step_keys]
+        if still:
+            raise ValueError(
+                f"The belief holds {still}, which no module writes: a step would lose it. Let one pass it on."
+            )
+        belief = [key for key in provided if key in step_keys]
+        for key in step_keys:  # a summary that the analysis writes and the initial belief does not
+            if key not in belief and key[-1] in _SUMMARIES and any(key[:-1] == other[:-1] for other in carry):
+                belief.append(key)
+        forecast_of = _forecasts(carry, _out(steps[0][1]), forecast_keys)
+        return cls(
+            frames=tuple(frames),
+            transition=steps[0],
+            update=tuple(steps[1:]),
+            needed=tuple(key for key in needed if key not in carry and key not in control_keys),
+            optional=tuple(key for key in optional if key not in carry and key not in control_keys),
+            controls=tuple(key for key in (*needed, *optional) if key in control_keys),
+            required_controls=tuple(key for key in needed if key in control_keys),
+            carry=tuple(carry),
+            belief=tuple(belief),
+            forecast_of=forecast_of,
+            beside=tuple(key for key in _out(steps[0][1]) if key not in forecast_of.values()),
+            observation_dims=_observation_dims([*frames, *steps[1:]]),
+            readings=tuple(_readings(frames, steps[1:], needed)),
+            own_info=own_info,
+            totals=totals,
+            likelihoods=tuple(_likelihoods(steps, own_info, totals)),
+            frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in _out(module))),
+            step_keys=step_keys,
+        )
+
+
+def _out(module: TensorDictModuleBase) -> list[NestedKey]:
+    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
+    return list(dict.fromkeys(unravel_key(key) for part in _in_sequences(module) for key in part.out_keys))
+
+
+def _inputs(modules: Sequence[Placed]) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What all modules together must find and may use."""
+    needed: dict[NestedKey, None] = {}
+    optional: dict[NestedKey, None] = {}
+    made: set[NestedKey] = set()
+    for _, module in modules:
+        must, may = reads(module)
+        needed.update((key, None) for key in must if key not in made)
+        optional.update((key, None) for key in may if key not in made)
+        made.update(_out(module))
+    return list(needed), [key for key in optional if key not in needed]
+
+
+def _forecasts(
+    carry: Sequence[NestedKey], written: Sequence[NestedKey], chosen: Mapping[NestedKey, NestedKey]
+) -> dict[NestedKey, NestedKey]:
+    """Which entry that the transition writes is the forecast of which carried one: that of the same last name."""
+    chosen = {unravel_key(key): unravel_key(value) for key, value in chosen.items()}
+    unknown = [key for key in chosen if key not in carry] + [key for key in chosen.values() if key not in written]
+    if unknown:
+        raise ValueError(
+            f"forecast_keys names {unknown}; the filter carries {list(carry)}, and {list(written)} is written."
+        )
+    found = {}
+    for key in carry:
+        name = key if isinstance(key, str) else key[-1]
+        same = [other for other in written if (other if isinstance(other, str) else other[-1]) == name and other != key]
+        if key in chosen:
+            found[key] = chosen[key]
+        elif len(same) == 1:
+            found[key] = same[0]
+        elif len(same) > 1:
+            raise ValueError(
+                f"The transition writes {same}; say which is the forecast: forecast_keys={{{key!r}: ...}}."
+            )
+    if not found:
+        if len(carry) > 1 or len(written) > 1:
+            raise ValueError(
+                f"The first module that reads the belief, {list(carry)}, writes {list(written)}, of which none is a "
+                "forecast by its name. Say which is: forecast_keys={carried: forecast}."
+            )
+        found[carry[0]] = written[0]
+    return found
+
+
+def _observation_dims(modules: Sequence[Placed]) -> dict[NestedKey, int]:
+    """How many numbers an entry has, where all modules that write it agree."""
+    sizes: dict[NestedKey, set[int]] = {}
+    for _, module in modules:
+        for part in submodels(module):
+            own = [part] if getattr(part, "observation_dim", None) is not None else submodels(part)
+            found = {inner.observation_dim for inner in own if getattr(inner, "observation_dim", None) is not None}
+            for key in map(unravel_key, part.out_keys):
+                sizes.setdefault(key, set()).update(found)
+    return {key: found.pop() for key, found in sizes.items() if len(found) == 1}
+
+
+def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey]) -> list[NestedKey]:
+    """The entries from outside of which the analyses' readings are made, through whatever sensors."""
+    found: dict[NestedKey, None] = {}
+    for _, module in update:
+        for part in submodels(module):
+            found.update(dict.fromkeys(map(unravel_key, getattr(part, "reading_keys", ()))))
+    for _, module in reversed([*frames, *update]):
+        if not found.keys().isdisjoint(_out(module)):
+            found.update(dict.fromkeys(reads(module)[0]))
+    made_by_steps = {key for _, module in update for key in _out(module)}
+    return [key for key in found if key in needed and key not in made_by_steps]
+
+
+def _refuse_overwriting(modules: Sequence[Placed]) -> None:
+    """Raises where all that a module writes is written again before anybody has read it."""
+    for index, (place, module) in enumerate(modules):
+        info = getattr(module, "info_key", None)
+        unread = {key for key in _out(module) if info is None or key[0] != info}
+        used = False
+        for other_place, other in modules[index + 1 :]:
+            must, may = reads(other)
+            used = used or not unread.isdisjoint((*must, *may))
+            lost = unread.intersection(_out(other))
+            if lost and not used:
+                raise ValueError(
+                    f"{other_place!r} ({type(other).__name__}) writes {sorted(map(str, lost))} over what {place!r} "
+                    f"({type(module).__name__}) wrote, before any module has read it. Give one of them other keys, "
+                    "e.g. out_key=, or belief_key= of the first analysis and forecast_key= of the second."
+                )
+
+
+def _refuse_nesting(read: Sequence[NestedKey], written: Sequence[NestedKey]) -> None:
+    """Raises where a tensor would have to hold another entry."""
+    names = set(read) | set(written)
+    for key in written:
+        for length in range(1, 1 if isinstance(key, str) else len(key)):
+            outer = key[0] if length == 1 else key[:length]
+            if outer in names:
+                raise ValueError(f"{outer!r} is a tensor, so that {key!r} cannot be written: rename one of them.")
+
+
+def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey]], dict]:
+    """Names of their own for the diagnostics of several analyses, and what to sum up."""
+    writers: dict[str, list[Placed]] = {}
+    for place, module in steps:
+        for part in _in_sequences(module):
+            info = getattr(part, "info_key", None)
+            if info is not None:
+                writers.setdefault(info, []).append((place, part))
+    own_info: dict[str, dict[NestedKey, NestedKey]] = {}
+    totals: dict[NestedKey, list[NestedKey]] = {}
+    for info, placed in writers.items():
+        if len(placed) < 2:
+            continue
+        inside = [place for place, module in placed if (place, module) not in steps]
+        if inside:
+            raise ValueError(
+                f"Several analyses write their diagnostics under {info!r}, and in the sequence {inside[0]!r} they "
+                "would be overwritten: give each its own info_key."
+            )
+        for place, module in placed:
+            keys = [key for key in _out(module) if key[0] == info]
+            own_info[place] = {key: (info, place, *key[1:]) for key in keys}
+            for key in keys:
+                if key[-1] in ("nis", "log_likelihood"):
+                    totals.setdefault(key, []).append(own_info[place][key])
+    return own_info, {key: tuple(values) for key, values in totals.items()}
+
+
+def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) -> list[NestedKey]:
+    """The log-likelihoods that together are that of all readings."""
+    found = []
+    for place, module in steps:
+        for part in _in_sequences(module):
+            for key in _out(part):
+                if key[0] == getattr(part, "info_key", None) and key[-1] == "log_likelihood":
+                    found.append(key if key in totals else own_info.get(place, {}).get(key, key))
+    return list(dict.fromkeys(found))
+
+
+def _in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
+    """The module, or those of a plain sequence."""
+    if type(module) is TensorDictSequential:
+        for inner in module.module.children():
+            yield from _in_sequences(inner)
+    else:
+        yield module

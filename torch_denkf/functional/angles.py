@@ -1,0 +1,83 @@
+"""Angles in radians, of which many values mean the same direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
+    """Wraps some components of differences to [-pi, pi).
+
+    Args:
+        difference: ``[*, N]``.
+        angles: the components that are angles in radians.
+
+    Returns:
+        ``[*, N]``.
+
+    Examples:
+        >>> wrap_angles(torch.tensor([6.0, 6.0]), [1])
+        tensor([ 6.0000, -0.2832])
+    """
+    if not angles:
+        return difference
+    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+    is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
+    is_angle[list(angles)] = True
+    return torch.where(is_angle, wrapped, difference)
+
+
+def align_angles(
+    predicted: Tensor, observation: Tensor, angles: Sequence[int], observed: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Brings angles to the same turn, so that they can be averaged and subtracted like other numbers.
+
+    Predictions go within half a turn of their circular mean, the observation's samples within half a turn of their own,
+    and that within half a turn of the predictions'. What is no angle stays as it is.
+
+    Args:
+        predicted: predicted observations of the members, ``[*B, E, O]``.
+        observation: samples ``[*B, E, O]`` or one reading ``[*B, O]``.
+        angles: the components that are angles in radians.
+        observed: optional mask ``[*B, 1]`` or ``[*B, O]``; what it hides may be NaN, and becomes 0.
+
+    Returns:
+        Both, of the same shapes.
+
+    Examples:
+        >>> predicted, reading = align_angles(torch.tensor([[3.1], [-3.1]]), torch.tensor([-3.0]), [0])
+        >>> predicted.mean().round(decimals=2).abs(), (reading - predicted.mean()).round(decimals=2)
+        (tensor(3.1400), tensor([0.1400]))
+    """
+    if not angles:
+        return predicted, observation
+    samples = observation if observation.ndim == predicted.ndim else observation.unsqueeze(-2)
+    if observed is not None:
+        samples = torch.where(observed.unsqueeze(-2), samples, 0)
+    center, own = _circular_mean(predicted), _circular_mean(samples)
+    samples = center + wrap_angles(own - center, angles) + wrap_angles(samples - own, angles)
+    predicted = center + wrap_angles(predicted - center, angles)
+    return predicted, samples if observation.ndim == predicted.ndim else samples.squeeze(-2)
+
+
+def mean_observation(samples: Tensor, angles: Sequence[int]) -> Tensor:
+    """The mean ``[*B, O]`` of samples ``[*B, E, O]``, with angles on one turn.
+
+    Examples:
+        >>> mean_observation(torch.tensor([[3.1], [-3.1]]), [0]).abs()
+        tensor([3.1416])
+    """
+    if not angles:
+        return samples.mean(-2)
+    center = _circular_mean(samples)
+    return (center + wrap_angles(samples - center, angles)).mean(-2)
+
+
+def _circular_mean(values: Tensor) -> Tensor:
+    """The direction of the sum of unit vectors, ``[*B, 1, O]``; a constant to the gradient: it only picks the turn."""
+    values = values.detach()
+    return torch.atan2(values.sin().mean(-2, keepdim=True), values.cos().mean(-2, keepdim=True))

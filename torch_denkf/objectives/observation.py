@@ -1,0 +1,85 @@
+"""The training objective of an observation model alone, on true states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from tensordict import NestedKey, TensorDictBase
+
+from torch_denkf.filters import Filter
+from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._part import PartLoss
+from torch_denkf.objectives._readings import ReadingsLoss
+
+__all__ = ["ObservationLoss"]
+
+
+class ObservationLoss(PartLoss, ReadingsLoss):
+    r"""Scores what a filter's observation model reads of true states, ``[*B]``.
+
+    Its term ``loss_observation`` is the squared error of :math:`h_\psi(x_t)` against the true observation, the term of
+    that name in :class:`~torch_denkf.objectives.DEnKFLoss`. The parameters of the loss are those of the model.
+
+    Args:
+        filter: the filter whose observation model is trained; a module with an ``observe()`` method.
+        observation_scale: ``[O]``; errors are divided by it. A dimension with infinite scale does not count: means are
+            taken over the others.
+        observation_angles: dimensions of the observation that are angles in radians; their errors are wrapped to
+            [-pi, pi).
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``).
+
+    Raises:
+        ValueError: if a scale is not positive.
+        KeyError: if the filter has no such model, or an entry is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> loss = ObservationLoss(KalmanFilter(one, one, 3 * one, one, mean=torch.zeros(1), cov=one))
+        >>> td = TensorDict({"state": torch.ones(8, 1), "target_observation": torch.ones(8, 1)}, [8])
+        >>> loss(td)["loss_observation"]
+        tensor(4.)
+    """
+
+    @dataclass
+    class _AcceptedKeys(ReadingsLoss._AcceptedKeys):
+        """The entries that the loss reads.
+
+        Attributes:
+            state: true state ``[*B, S]``.
+            target_observation: true observation ``[*B, O]``.
+        """
+
+    default_keys = _AcceptedKeys
+    SCORES = ("mse",)
+
+    def __init__(
+        self,
+        filter: Filter,
+        *,
+        observation_scale: Scale = None,
+        observation_angles: Sequence[int] = (),
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ):
+        super().__init__(
+            filter,
+            {"observation": 1.0},
+            score="mse",
+            observation_scale=observation_scale,
+            observation_angles=observation_angles,
+            reduction=reduction,
+        )
+
+    def _trained(self):
+        model = self._observation_model()
+        return [] if model is None else [model]
+
+    def _needed(self) -> list[NestedKey]:
+        return [self.tensor_keys.state, self.tensor_keys.target_observation]
+
+    def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict

@@ -1,0 +1,133 @@
+"""The training objective of a sensor and its noise model alone, on frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Literal
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
+
+from torch_denkf.filters import Filter
+from torch_denkf.modules._base import Call, reads, run_modules
+from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._part import PartLoss
+from torch_denkf.objectives._readings import ReadingsLoss
+from torch_denkf.objectives._scores import MEMBER_SCORES, score_gaussian
+
+__all__ = ["SensorLoss"]
+
+
+class SensorLoss(PartLoss, ReadingsLoss):
+    r"""Scores what a filter's sensor reads, without the filter, on any batch of frames ``[*B]``. Of two or
+    more dimensions the last is time, for modules that tell times apart.
+
+    The modules that read frames alone are run: the sensor, and what follows from it, such as the noise model.
+
+    ========================  =====================================================================================
+    ``loss_sensor``           score of the sensor's samples against the true observation, the term of that name in
+                              :class:`~torch_denkf.objectives.DEnKFLoss`
+    ``loss_noise``            negative log-likelihood of the true observation under N(mean of the samples, R), nats
+    ========================  =====================================================================================
+
+    Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames
+    count where the sensor observed all. The parameters of the loss are those of the modules it runs.
+
+    Args:
+        filter: the filter whose sensor is trained.
+        score: of the samples: ``"crps"`` (fair), ``"energy"`` (fair) or ``"mse"`` (of the mean). Of one sample the
+            first two are its absolute error, and the length of its error: the scores of a point.
+        sensor: weight of ``loss_sensor``.
+        noise: weight of ``loss_noise``. R must follow from frames alone.
+        observation_scale: ``[O]``; errors are divided by it. A dimension with infinite scale does not count: means are
+            taken over the others. ``loss_noise`` is a density in the observation's own units all the same.
+        observation_angles: dimensions of the observation that are angles in radians; their errors are wrapped to
+            [-pi, pi).
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
+
+    Raises:
+        ValueError: on an unknown score, or a scale that is not positive.
+        KeyError: if an entry that a term needs is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import DEnKF
+        >>> loss = SensorLoss(DEnKF.paper(5, 2, ensemble_size=4), noise=0.1)
+        >>> frames = TensorDict({"pixels": torch.rand(3, 6, 50, 150), "target_observation": torch.randn(3, 2)}, [3])
+        >>> sorted(loss(frames).keys())
+        ['loss_noise', 'loss_sensor']
+    """
+
+    @dataclass
+    class _AcceptedKeys(ReadingsLoss._AcceptedKeys):
+        """The entries that the loss reads.
+
+        Attributes:
+            state: true state ``[*B, S]``, read where there is no true observation.
+            target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
+                no parameters, it is that model's observation of the true state.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``.
+            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+            noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+        """
+
+        noise: NestedKey = ("sensor", "noise")
+
+    default_keys = _AcceptedKeys
+    SCORES = MEMBER_SCORES
+
+    def __init__(
+        self,
+        filter: Filter,
+        *,
+        score: Literal["crps", "energy", "mse"] = "crps",
+        sensor: float = 1.0,
+        noise: float = 0.0,
+        observation_scale: Scale = None,
+        observation_angles: Sequence[int] = (),
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ):
+        super().__init__(
+            filter,
+            {"sensor": sensor, "noise": noise},
+            score=score,
+            observation_scale=observation_scale,
+            observation_angles=observation_angles,
+            reduction=reduction,
+        )
+
+    def _trained(self):
+        return self.filter.frame_modules
+
+    def _needed(self) -> list[NestedKey]:
+        """What the modules read, and the true observation, or the state that it follows from."""
+        needed: list[NestedKey] = []
+        made: set[NestedKey] = set()
+        for module in self.filter.frame_modules:
+            needed += [key for key in reads(module)[0] if key not in made and key not in needed]
+            made.update(map(unravel_key, module.out_keys))
+        model = self._observation_model()
+        known = model is not None and not any(True for _ in model.parameters())
+        return [*needed, self.tensor_keys.state if known else self.tensor_keys.target_observation]
+
+    def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
+        size, out = tensordict.batch_size, tensordict.copy()
+        call = Call(size, time=len(size) > 1)
+        # As in Filter.sequence: a recurrent network among these modules reads whole sequences.
+        with set_recurrent_mode(True) if call.time else nullcontext():
+            written = run_modules(self.filter.structure.frames, self.filter.entries_of(tensordict), call)
+        for key, value in written.items():
+            out.set(key, value)
+        return out
+
+    def _noise(self, tensordict, out):
+        errors, mask = self._reading_errors(tensordict, out)
+        noise = self._entry(out, self.tensor_keys.noise, "R must follow from frames alone. ")
+        error = errors.mean(-2)
+        cov = as_covariance(noise, self._true_observation(tensordict))
+        cov = self._counting("observation", cov, -1, -2)
+        return score_gaussian(error, cov, "nll", self._scale("observation")), mask
