@@ -5,13 +5,10 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torch import nn
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import FrameSkipTransform, TransformedEnv
 
 from tests.filters.factories import (
-    FixedEnsemble,
     NoisyLinear,
     linear_denkf,
     linear_kalman,
@@ -24,19 +21,14 @@ from tests.filters.particle_for_tests import bootstrap
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.filters import EKF, UKF, DEnKF, Filter, KalmanFilter
 from torch_denkf.modules import (
-    AroundState,
     ConstantNoise,
     EnsembleAnalysis,
     GaussianPrior,
     LearnedObservation,
     LinearObservation,
     MomentPrior,
-    PairObservation,
     Select,
     StochasticMLP,
-    UnicycleMotion,
-    UnicycleTransition,
-    WithHistory,
 )
 from torch_denkf.transforms import DEnKFTransform
 
@@ -499,139 +491,3 @@ def test_behind_a_frame_skip_the_belief_takes_one_step_a_skip():
 def test_an_initial_belief_is_drawn_in_the_filters_precision():
     filter = toy_denkf(action=False).double()
     assert filter.initialise(TensorDict({}, [3]))[ENSEMBLE].dtype == torch.float64
-
-
-# ------------------------------------------------------------------------------------------------ resets that update
-
-
-@pytest.mark.parametrize("history", [False, True])
-def test_an_update_at_a_reset_sees_nothing_of_the_episode_before(float64, history):
-    """An update that reads the belief of t-1 itself, as UnicycleMotion does."""
-    keys = {"history_key": ("belief", "history")} if history else {}
-    start = AroundState([0.1] * 5, ensemble_size=6)
-    analysis = {"sensor_key": "y", "belief_key": "analysis"}
-    if history:
-        analysis |= {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
-    filter = Filter(
-        {
-            "noise": ConstantNoise([0.3, 0.05], in_key="y"),
-            "transition": UnicycleTransition(torch.zeros_like, dt=0.1),
-            "observation": PairObservation() if history else Select([3, 4]),
-            "analysis": EnsembleAnalysis("etkf", **analysis),
-            "motion": UnicycleMotion(0.1, **keys),
-        },
-        initial=WithHistory(start, lags=2) if history else start,
-        update_at_reset=True,
-    )
-    frames = TensorDict({"y": torch.randn(2, 8, 2), "state": 3 * torch.randn(2, 8, 5)}, [2, 8])
-    frames["is_init"] = torch.zeros(2, 8, 1, dtype=torch.bool)
-    frames["is_init"][:, [0, 4]] = True
-    filter.draw_noise(frames)
-    whole = filter.sequence(frames.copy())
-    halves = torch.cat([filter.sequence(frames[:, :4].copy()), filter.sequence(frames[:, 4:].copy())], 1)
-    close(whole, halves, filter.belief_keys)
-
-
-def test_elements_without_a_belief_before_them_do_not_count_as_steps():
-    filter = linear_denkf()
-    data = TensorDict({"observation": torch.randn(9, 2)}, [9])
-    data["previous", "belief", "ensemble"] = torch.randn(9, 6, 2)
-    data["previous", "known"] = torch.tensor([0, 1, 1, 1, 0, 1, 1, 1, 1]).bool().unsqueeze(-1)
-    assert filter.stepped(data).equal(data["previous", "known"].squeeze(-1))
-    assert filter.stepped(data.exclude(("previous", "known"))).all()
-    assert not filter.stepped(data.exclude("previous"))[0]
-
-
-# ------------------------------------------------------------------------------------------------ nested sequences
-
-
-def blocks(**info):
-    plain, (_, _, H, R) = linear_denkf(), linear_system()
-
-    def block(index, before, after):
-        return TensorDictSequential(
-            LinearObservation(H[[index]], in_key=(before, "ensemble"), out_key=f"p{index}"),
-            EnsembleAnalysis(
-                "etkf",
-                forecast_key=(before, "ensemble"),
-                predicted_key=f"p{index}",
-                sensor_key=f"y{index}",
-                noise_variance_key=f"r{index}",
-                belief_key=after,
-                **({"info_key": f"info{index}"} if info else {}),
-            ),
-        )
-
-    noises = {f"r{i}": ConstantNoise(R[[i]].sqrt(), in_key=f"y{i}", out_key=f"r{i}") for i in (0, 1)}
-    parts = {"first": block(0, "forecast", "mid"), "second": block(1, "mid", "belief")}
-    return Filter({**noises, "transition": plain["transition"], **parts}, initial=plain.initial)
-
-
-def test_analyses_inside_sequences_count_all_or_are_refused(float64):
-    with pytest.raises(ValueError, match="each its own info_key"):
-        blocks()
-    filter, both = blocks(named=True), linear_denkf()
-    frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
-    frames.update({"y0": frames["observation"][..., :1], "y1": frames["observation"][..., 1:]})
-    out, exact = filter.sequence(frames.copy()), both.sequence(frames.copy())
-    close(out, exact, [MEAN, VAR])
-    likelihood = sum(out[key] for key in filter.log_likelihood_keys)
-    torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
-
-
-def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
-    filter = blocks(named=True)
-    old = filter["second"].module[1]
-    filter["second"].module[1] = EnsembleAnalysis(
-        "etkf",
-        forecast_key=("mid", "ensemble"),
-        predicted_key="p1",
-        sensor_key="y1",
-        noise_variance_key="r1",
-        observed_key="seen",
-    )
-    assert old is not filter["second"].module[1]
-    frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
-    hidden = filter.sequence(frames.copy().set("seen", torch.zeros(5, 1, dtype=torch.bool)))
-    assert not hidden[MEAN].equal(filter.sequence(frames.copy())[MEAN])
-
-
-def test_a_belief_that_no_module_passes_on_is_refused():
-    plain = linear_denkf()
-
-    class WithBias(FixedEnsemble):
-        def __init__(self, members):
-            super().__init__(members)
-            self.out_keys = [*self.out_keys, ("belief", "bias")]
-
-        def compute(self, *, batch_size):
-            return *super().compute(batch_size=batch_size), torch.zeros(*batch_size, 2)
-
-    class Biased(NoisyLinear):
-        def __init__(self):
-            super().__init__(torch.eye(2))
-            self.in_keys = [*self.in_keys, ("belief", "bias")]
-
-        def compute(self, state, bias, *, noise):
-            return state + bias.unsqueeze(-2)
-
-    names = ("noise", "observation", "analysis")
-    with pytest.raises(ValueError, match=r"'bias'.* no module writes"):
-        Filter(
-            {"transition": Biased(), **{name: plain[name] for name in names}},
-            initial=WithBias(plain.initial.members),
-        )
-
-
-def test_a_buffer_that_filters_before_its_slices_are_marked_is_refused():
-    frames = TensorDict({"observation": torch.randn(80, 2), "episode": torch.arange(80) // 20}, [80])
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(80),
-        sampler=SliceSampler(slice_len=5, traj_key="episode", cache_values=True),
-        batch_size=20,
-        transform=DEnKFTransform(linear_denkf()),
-    )
-    torch.manual_seed(0)
-    buffer.extend(frames)
-    with pytest.raises(ValueError, match="several sequences"):
-        buffer.sample()
