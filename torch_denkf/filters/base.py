@@ -339,15 +339,13 @@ class Filter(TensorDictSequential):
         else:
             written.update(start)
             written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
-        for key, value in written.items():
-            tensordict.set(key, value)
+        write(tensordict, written)
         return tensordict
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
         carry = {key: tensordict.get(key) for key in self.structure.carry}
-        for key, value in summaries(carry, self.structure.belief).items():
-            tensordict.set(key, value)
+        write(tensordict, summaries(carry, self.structure.belief))
         return tensordict
 
     # --------------------------------------------------------------------------------------------- a sequence
@@ -360,8 +358,7 @@ class Filter(TensorDictSequential):
         entries, size, structure = self.entries_of(tensordict), tensordict.batch_size, self.structure
         modules = (*structure.frames, structure.transition, *structure.update, ("initial", self.initial))
         drawn = draw_noise(self, entries, size, modules, time=len(size) > 0, generator=generator, as_far_as_known=True)
-        for key, value in (drawn or {}).items():
-            tensordict.set(key, value)
+        write(tensordict, drawn or {})
         return tensordict
 
     def sequence(
