@@ -14,7 +14,8 @@ setup(
     license_files=["LICENSE"],
     python_requires=">=3.11",
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
-    package_data={"torch_denkf": ["py.typed"], "torch_denkf.envs": ["assets/*.xml"]},
+    package_data={"torch_denkf": ["py.typed", "**/*.pyi"], "torch_denkf.simulation.ur5": ["assets/*.xml"]},
+    entry_points={"console_scripts": ["denkf = torch_denkf.cli.main:main"]},
     install_requires=[
         "torch>=2.13",
         "torchrl>=0.14.1",
@@ -24,11 +25,14 @@ setup(
         "dm-control>=1.0.50",
         "opencv-python-headless>=4.10",
         "numpy",
+        "filelock>=3.12",  # one process at a time in a folder
+        "lazy_loader>=0.4",  # `import torch_denkf` stays cheap
+        "tqdm>=4.60",
     ],
     extras_require={
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
         "lerobot": ["pyarrow>=15", "av>=14"],
-        "examples": ["tqdm", "matplotlib", "tensorboard"],
+        "examples": ["matplotlib", "tensorboard"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/results/speed.md was made with.

@@ -28,7 +28,6 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.data.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import gaspari_cohn
 from torch_denkf.modules import (
@@ -39,6 +38,7 @@ from torch_denkf.modules import (
     Select,
 )
 from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 FORCING, NOISE, R = 8.0, 0.2, 1.0  # of the true system: F; model noise and observation noise, standard deviations
 START, NOISE_START = 5.0, 1.0  # where learning begins

@@ -22,9 +22,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data.lorenz96 import lorenz96_step
 from torch_denkf.functional import analyse, inflate, random_rotation
 from torch_denkf.modules import LocalEnsembleAnalysis
+from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 VARIABLES = 40
 SPIN_UP = 1000  # cycles from a random state to the attractor

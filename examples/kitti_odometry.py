@@ -5,7 +5,7 @@
     python examples/kitti_odometry.py evaluate --checkpoint runs/09/folds/09-denkf-flow-0 --root KITTI --test 09
 
 KITTI is the folder with ``sequences`` and ``poses``, from cvlibs.net/datasets/kitti; without it:
-``python -m torch_denkf.data.render_kitti --out KITTI``. A study that is broken off goes on where it stopped.
+``python -m torch_denkf.cli.render_kitti --out KITTI``. A study that is broken off goes on where it stopped.
 
 Every fold trains a sensor alone, then the filter on the readings that the frozen sensor makes of drives it has not
 seen, then both end to end; see kitti_study/training.py. With ``--rendered N`` the sensor is first trained on N rendered

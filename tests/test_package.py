@@ -28,13 +28,13 @@ def wheel(tmp_path_factory):
 
 
 # All that needs the wheel is in one test, so that pytest-xdist builds it in one process alone.
-def test_point_10_the_wheel_holds_the_package_alone(wheel):
+def test_the_wheel_holds_the_package_alone(wheel):
     names = wheel.namelist()
     top = {name.split("/")[0] for name in names}
     (info,) = (name for name in top if name.endswith(".dist-info"))
     assert top == {"torch_denkf", info}
     package = ROOT / "torch_denkf"
-    kinds = ("*.py", "*.xml", "py.typed")
+    kinds = ("*.py", "*.pyi", "*.xml", "py.typed")
     sources = {str(path.relative_to(ROOT)) for kind in kinds for path in package.rglob(kind)}
     assert "torch_denkf/py.typed" in sources, "without it no type checker reads the annotations"
     assert {name for name in names if name.startswith("torch_denkf/")} == sources

@@ -11,9 +11,9 @@ from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, StepCount
 from torchrl.envs.utils import check_env_specs
 
 from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
-from torch_denkf.data._kitti_files import poses_to_state, state_to_poses
 from torch_denkf.envs import KITTIReplayEnv
 from torch_denkf.metrics import dead_reckoning
+from torch_denkf.vision.poses import poses_to_state, state_to_poses
 
 ROWS = 24
 KEYS = ("pixels", "state", "observed", "time")

@@ -1,15 +1,15 @@
 """Oracles: numbers by hand, closed forms of circles, and the official trajectories."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tests.real_data import KITTI
 from torch_denkf.metrics import dead_reckoning, kitti_endpoint_error, wrap_angle
 
-POSES = Path(__file__).parents[2].parent / "shared" / "data" / "kitti" / "poses"
+POSES = KITTI / "poses"
 
 
 def straight(rows=201, step=1.0, dtype=torch.float64):

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.data.lorenz96 import lorenz96_step
+from torch_denkf.simulation.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import Neighbours, gaspari_cohn, relax_to_prior_spread
 from torch_denkf.modules import (

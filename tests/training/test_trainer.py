@@ -243,7 +243,7 @@ def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
 
     class Bar:
         def __init__(self, **kwargs):
-            shown.append(kwargs)
+            shown.append({key: kwargs[key] for key in ("total", "initial", "desc", "unit", "disable")})
 
         __enter__ = lambda self: self  # noqa: E731
         __exit__ = update = lambda self, *_: None
@@ -251,12 +251,12 @@ def test_the_bar_shows_terms_and_errors(tmp_path, monkeypatch):
         def set_postfix(self, values, refresh):
             shown.append(sorted(values))
 
-    monkeypatch.setattr(sys.modules["torch_denkf.training.progress"], "tqdm", Bar)
+    monkeypatch.setattr(sys.modules["torch_denkf._progress"], "tqdm", Bar)
     net = nn.Linear(2, 1)
     trainer = FilterTrainer(net, [line_stage(net)], out=tmp_path, device="cpu", validate=lambda: {"error": 1.0})
     trainer.fit()
     assert shown == [
-        {"total": 6, "initial": 0, "desc": "fit", "disable": None},
+        {"total": 6, "initial": 0, "desc": "fit", "unit": "it", "disable": False},
         ["error", "loss", "loss_bias", "loss_square"],
     ]
 

@@ -1,8 +1,6 @@
 """Environments: toy systems, replays and a simulated arm. They know nothing about filters."""
 
-from torch_denkf.envs.kitti import KITTIReplayEnv
-from torch_denkf.envs.linear import LinearGaussianEnv
-from torch_denkf.envs.ur5 import UR5TableEnv
-from torch_denkf.envs.ur5_expert import UR5Expert
+import lazy_loader
 
-__all__ = ["KITTIReplayEnv", "LinearGaussianEnv", "UR5TableEnv", "UR5Expert"]
+# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

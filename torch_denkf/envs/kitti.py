@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_denkf.data.frames import MOTION_KEYS, frames_at
-from torch_denkf.data.kitti import read_kitti_drive
+from torch_denkf.data.kitti.drive import read_kitti_drive
+from torch_denkf.data.kitti.frames import MOTION_KEYS, frames_at
 
 __all__ = ["KITTIReplayEnv"]
 

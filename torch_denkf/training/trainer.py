@@ -11,11 +11,11 @@ from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
-from torch_denkf.training.progress import progress_bar
 from torch_denkf.training.stage import Stage, only_trainable
 from torch_denkf.training.update import Updates, seed_update
 
@@ -60,7 +60,7 @@ class FilterTrainer(HookPoints):
         device: by default the GPU if there is one.
         keep: ``"best"``, or ``"last"``: stages begin and end with the parameters of the last update.
         max_skipped: so many non-finite updates in a row are left out; one more is an error.
-        progress: whether a terminal shows a bar (needs ``tqdm``).
+        progress: whether a bar, or off a terminal a line every ten seconds, shows how far it is.
 
     Raises:
         ValueError: on stages without parameters, with the same names, or whose parameters the model does not hold.
@@ -172,7 +172,7 @@ class FilterTrainer(HookPoints):
         stage = self.stages[number]
         updates = Updates(stage, stage.groups(self.model), self.processes)
         shown = self.progress and self.processes.is_main
-        bar = progress_bar(stage.name, stage.updates, done, shown)
+        bar = progress_bar(stage.name, stage.updates, done, shown=shown)
         with only_trainable(self.model, updates.parameters), bar:
             if saved is None:
                 self._best = None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
+from torch_denkf import vision
+from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
 
 __all__ = ["OpticalFlow"]
 
@@ -71,7 +71,7 @@ class OpticalFlow(Transform):
         frames = pixels.reshape(-1, *pixels.shape[-3:]).cpu()
         for row in observed.reshape(-1).nonzero().flatten().tolist():
             frame, difference = frames[row].chunk(2)
-            arrays = image_motion(_grey(frame - difference), _grey(frame), self.calibration, height=self.height)
+            arrays = vision.image_motion(_grey(frame - difference), _grey(frame), self.calibration, height=self.height)
             flow[row], road[row] = (torch.from_numpy(array) for array in arrays)
         for key, value in zip(self.out_keys, (flow, road), strict=True):
             next_tensordict.set(key, value.reshape(*batch, *value.shape[1:]).to(pixels.device))
@@ -93,5 +93,7 @@ class OpticalFlow(Transform):
 
 
 def _grey(image: torch.Tensor):
+    import cv2
+
     pixels = (image * 255).round_().clamp_(0, 255).to(torch.uint8).numpy()
     return pixels[0] if len(pixels) == 1 else cv2.cvtColor(pixels.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 __all__ = ["CanonicalCamera", "KITTI_HEIGHT"]
@@ -57,6 +56,8 @@ class CanonicalCamera:
         Returns:
             ``[height, width]``, uint8.
         """
+        import cv2  # half of this package needs no OpenCV: what reads the flow, and the filters
+
         fx, fy, cx, cy = (float(value) for value in calibration)
         if fx > 1.5 * self.focal:  # linear interpolation alone would skip pixels
             height, width = image.shape

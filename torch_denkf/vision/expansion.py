@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.vision.camera import CanonicalCamera
-from torch_denkf.vision.flow import FLOW_SHAPE
+from torch_denkf.vision.shapes import FLOW_SHAPE
 
 __all__ = ["Expansion", "focus_of_expansion"]
 

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 
 from torch_denkf.vision.camera import CanonicalCamera
+from torch_denkf.vision.shapes import FLOW_SHAPE
 
-__all__ = ["FLOW_SHAPE", "coarse_flow", "dense_flow", "median_turn"]
-
-FLOW_SHAPE = (3, 25, 79)  # channels of coarse_flow, rows, columns: of every camera
+__all__ = ["coarse_flow", "dense_flow", "median_turn"]
 
 _RESIDUAL = 40.0  # grey levels that count as a complete mismatch
 

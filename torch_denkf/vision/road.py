@@ -14,16 +14,12 @@ import cv2
 import numpy as np
 
 from torch_denkf.vision.camera import KITTI_HEIGHT, CanonicalCamera
+from torch_denkf.vision.shapes import CELL, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
 
-__all__ = ["ROAD_PITCHES", "ROAD_SHAPE", "ROAD_SHIFTS", "road_correlation"]
+__all__ = ["road_correlation"]
 
-_CELL = 0.05  # m along the road
 _LENGTH, _HALF_WIDTH, _LANES = 7.0, 3.0, 32  # m, m, columns: the stretch of road that is compared
 _NEAREST = 4.0  # m: nearer, a cell is many pixels
-
-ROAD_PITCHES = np.arange(-8, 5) * 0.005  # rad, camera's axis above (+) the road: 0.02 up and 0.04 down
-ROAD_SHIFTS = np.arange(-3, 66) * _CELL  # m forwards between the two images: up to 113 km/h at 10 Hz
-ROAD_SHAPE = (len(ROAD_PITCHES), len(ROAD_SHIFTS))
 
 
 def road_correlation(
@@ -48,15 +44,15 @@ def road_correlation(
     """
     previous, current = (cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in (previous, current))
     left, up = turn
-    first, count = round(ROAD_SHIFTS[0] / _CELL), len(ROAD_SHIFTS)
+    first, count = round(ROAD_SHIFTS[0] / CELL), len(ROAD_SHIFTS)
     table = np.empty(ROAD_SHAPE, np.float32)
     for row, pitch in enumerate(ROAD_PITCHES):
         nearest = _nearest(camera, float(pitch), height) - ROAD_SHIFTS[0]
-        cells = round(_LENGTH / _CELL)
-        ahead = nearest + np.arange(cells) * _CELL
+        cells = round(_LENGTH / CELL)
+        ahead = nearest + np.arange(cells) * CELL
         # Both views are turned half way, so that the motion between them is straight ahead.
         now = _plan(current, camera, pitch, height, ahead, -left / 2, 0.0)
-        before = nearest + (first + np.arange(cells + count - 1)) * _CELL
+        before = nearest + (first + np.arange(cells + count - 1)) * CELL
         then = _plan(previous, camera, pitch, height, before, left / 2, up)
         table[row] = _slide(now, then, (1 / ahead).astype(np.float32))
     return table

@@ -1,0 +1,310 @@
+"""Rows of recordings in LeRobot's layouts are what was written, and what torchrl's samplers ask for."""
+
+import builtins
+import json
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tensordict import MemoryMappedTensor
+from torchrl.data import SamplerWithoutReplacement, SliceSampler
+from torchrl.data.datasets import BaseDatasetExperienceReplay
+
+import torch_denkf.data.lerobot.recording as recording_module
+from tests.data.lerobot.lerobot_folder import (
+    NAMES,
+    SIZE,
+    actions,
+    joints,
+    pictures,
+    write_info,
+    write_version_2,
+    write_version_3,
+)
+from tests.data.replay_for_tests import counting_bars
+from torch_denkf.data import LeRobotExperienceReplay
+
+LENGTHS = [9, 6, 12, 7, 8]
+open_all = partial(LeRobotExperienceReplay, size=SIZE, cache=None, split="all")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lerobot")
+    write_version_2(folder, LENGTHS)
+    return folder
+
+
+def expected_pixels(episode, length, size=SIZE):
+    frames = pictures(episode, length)
+    if size != SIZE:
+        frames = np.stack([cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA) for frame in frames])
+    return torch.from_numpy(frames.transpose(0, 3, 1, 2).astype(np.float32) / 255)
+
+
+def check_rows(data, lengths, tolerance=0.0):
+    rows = data[:]
+    assert [(e.number, e.length) for e in data.episodes] == list(enumerate(lengths))
+    assert len(data) == sum(lengths)
+    for episode in data.episodes:
+        mine, length = rows[episode.start : episode.start + episode.length], episode.length
+        torch.testing.assert_close(mine["pixels"], expected_pixels(episode.number, length), rtol=0, atol=tolerance)
+        assert (mine["state"].numpy() == joints(episode.number, length)).all()
+        assert (mine["action"].numpy() == actions(episode.number, length)).all()
+        np.testing.assert_allclose(mine["time"].flatten(), np.arange(length) / 10, atol=1e-7)  # float32 in the file
+        assert mine["time"].dtype == torch.float64
+        assert mine["frame"].flatten().tolist() == list(range(length))
+        assert (mine["episode"] == episode.number).all()
+        assert mine["observed"].all()
+        assert mine["is_init"].flatten().tolist() == [True] + [False] * (length - 1)
+        end = [False] * (length - 1) + [True]
+        assert mine["next", "done"].flatten().tolist() == mine["next", "truncated"].flatten().tolist() == end
+        assert not mine["next", "terminated"].any()
+        assert not (mine["done"] | mine["truncated"] | mine["terminated"]).any()
+
+
+# What is read ---------------------------------------------------------------------------------------------------------
+
+
+def test_version_2_with_lossless_video(root):
+    data = open_all(root)
+    assert isinstance(data, BaseDatasetExperienceReplay)
+    check_rows(data, LENGTHS)
+    assert data.fps == 10
+    assert data.names == tuple(NAMES)
+    assert data[5].batch_size == ()
+    assert data[5]["pixels"].equal(data[:]["pixels"][5])
+    assert data[torch.tensor([30, 3, 3])]["pixels"].equal(data[:]["pixels"][[30, 3, 3]])
+
+
+# Neighbouring frames differ by 14/255 in red. Lossy codecs keep flat colours and soft ramps to within 6/255 (measured:
+# 5 by MPEG-4, 4 by AV1): a frame in a neighbour's row fails.
+LOSSY = 6 / 255
+
+
+@pytest.mark.parametrize("codec", ["mp4v", "av1"])
+def test_lossy_video(tmp_path, codec):
+    write_version_2(tmp_path / "2", LENGTHS[:2], version="v2.0", codec=codec, suffix="mp4")
+    check_rows(open_all(tmp_path / "2"), LENGTHS[:2], LOSSY)
+    write_version_3(tmp_path / "3", [[5, 7], [6]], codec=codec, suffix="mp4")
+    check_rows(open_all(tmp_path / "3"), [5, 7, 6], LOSSY)
+
+
+@pytest.mark.parametrize("images", ["bytes", "path", "folder"])
+def test_images_instead_of_video(tmp_path, images):
+    write_version_2(tmp_path, LENGTHS[:3], images=images)
+    check_rows(open_all(tmp_path), LENGTHS[:3])
+
+
+def test_version_3_puts_many_episodes_in_a_file(tmp_path):
+    """Data files and videos end at different episodes."""
+    write_version_3(tmp_path, [[5, 7, 6], [4, 9]], groups_of_videos=[[5], [7, 6, 4, 9]])
+    check_rows(open_all(tmp_path), [5, 7, 6, 4, 9])
+
+
+def test_frames_follow_the_clock_and_not_the_count(tmp_path):
+    """A camera of twice the rate; rows in a file are not in the order of their times."""
+    write_version_2(tmp_path, [6])
+    video = tmp_path / "videos/chunk-000/observation.images.top/episode_000000.mkv"
+    writer = cv2.VideoWriter(str(video), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 20, SIZE[::-1])
+    for frame in pictures(0, 6):
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+        writer.write(np.zeros((*SIZE, 3), np.uint8))  # half way between two rows
+    writer.release()
+    check_rows(open_all(tmp_path), [6])
+
+
+def test_options(root):
+    small = open_all(root, size=(24, 32), camera="top")
+    for episode in small.episodes:
+        mine = small[:][episode.start : episode.start + episode.length]
+        expected = expected_pixels(episode.number, episode.length, (24, 32))
+        torch.testing.assert_close(mine["pixels"], expected, rtol=0, atol=0)
+    assert "action" not in open_all(root, action_key=None)[:]
+    other = open_all(root, state_key="action", action_key="timestamp", camera="observation.images.top")
+    assert other[:]["state"].equal(small[:]["action"])
+    assert other[:]["action"].flatten().tolist() == other[:]["time"].float().flatten().tolist()
+    assert other.names is None
+
+
+# Splits, samples, statistics ------------------------------------------------------------------------------------------
+
+
+def test_splits_are_by_episode_and_stay(tmp_path):
+    write_version_2(tmp_path, [2] * 25, images="bytes")
+    sets = {s: {e.number for e in open_all(tmp_path, split=s).episodes} for s in ("train", "test", "all")}
+    assert len(sets["test"]) == 5
+    assert not sets["train"] & sets["test"]
+    assert sets["train"] | sets["test"] == sets["all"] == set(range(25))
+    assert len({number % 5 for number in sets["test"]}) > 1  # not each fifth: recordings often go round objects
+    test = open_all(tmp_path, split="test")
+    for episode in test.episodes:
+        mine = test[:][episode.start : episode.start + 2]
+        assert mine["pixels"].equal(expected_pixels(episode.number, 2))
+        assert (mine["state"].numpy() == joints(episode.number, 2)).all()
+    lines = (tmp_path / "meta/episodes.jsonl").read_text().splitlines()
+    (tmp_path / "meta/episodes.jsonl").write_text("\n".join(lines[:12]))  # as it was earlier
+    fewer = {e.number for e in open_all(tmp_path, split="test").episodes}
+    assert fewer == {number for number in sets["test"] if number < 12}
+    (tmp_path / "meta/episodes.jsonl").write_text(next(lines[k] for k in range(5) if k not in sets["test"]))
+    with pytest.raises(ValueError, match=r"split 'test' has none of the episodes .*pass split='all'"):
+        open_all(tmp_path, split="test")
+
+
+@pytest.mark.parametrize(
+    "options", [{"num_slices": 4}, {"slice_len": 6}, {"sampler": SliceSampler(num_slices=4)}, {"prefetch": 2}]
+)
+def test_slices_are_contiguous_and_in_one_episode(root, options):
+    if "prefetch" in options:
+        options = {"slice_len": 6, **options}
+    data = open_all(root, batch_size=24, **options)
+    rows, starts = data[:], set()
+    for _ in range(30):
+        flat = data.sample()
+        batch, index = flat.reshape(4, 6), flat["index"].reshape(4, 6)
+        assert (batch["episode"] == batch["episode"][:, :1]).all()
+        assert (batch["frame"].diff(dim=1) == 1).all()
+        assert (index.diff(dim=1) == 1).all()
+        for key in ("pixels", "state", "action", "time"):
+            assert batch[key].equal(rows[key][index]), key
+        assert batch["is_init"].squeeze(-1).tolist() == [[True] + [False] * 5] * 4
+        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * 5 + [True]] * 4
+        starts |= set(index[:, 0].tolist())
+    possible = {e.start + k for e in data.episodes for k in range(e.length - 5)}
+    assert starts <= possible
+    assert len(starts) > 0.75 * len(possible)  # 4 + 1 + 7 + 2 + 3 windows, 120 draws
+
+
+def test_each_row_once(root):
+    data = LeRobotExperienceReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
+    seen = torch.cat([batch["index"].flatten() for batch in data])
+    assert sorted(seen.tolist()) == list(range(len(data)))
+    assert len(data) < sum(LENGTHS)
+
+
+def test_statistics_by_numpy(root):
+    data = LeRobotExperienceReplay(root, size=SIZE, cache=None)  # the training split
+    which = [e.number for e in data.episodes]
+    assert len(which) == 4
+    parts = {
+        "state": np.concatenate([joints(e, LENGTHS[e]) for e in which]).astype(np.float64),
+        "action": np.concatenate([actions(e, LENGTHS[e]) for e in which]).astype(np.float64),
+        "pixels": np.concatenate([pictures(e, LENGTHS[e]) for e in which]).reshape(-1, 3) / 255,
+    }
+    for key, values in parts.items():
+        for name, function in (("mean", np.mean), ("std", np.std)):
+            found = data.statistics[key, name].flatten()
+            np.testing.assert_allclose(found, function(values, axis=0), rtol=2e-6, atol=1e-7)
+    assert data.statistics["pixels", "mean"].shape == (3, 1, 1)
+    assert data.statistics["state", "std"][2] == 0  # a joint that never moves
+    everything = open_all(root).statistics
+    assert (
+        abs(everything["state", "mean"][0] - data.statistics["state", "mean"][0]) > 0.01
+    )  # the test split would count
+
+
+def test_transforms_and_preprocess_see_the_pixels(root, tmp_path):
+    data = open_all(root, transform=lambda rows: rows.set("half", rows["pixels"] / 2), batch_size=4)
+    sample = data.sample()
+    assert sample["half"].equal(sample["pixels"] / 2)
+    storage = open_all(root).preprocess(brightness, num_workers=1, mp_start_method="fork", dest=tmp_path)
+    torch.testing.assert_close(storage[:]["mean"], data[:]["pixels"].mean((1, 2, 3)))
+
+
+def brightness(rows):
+    return rows.select("episode").set("mean", rows["pixels"].mean((-3, -2, -1)))
+
+
+def test_it_deletes_and_writes_nothing(root):
+    data = open_all(root)
+    with pytest.raises(RuntimeError, match="delete it by hand"):
+        data.delete()
+    with pytest.raises(RuntimeError):
+        data.extend(data[:2])
+    assert data.data_path == data.data_path_root == root.resolve()
+
+
+# Cache and bar --------------------------------------------------------------------------------------------------------
+
+
+def test_the_second_open_reads_the_cache(root, tmp_path, monkeypatch):
+    first = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
+    assert len(list(tmp_path.iterdir())) == 1  # no temporary file stays
+    with monkeypatch.context() as patch:
+        patch.setattr(recording_module, "frames_at_times", None)
+        patch.setattr(recording_module, "read_table", None)
+        again = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
+        parts = [LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
+    assert isinstance(again._recording["image"], MemoryMappedTensor)
+    assert again._recording["image"].dtype == torch.uint8
+    assert "pixels" not in again._storage[:]
+    assert (again[:] == first[:]).all()
+    check_rows(again, LENGTHS)
+    assert sum(len(part) for part in parts) == sum(LENGTHS)
+    LeRobotExperienceReplay(root, size=(24, 32), cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_changed_files_are_read_anew(tmp_path):
+    write_version_2(tmp_path / "a", [4, 4], images="folder")
+    before = open_all(tmp_path / "a", cache=tmp_path / "cache")[:]["pixels"]
+    name = tmp_path / "a/images/observation.images.top/episode_000001/frame_000002.png"
+    cv2.imwrite(str(name), np.zeros((*SIZE, 3), np.uint8))
+    after = open_all(tmp_path / "a", cache=tmp_path / "cache")[:]["pixels"]
+    assert not after[6].any()
+    assert after[[0, 1, 2, 3, 4, 5, 7]].equal(before[[0, 1, 2, 3, 4, 5, 7]])
+
+
+def test_a_bar_counts_frames(root, tmp_path, monkeypatch):
+    bars = counting_bars(monkeypatch)
+    open_all(root, cache=tmp_path)
+    open_all(root, cache=tmp_path)  # from the cache: no bar
+    open_all(root, progress=False)
+    assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(sum(LENGTHS), sum(LENGTHS), True)]
+
+
+# What is optional -----------------------------------------------------------------------------------------------------
+
+
+def without(monkeypatch, *names):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name.split(".")[0] in names:
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+
+
+def test_without_the_extra(tmp_path, root, monkeypatch):
+    write_version_2(tmp_path, [4], codec="av1", suffix="mp4")
+    with monkeypatch.context() as patch:
+        without(patch, "av")
+        with pytest.raises(ValueError, match=r"no frame of .*episode_000000.mp4 .*AV1 .*torch_denkf\[lerobot\]"):
+            open_all(tmp_path)
+        check_rows(open_all(root), LENGTHS)  # other codecs need no PyAV
+    with monkeypatch.context() as patch:
+        without(patch, "pyarrow")
+        with pytest.raises(ImportError, match=r"pyarrow: pip install 'torch_denkf\[lerobot\]'"):
+            open_all(root)
+
+
+def test_names_and_actions_are_optional(tmp_path):
+    write_version_2(tmp_path, [4], images="bytes")
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    for names, expected in (
+        (NAMES, tuple(NAMES)),
+        ({"motors": NAMES[:2], "gripper": ["g"]}, ("shoulder", "elbow", "g")),
+        (["motors"], None),
+        (None, None),
+    ):
+        info["features"]["observation.state"]["names"] = names
+        write_info(tmp_path, "v2.1", False, features=info["features"])
+        assert open_all(tmp_path).names == expected
+    del info["features"]["action"]
+    write_info(tmp_path, "v2.1", False, features=info["features"])
+    assert "action" not in open_all(tmp_path)[:]
+    assert "action" not in open_all(tmp_path).statistics

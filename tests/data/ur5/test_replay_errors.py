@@ -1,0 +1,97 @@
+"""What is wrong with options, folders and files is said with their names and with what to do."""
+
+import json
+import os
+from functools import partial
+
+import pytest
+
+from tests.data.ur5.ur5_demos import make_demo, ten_demos, write_folder
+from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.data.ur5.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
+
+open_dataset = partial(UR5ExperienceReplay, cache=None)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return ten_demos(tmp_path_factory)
+
+
+def test_options_out_of_range(root):
+    with pytest.raises(ValueError, match="'train', 'test' or 'all', got 'val'"):
+        open_dataset(root, split="val")
+    with pytest.raises(ValueError, match="one of num_slices"):
+        open_dataset(root, num_slices=2, slice_len=3)
+    with pytest.raises(ValueError, match="frames_only leaves single rows"):
+        open_dataset(root, frames_only=True, slice_len=3)
+    with pytest.raises(ValueError, match=r"\(13, 16\) is larger than the demos' \(12, 16\)"):
+        open_dataset(root, size=(13, 16))
+    with pytest.raises(ValueError, match="must be positive"):
+        open_dataset(root, size=(0, 16))
+    with pytest.raises(ValueError, match=r"slices have 7 rows, but demos \[8\] have 6"):
+        open_dataset(root, split="all", slice_len=7, batch_size=14)
+    short = open_dataset(root, split="all", slice_len=7, batch_size=14, strict_length=False)
+    assert len(short.sample()) in (12, 13, 14)
+
+
+def test_folders_without_demos(tmp_path):
+    with pytest.raises(FileNotFoundError, match=f"no folder {tmp_path / 'nowhere'}.*{COMMAND}"):
+        open_dataset(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=f"no demos in {tmp_path}: no {MANIFEST}"):
+        open_dataset(tmp_path)
+    write_folder(tmp_path, [make_demo(1, 8)])
+    with pytest.raises(ValueError, match=r"none of the 1 demos .* is in the split 'test'"):
+        open_dataset(tmp_path, split="test")
+    write_folder(tmp_path, [make_demo(9, 8)])
+    with pytest.raises(ValueError, match="training split"):
+        _ = open_dataset(tmp_path, split="test").statistics
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "missing"])
+def test_damaged_files_are_named(tmp_path, damage):
+    write_folder(tmp_path, [make_demo(number, 8) for number in range(3)])
+    file = tmp_path / "demo-000002.npz"
+    data = bytearray(file.read_bytes())
+    if damage == "missing":
+        file.unlink()
+    elif damage == "cut":
+        file.write_bytes(data[:-100])
+    else:
+        data[len(data) // 2] ^= 1
+        file.write_bytes(data)
+    error = FileNotFoundError if damage == "missing" else ValueError
+    with pytest.raises(error, match=f"{file}.*{COMMAND}"):
+        open_dataset(tmp_path)
+
+
+def test_files_that_are_no_demos_are_named(tmp_path):
+    entry = write_demo(tmp_path, make_demo(0, 8))
+    shorter = write_demo(tmp_path, make_demo(1, 7))
+    write_manifest(tmp_path, [entry, type(entry)(**{**vars(shorter), "rows": 8})])
+    with pytest.raises(ValueError, match=r"demo-000001.npz has 'state' of shape \(7, 10\), .* says \(8, 10\)"):
+        open_dataset(tmp_path)
+    os.replace(tmp_path / entry.file, tmp_path / shorter.file)
+    write_manifest(tmp_path, [type(entry)(**{**vars(entry), "demo": 1, "file": shorter.file})])
+    with pytest.raises(ValueError, match=r"demo-000001.npz is demo 0 .* listed as demo 1"):
+        open_dataset(tmp_path)
+    write_folder(tmp_path, [make_demo(0, 8), make_demo(1, 8, size=(10, 10))])
+    text = r"demo-000001.npz has pictures of \(H, W\) = \(10, 10\), but .*demo-000000.npz of \(12, 16\)"
+    for size in (None, (5, 5)):
+        with pytest.raises(ValueError, match=text):
+            open_dataset(tmp_path, size=size)
+
+
+def test_a_cut_line_of_the_manifest_counts_as_not_written(root, tmp_path):
+    write_folder(tmp_path, [make_demo(number, 8) for number in range(3)])
+    text = (tmp_path / MANIFEST).read_text()
+    (tmp_path / MANIFEST).write_text(text[:-30])
+    assert list(read_manifest(tmp_path)) == [0, 1]
+    assert [json.loads(line)["demo"] for line in text.splitlines()] == [0, 1, 2]
+    assert [e.demo for e in open_dataset(tmp_path, split="all").episodes] == [0, 1]
+
+
+def test_a_cache_that_cannot_be_written(root, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot write the cache at .*file.*TORCH_DENKF_CACHE"):
+        UR5ExperienceReplay(root, cache=tmp_path / "file" / "cache")

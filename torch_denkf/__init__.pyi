@@ -1,0 +1,64 @@
+from .data.kitti.replay import KITTIOdometryExperienceReplay
+from .data.lerobot.replay import LeRobotExperienceReplay
+from .data.ur5.replay import UR5ExperienceReplay
+from .deployment import PackagedStep, export_step, load_step
+from .envs.kitti import KITTIReplayEnv
+from .envs.linear import LinearGaussianEnv
+from .envs.ur5.expert import UR5Expert
+from .envs.ur5.table import UR5TableEnv
+from .filters import DPF, EKF, PFM, UKF, BackpropKF, DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter
+from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from .training import FilterTrainer, Stage
+from .transforms import (
+    BlackFrames,
+    Blur,
+    Brightness,
+    DEnKFTransform,
+    LastAction,
+    MissingFrames,
+    OccludingBox,
+    OpticalFlow,
+    SaltAndPepper,
+)
+
+__version__: str
+
+__all__ = [
+    "BackpropKF",
+    "BlackFrames",
+    "Blur",
+    "Brightness",
+    "DEnKF",
+    "DEnKFLoss",
+    "DEnKFTransform",
+    "DPF",
+    "EKF",
+    "Filter",
+    "FilterTrainer",
+    "GaussianLoss",
+    "KITTIOdometryExperienceReplay",
+    "KITTIReplayEnv",
+    "KalmanFilter",
+    "LSTMFilter",
+    "LastAction",
+    "LeRobotExperienceReplay",
+    "LinearGaussianEnv",
+    "MissingFrames",
+    "MixtureLoss",
+    "ObservationLoss",
+    "OccludingBox",
+    "OpticalFlow",
+    "PFM",
+    "PackagedStep",
+    "ParticleFilter",
+    "SaltAndPepper",
+    "SensorLoss",
+    "Stage",
+    "TransitionLoss",
+    "UKF",
+    "UR5ExperienceReplay",
+    "UR5Expert",
+    "UR5TableEnv",
+    "export_step",
+    "load_step",
+]

@@ -1,0 +1,33 @@
+from .kitti.drive import list_kitti_drives, read_kitti_drive
+from .kitti.frames import drive_frames, frames_at, sample_windows
+from .kitti.gaps import bridge_gaps, steps_between
+from .kitti.mirror import mirror_drive
+from .kitti.motion import with_motion
+from .kitti.render import random_drive, render_drives, roadside_scene, write_drives
+from .kitti.replay import KITTIOdometryExperienceReplay
+from .lerobot.replay import LeRobotExperienceReplay
+from .lerobot.rows import recording_from_rows
+from .systems import lorenz96_step, lorenz96_tendency
+from .ur5.replay import UR5ExperienceReplay
+
+__all__ = [
+    "KITTIOdometryExperienceReplay",
+    "LeRobotExperienceReplay",
+    "UR5ExperienceReplay",
+    "bridge_gaps",
+    "drive_frames",
+    "frames_at",
+    "list_kitti_drives",
+    "lorenz96_step",
+    "lorenz96_tendency",
+    "mirror_drive",
+    "random_drive",
+    "read_kitti_drive",
+    "recording_from_rows",
+    "render_drives",
+    "roadside_scene",
+    "sample_windows",
+    "steps_between",
+    "with_motion",
+    "write_drives",
+]

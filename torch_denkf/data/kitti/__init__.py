@@ -1,0 +1,1 @@
+"""Drives in the layout of KITTI's odometry benchmark: read, rendered, mirrored, and as a data set."""

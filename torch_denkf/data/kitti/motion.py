@@ -1,0 +1,97 @@
+"""Optical flow and road correlation of a whole drive, computed once."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torch_denkf.data.kitti.drive import _cache_directory, _cached
+from torch_denkf.data.kitti.gaps import steps_at
+from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
+
+__all__ = ["with_motion"]
+
+_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
+
+
+def with_motion(
+    drive: TensorDictBase,
+    *,
+    height: float = KITTI_HEIGHT,
+    cache: str | Path | bool | None = True,
+    keep_images: bool = True,
+) -> TensorDict:
+    """Adds what the flow sensor reads to a drive: the motion of each image since the one before.
+
+    ======== =============== ==========================================================================================
+    key      shape           content
+    ======== =============== ==========================================================================================
+    ``flow`` [N, 3, 25, 79]  float16: coarse optical flow and its mismatch, see :func:`torch_denkf.vision.coarse_flow`
+    ``road`` [N, 13, 69]     float16: see :func:`torch_denkf.vision.road_correlation`
+    ======== =============== ==========================================================================================
+
+    Both are zero in rows whose image, or the one before, is missing; after :func:`torch_denkf.data.bridge_gaps` the one
+    before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
+    25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
+
+    Args:
+        drive: as :func:`torch_denkf.data.read_kitti_drive` gives it, batch size ``[N]``; colour images are reduced to
+            grey.
+        height: of the camera over the road, in m.
+        cache: as in :func:`torch_denkf.data.read_kitti_drive`.
+        keep_images: False leaves the images out of the result, which makes it light.
+
+    Returns:
+        A shallow copy of the drive, with both entries.
+
+    Raises:
+        KeyError: if the drive lacks images, their mask or the calibration.
+        OSError: if the cache cannot be written.
+
+    Examples:
+        >>> from torch_denkf.data import read_kitti_drive, write_drives
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
+        >>> drive = read_kitti_drive(folder, *write_drives(folder, ["town"], frames=5), cache=None)
+        >>> with_motion(drive, cache=None)["road"].shape
+        torch.Size([5, 13, 69])
+    """
+    missing = {"image", "frame_valid", "calibration"} - set(drive.keys())
+    if missing:
+        raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")
+
+    def compute() -> TensorDict:
+        return _compute(drive, height)
+
+    if cache is None or cache is False:
+        motion = compute()
+    else:
+        directory = _cache_directory() if cache is True else Path(cache).expanduser()
+        digest = hashlib.blake2b(f"{_FORMAT} {height} {tuple(drive['image'].shape)}".encode(), digest_size=10)
+        for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
+            digest.update(drive[key].contiguous().numpy().data)
+        motion = _cached(directory / f"motion-{digest.hexdigest()}", compute)
+    drive = drive.copy() if keep_images else drive.exclude("image")
+    return drive.update({"flow": motion["flow"], "road": motion["road"]})
+
+
+def _compute(drive: TensorDictBase, height: float) -> TensorDict:
+    rows = drive.batch_size[0]
+    flow = torch.zeros(rows, *FLOW_SHAPE, dtype=torch.float16)
+    road = torch.zeros(rows, *ROAD_SHAPE, dtype=torch.float16)
+    steps, calibration = steps_at(drive, torch.arange(rows)).squeeze(-1).tolist(), drive["calibration"].tolist()
+    for row in range(rows):
+        if steps[row]:
+            previous, current = (_grey(drive["image"][at]) for at in (row - steps[row], row))
+            arrays = image_motion(previous, current, calibration[row], height=height)
+            flow[row], road[row] = (torch.from_numpy(array).half() for array in arrays)
+    return TensorDict({"flow": flow, "road": road}, batch_size=[rows])
+
+
+def _grey(image: torch.Tensor):
+    pixels = image.numpy()
+    return pixels[0] if len(pixels) == 1 else cv2.cvtColor(pixels.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)

@@ -1,0 +1,194 @@
+"""Writes rendered drives: in stretches, in several processes, and so that a drive that is there is complete."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import time
+import uuid
+import zlib
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from torch_denkf.data.kitti.files import write_poses
+from torch_denkf.simulation.street.camera import Camera
+from torch_denkf.simulation.street.renderer import Renderer
+from torch_denkf.simulation.street.roadside import roadside_scene
+from torch_denkf.vision.poses import KITTI_DT, poses_to_state
+
+FORMAT = 3  # raise it when drives of the same options come out differently
+MARKER = "drive.json"
+STRETCH = 500  # frames that a process draws at a time
+GRAIN = 1.5  # grey values: standard deviation of the images' noise
+ABANDONED = 600.0  # s without a new image, after which a half drive is a killed run's
+
+
+@dataclass
+class Job:
+    """One drive to write.
+
+    Attributes:
+        root: folder that gets ``sequences`` and ``poses``.
+        name: of the drive.
+        poses: camera-to-world matrices, ``[N, 3, 4]``.
+        camera: what it is seen with.
+        folder: of the images; ``image_0`` and ``image_1`` are grey.
+        traffic: whether cars move.
+        options: what the drive follows from, for its marker; ``seed`` is one of them.
+        beside: the folder it is written to before it is complete.
+    """
+
+    root: Path
+    name: str
+    poses: np.ndarray
+    camera: Camera
+    folder: str
+    traffic: bool
+    options: dict
+    beside: Path = field(init=False)
+
+    def __post_init__(self):
+        self.beside = self.root / f".{self.name}-{uuid.uuid4().hex[:8]}"
+
+    @property
+    def target(self) -> Path:
+        """Where the drive will be."""
+        return self.root / "sequences" / self.name
+
+    def is_there(self, overwrite: bool) -> bool:
+        """Whether the drive is there already.
+
+        Raises:
+            FileExistsError: if another one is, which may not be replaced.
+        """
+        if not self.target.exists():
+            return False
+        marker = self.target / MARKER
+        ours = json.loads(marker.read_text()) if marker.is_file() else None
+        if ours == self.options:
+            return True
+        if ours is None or not overwrite:
+            hint = "choose another name or folder" if ours is None else "pass overwrite=True or choose another name"
+            raise FileExistsError(f"{self.target} is there and is another drive ({ours or 'not rendered'}); {hint}")
+        return False
+
+    def renderer(self) -> Renderer:
+        """The drive's scene, from its name and seed."""
+        rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 1])
+        ground = self.poses[:, 1, 3] + self.camera.height
+        scene = roadside_scene(poses_to_state(self.poses, KITTI_DT), rng, ground=ground, traffic_on=self.traffic)
+        return Renderer(scene, self.camera)
+
+    def draw(self, renderer: Renderer, start: int, stop: int) -> None:
+        """Write the images of frames ``start`` to ``stop``."""
+        folder = self.beside / self.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        grey = self.folder in ("image_0", "image_1")
+        for number in range(start, stop):
+            picture = renderer.render(self.poses[number], number)
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if grey else picture
+            rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 2, number])
+            grain = rng.standard_normal(picture.shape, dtype=np.float32) * np.float32(GRAIN)
+            picture = np.clip(picture + grain + np.float32(0.5), 0, 255).astype(np.uint8)
+            file = folder / f"{number:06d}.png"
+            if not cv2.imwrite(str(file), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                raise OSError(f"cannot write {file}; is the disk full?")
+
+    def finish(self) -> None:
+        """Write the text files and rename: a drive that is there is complete."""
+        camera, beside = self.camera, self.beside
+        row = f"{camera.fx:.9e} 0 {camera.cx:.9e} 0 0 {camera.fy:.9e} {camera.cy:.9e} 0 0 0 1 0"
+        (beside / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
+        (beside / "times.txt").write_text("".join(f"{KITTI_DT * k:.6e}\n" for k in range(len(self.poses))))
+        (beside / MARKER).write_text(json.dumps(self.options))
+        write_poses(beside / "poses.txt", self.poses)
+        os.replace(beside / "poses.txt", self.root / "poses" / f"{self.name}.txt")
+        if self.target.exists():
+            shutil.rmtree(self.target)
+        beside.rename(self.target)
+
+
+def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None = None) -> None:
+    """Draw and write drives; what comes out does not depend on the number of processes.
+
+    Args:
+        jobs: the drives, all of one root.
+        processes: how many draw at a time; 1 draws in this process.
+        progress: called with the number of images that were written since the last call.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
+    if not jobs:
+        return
+    root = jobs[0].root
+    try:
+        for folder in (root / "sequences", root / "poses"):
+            folder.mkdir(parents=True, exist_ok=True)
+        for job in jobs:
+            _sweep(root, job.name)
+            job.beside.mkdir()
+    except OSError as error:
+        raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
+    tasks = [
+        (job, start, min(start + STRETCH, len(job.poses)))
+        for job in jobs
+        for start in range(0, len(job.poses), STRETCH)
+    ]
+    missing = {job.name: len(job.poses) for job in jobs}
+
+    def done(job: Job, start: int, stop: int) -> None:
+        missing[job.name] -= stop - start
+        if not missing[job.name]:
+            job.finish()
+        if progress is not None:
+            progress(stop - start)
+
+    try:
+        if processes == 1:
+            for task in tasks:
+                _draw(*task)
+                done(*task)
+            return
+        # Not forked: a fork of a process with threads (PyTorch's, OpenCV's) can hang.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(
+            min(processes, len(tasks)), context, initializer=cv2.setNumThreads, initargs=(1,)
+        ) as pool:
+            waiting = {pool.submit(_draw, *task): task for task in tasks}
+            try:
+                for future in as_completed(waiting):
+                    future.result()
+                    done(*waiting[future])
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    finally:
+        _last.clear()
+        for job in jobs:
+            shutil.rmtree(job.beside, ignore_errors=True)
+
+
+_last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
+
+
+def _draw(job: Job, start: int, stop: int) -> None:
+    if job.beside not in _last:
+        _last.clear()
+        _last[job.beside] = job.renderer()
+    job.draw(_last[job.beside], start, stop)
+
+
+def _sweep(root: Path, name: str) -> None:
+    """Remove what killed runs left of a drive."""
+    for folder in root.glob(f".{name}-????????"):
+        newest = max(path.stat().st_mtime for path in (folder, *folder.glob("image_?")))
+        if time.time() - newest > ABANDONED:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,271 @@
+"""LeRobot's layout on disk, versions 2.0, 2.1 and 3.0: which file holds what, and the numbers in them.
+
+::
+
+    meta/info.json                                      version, fps, features, the two templates of paths
+    meta/episodes.jsonl                                 2.x: number and length of each episode
+    meta/episodes/chunk-CCC/file-FFF.parquet            3.0: also the files it is in, and where in the video it begins
+    data/chunk-CCC/episode_EEEEEE.parquet               2.x: numbers (and images); 3.0: file-FFF.parquet, many episodes
+    videos/chunk-CCC/CAMERA/episode_EEEEEE.mp4          2.x; 3.0: videos/CAMERA/chunk-CCC/file-FFF.mp4
+    images/CAMERA/episode_EEEEEE/frame_FFFFFF.png       where images are neither in videos nor in the parquet files
+
+Source: github.com/huggingface/lerobot, ``lerobot.datasets``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from torch_denkf.data.lerobot.video import EXTRA
+
+VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
+COMPLETE = "download the data set completely"
+
+
+@dataclass(frozen=True)
+class EpisodeFiles:
+    """Where one episode is.
+
+    Attributes:
+        number: of the episode.
+        length: rows.
+        data: the parquet file.
+        video: the camera's, None where it has images.
+        begin: s into the video.
+    """
+
+    number: int
+    length: int
+    data: Path
+    video: Path | None
+    begin: float
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A data set's metadata, for one camera.
+
+    Attributes:
+        root: the folder.
+        fps: rows a second.
+        features: of ``info.json``: dtype, shape and names by key.
+        camera: key of the camera.
+        episodes: by number.
+        meta: the files that all this is from.
+    """
+
+    root: Path
+    fps: float
+    features: dict[str, dict[str, Any]]
+    camera: str
+    episodes: tuple[EpisodeFiles, ...]
+    meta: tuple[Path, ...]
+
+    def width(self, key: str) -> int:
+        """Numbers in a feature.
+
+        Raises:
+            ValueError: if there is no such feature, or it is no vector.
+        """
+        if key not in self.features:
+            raise ValueError(f"{self.root} has no feature {key!r}; it has {sorted(self.features)}")
+        feature = self.features[key]
+        if len(feature["shape"]) != 1 or feature["dtype"] in ("string", "image", "video"):
+            raise ValueError(f"feature {key!r} of {self.root} is no vector: {feature['dtype']} {feature['shape']}")
+        return int(feature["shape"][0])
+
+    def names(self, key: str) -> tuple[str, ...] | None:
+        """Names of a feature's numbers, where each has one: LeRobot writes lists, or lists below a common name."""
+        names = self.features[key].get("names")
+        if isinstance(names, dict):
+            names = [name for part in names.values() for name in (part if isinstance(part, list) else [part])]
+        if not names or len(names) != self.width(key):
+            return None
+        return tuple(str(name) for name in names)
+
+
+def read_layout(root: Path, camera: str | None) -> Layout:
+    """Read the metadata of a LeRobot folder.
+
+    Raises:
+        FileNotFoundError: without metadata.
+        ValueError: for versions that are not supported, cameras that are not there, and malformed metadata.
+    """
+    file = root / "meta" / "info.json"
+    if not file.is_file():
+        raise FileNotFoundError(f"no {file}; pass the folder of a LeRobot data set, which holds meta and data")
+    try:
+        info = json.loads(file.read_text())
+        version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
+    if version not in VERSIONS:
+        raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
+    camera = _choose_camera(root, features, camera)
+    if VERSIONS[version] == 2:
+        episodes, meta = _episodes_of_version_2(root, info, camera)
+    else:
+        episodes, meta = _episodes_of_version_3(root, info, camera)
+    episodes = [episode for episode in episodes if episode.length]
+    if not episodes:
+        raise ValueError(f"{root} has no episodes; {COMPLETE}")
+    episodes.sort(key=lambda episode: episode.number)
+    return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
+
+
+def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) -> str:
+    cameras = [key for key, feature in features.items() if _is_camera(feature)]
+    if camera is None and len(cameras) == 1:
+        return cameras[0]
+    for name in cameras:
+        if camera is not None and camera in (name, name.removeprefix("observation.images.")):
+            return name
+    if not cameras:
+        raise ValueError(f"{root} has no camera: no feature of dtype video or image among {sorted(features)}")
+    raise ValueError(
+        f"{root} has no camera {camera!r}; it has {cameras}"
+        if camera is not None
+        else f"{root} has several cameras; pass camera=, one of {cameras}"
+    )
+
+
+def _is_camera(feature: dict) -> bool:
+    details = feature.get("info") or feature.get("video_info") or {}
+    depth = details.get("video.is_depth_map") or details.get("is_depth_map")
+    return feature["dtype"] in ("video", "image") and not depth
+
+
+def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[EpisodeFiles], list[Path]]:
+    file = root / "meta" / "episodes.jsonl"
+    if not file.is_file():
+        raise FileNotFoundError(f"no {file}, which lists the episodes; {COMPLETE}")
+    video = info["features"][camera]["dtype"] == "video"
+    episodes = []
+    for line in filter(str.strip, file.read_text().splitlines()):
+        try:
+            entry = json.loads(line)
+            number, length = int(entry["episode_index"]), int(entry["length"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} has a malformed line {line[:80]!r}; download it anew") from error
+        place = {
+            "episode_chunk": number // int(info.get("chunks_size", 1000)),
+            "episode_index": number,
+            "video_key": camera,
+        }
+        data = root / info["data_path"].format(**place)
+        episodes.append(
+            EpisodeFiles(number, length, data, root / info["video_path"].format(**place) if video else None, 0.0)
+        )
+    return episodes, [file]
+
+
+def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[EpisodeFiles], list[Path]]:
+    files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    if not files:
+        raise FileNotFoundError(f"no {root / 'meta' / 'episodes'}/*/*.parquet, which list the episodes; {COMPLETE}")
+    video = info["features"][camera]["dtype"] == "video"
+    data_keys = ["data/chunk_index", "data/file_index"]
+    video_keys = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    keys = ["episode_index", "length", *data_keys, *(video_keys if video else [])]
+    episodes = []
+    for file in files:
+        for entry in read_table(file, keys).to_pylist():
+            number, length, chunk, part = (int(entry[key]) for key in keys[:4])
+            shown, begin = None, 0.0
+            if video:
+                place = {"video_key": camera, "chunk_index": entry[keys[4]], "file_index": entry[keys[5]]}
+                shown, begin = root / info["video_path"].format(**place), float(entry[keys[6]])
+            data = root / info["data_path"].format(chunk_index=chunk, file_index=part)
+            episodes.append(EpisodeFiles(number, length, data, shown, begin))
+    return episodes, files
+
+
+def read_table(file: Path, columns: list[str] | None = None):
+    """Columns of a parquet file, or all, as a pyarrow table.
+
+    Raises:
+        ImportError: without pyarrow.
+        FileNotFoundError: without the file.
+        ValueError: if it is damaged, or lacks a column.
+    """
+    try:
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+    except ImportError as error:
+        raise ImportError(f"LeRobot keeps its numbers in parquet files, which need pyarrow: {EXTRA}") from error
+    if not file.is_file():
+        raise FileNotFoundError(f"no {file}, which the data set's metadata names; {COMPLETE}")
+    try:
+        with parquet.ParquetFile(file) as opened:
+            there = opened.schema_arrow.names
+            missing = sorted(set(columns or ()) - set(there))
+            if missing:
+                raise ValueError(f"{file} lacks the columns {missing}; it has {there}")
+            return opened.read(columns)
+    except (arrow.ArrowException, OSError) as error:
+        raise ValueError(f"{file} is no complete parquet file ({error}); download it anew") from error
+
+
+def rows_of_episode(table, episode: EpisodeFiles):
+    """The rows of one episode.
+
+    Raises:
+        ValueError: if they are not as many as the metadata says, or not in order.
+    """
+    import pyarrow.compute as compute
+
+    table = table.filter(compute.equal(table["episode_index"], episode.number))
+    if table.num_rows != episode.length:
+        raise ValueError(
+            f"{episode.data} has {table.num_rows} rows of episode {episode.number}, but the metadata says "
+            f"{episode.length}; download both anew"
+        )
+    if "frame_index" in table.column_names:
+        frame = table["frame_index"].to_numpy()
+        if (frame != np.arange(episode.length)).any():
+            raise ValueError(f"{episode.data}: frame_index of episode {episode.number} does not count from 0 by ones")
+    return table
+
+
+def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
+    """A column of numbers, float32 ``[n, width]``.
+
+    Raises:
+        ValueError: if a row has another width, or none.
+    """
+    import pyarrow as arrow
+    import pyarrow.compute as compute
+
+    column = table[key].combine_chunks()
+    if isinstance(column, arrow.ExtensionArray):
+        column = column.storage
+    listed = arrow.types.is_list(column.type) or arrow.types.is_large_list(column.type)
+    widths = {1}
+    if listed or arrow.types.is_fixed_size_list(column.type):
+        widths = set(compute.list_value_length(column).to_pylist())
+        column = column.flatten()
+    if widths != {width} or column.null_count:
+        found = "gaps" if column.null_count or None in widths else f"rows of {sorted(widths)} numbers"
+        raise ValueError(f"{key!r} in {file} has {found}; meta/info.json says {width} in each row")
+    return column.to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
+
+
+def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:
+    """One image of a parquet file, or of a file that it names, as RGB ``[H, W, 3]``; None if it cannot be decoded."""
+    data = (value or {}).get("bytes")
+    if data is None:
+        names = [(value or {}).get("path")]
+        names += [f"images/{camera}/episode{m}{episode:06d}/frame{m}{frame:06d}.png" for m in "_-"]
+        files = [root / name for name in names if name]
+        data = next((file.read_bytes() for file in files if file.is_file()), b"")
+    # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
+    ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
+    complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete else None
+    return None if pixels is None else pixels[..., ::-1]

@@ -1,0 +1,235 @@
+"""A robot's recording: episodes of camera images with the joints' states, one row a frame."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from torch_denkf._progress import progress_bar
+from torch_denkf.data.cache import _cache_directory, _cached
+from torch_denkf.data.lerobot.files import (
+    EpisodeFiles,
+    Layout,
+    decode_image,
+    read_layout,
+    read_table,
+    rows_of_episode,
+    vectors,
+)
+from torch_denkf.data.lerobot.video import frames_at_times
+
+_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What :class:`torch_denkf.data.LeRobotExperienceReplay` replays.
+
+    Attributes:
+        rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,
+            zeros where it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action``
+            float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
+            and ``episode`` int64 ``[N]``.
+        fps: rows a second.
+        names: of the state's numbers, if they have any.
+        source: folder that it was read from, if there is one.
+    """
+
+    rows: TensorDict
+    fps: float
+    names: tuple[str, ...] | None = None
+    source: Path | None = None
+
+
+def read_recording(
+    root: Path,
+    *,
+    camera: str | None,
+    state_key: str,
+    action_key: str | None,
+    size: tuple[int, int],
+    cache: str | Path | bool | None,
+    progress: bool,
+) -> Recording:
+    """Read all episodes of a LeRobot folder, or load them from the cache.
+
+    Raises:
+        ImportError: without pyarrow.
+        FileNotFoundError: without the folder or one of its files.
+        ValueError: for what is unknown, damaged or contradicts itself.
+    """
+    layout = read_layout(root, camera)
+    if action_key == "action" and action_key not in layout.features:  # the default: actions where there are any
+        action_key = None
+    keys = {"state": state_key} if action_key is None else {"state": state_key, "action": action_key}
+    widths = {name: layout.width(key) for name, key in keys.items()}
+    names = layout.names(state_key)
+    if cache is None or cache is False:
+        return Recording(_read(layout, keys, widths, size, None, progress), layout.fps, names, root)
+    folder = _cache_directory() if cache is True else Path(cache).expanduser()
+    key = [_FORMAT, str(root), layout.camera, keys, layout.fps, *size]
+    key += [(str(file.relative_to(root)), *_stamp(file)) for file in _files(layout)]
+    digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
+    entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
+    rows = _cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
+    return Recording(rows, layout.fps, names, root)
+
+
+def _files(layout: Layout) -> list[Path]:
+    files = {*layout.meta, *(e.data for e in layout.episodes), *(e.video for e in layout.episodes if e.video)}
+    if layout.episodes[0].video is None:
+        files |= set((layout.root / "images" / layout.camera).rglob("*.png"))
+    return sorted(files)
+
+
+def _stamp(file: Path) -> tuple[int, int]:
+    if not file.is_file():
+        return (-1, -1)  # the reader says what is missing
+    status = file.stat()
+    return status.st_mtime_ns, status.st_size
+
+
+class _Frames:
+    """The images of all rows, filled one by one."""
+
+    def __init__(self, rows: int, size: tuple[int, int], folder: Path | None, progress: bool):
+        self.size, self.observed = size, np.zeros((rows, 1), bool)
+        self._native: tuple[tuple[int, ...], object] | None = None
+        self.images = image_store(rows, size, folder)
+        self._bar = progress_bar("reading recordings", rows, unit=" frames", shown=progress)
+
+    def put(self, rows: np.ndarray, image: np.ndarray, source: object) -> None:
+        """Scale an image and take it for ``rows``."""
+        if self._native is None:
+            self._native = image.shape[:2], source
+        if image.shape[:2] != self._native[0]:
+            (h, w), (height, width) = image.shape[:2], self._native[0]
+            raise ValueError(
+                f"{source} is {w} pixels wide and {h} high, but {self._native[1]} is {width} wide and {height} high; "
+                "one camera has images of one size"
+            )
+        self.images[rows] = scaled(image, self.size)
+        self._bar.update(int((~self.observed[rows]).sum()))
+        self.observed[rows] = True
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
+    """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
+    if folder is None:
+        return np.zeros((rows, 3, *size), np.uint8)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+    except OSError as error:
+        raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
+
+
+def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``[H, W, 3]`` to ``[3, *size]``: averaged over areas where it shrinks."""
+    if image.shape[:2] != size:
+        shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
+        image = np.ascontiguousarray(image)
+        image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return image.transpose(2, 0, 1)
+
+
+def _read(
+    layout: Layout,
+    keys: dict[str, str],
+    widths: dict[str, int],
+    size: tuple[int, int],
+    folder: Path | None,
+    progress: bool,
+) -> TensorDict:
+    lengths = [episode.length for episode in layout.episodes]
+    starts = np.cumsum([0, *lengths])
+    numbers = {name: np.empty((starts[-1], width), np.float32) for name, width in widths.items()}
+    time = np.empty(starts[-1])
+    frames = _Frames(starts[-1], size, folder, progress)
+    videos: dict[Path, list[int]] = {}
+    opened, table = None, None
+    try:
+        for place, episode in enumerate(layout.episodes):
+            if episode.data != opened:
+                opened, table = episode.data, read_table(episode.data)
+                _check_columns(opened, table, [*keys.values(), "episode_index"])
+            rows, at = rows_of_episode(table, episode), slice(starts[place], starts[place + 1])
+            for name, key in keys.items():
+                numbers[name][at] = vectors(rows, opened, key, widths[name])
+            stamped = "timestamp" in rows.column_names
+            time[at] = rows["timestamp"].to_numpy() if stamped else np.arange(episode.length) / layout.fps
+            if episode.video is None:
+                _put_images(layout, episode, rows, starts[place], frames)
+                _check_seen(episode, frames.observed[at, 0])
+            else:
+                videos.setdefault(episode.video, []).append(place)
+        for file, places in videos.items():
+            index = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in places])
+            begin = np.repeat([layout.episodes[k].begin for k in places], [lengths[k] for k in places])
+            for near, image in frames_at_times(file, begin + time[index], 0.5 / layout.fps):
+                frames.put(index[near], image, file)
+            for k in places:
+                _check_seen(layout.episodes[k], frames.observed[starts[k] : starts[k + 1], 0])
+    finally:
+        frames.close()
+    return TensorDict(
+        {
+            "image": torch.from_numpy(frames.images),
+            "observed": torch.from_numpy(frames.observed),
+            **{name: torch.from_numpy(values) for name, values in numbers.items()},
+            "time": torch.from_numpy(time[:, None]),
+            "frame": torch.cat([torch.arange(length) for length in lengths])[:, None],
+            "episode": torch.tensor([e.number for e in layout.episodes]).repeat_interleave(torch.tensor(lengths)),
+        },
+        batch_size=[int(starts[-1])],
+    )
+
+
+def _check_columns(file: Path, table, columns: Sequence[str]) -> None:
+    missing = sorted(set(columns) - set(table.column_names))
+    if missing:
+        raise ValueError(f"{file} lacks the columns {missing}; it has {table.column_names}")
+
+
+def _put_images(layout: Layout, episode: EpisodeFiles, rows, start: int, frames: _Frames) -> None:
+    column = rows[layout.camera] if layout.camera in rows.column_names else [None] * episode.length
+    for frame, value in enumerate(column):
+        value = value if value is None else value.as_py()
+        image = decode_image(layout.root, layout.camera, episode.number, frame, value)
+        if image is not None:
+            frames.put(np.array([start + frame]), image, f"frame {frame} of {episode.data}")
+
+
+def _check_seen(episode: EpisodeFiles, seen: np.ndarray) -> None:
+    """A frame that is not there is a warning; an episode without any is an error."""
+    source = episode.video or episode.data
+    if not seen.any():
+        raise ValueError(
+            f"{source} shows none of the {episode.length} frames of episode {episode.number}; download it anew"
+        )
+    missing = np.flatnonzero(~seen).tolist()
+    if missing:
+        some = ", ".join(map(str, missing[:10])) + (f" and {len(missing) - 10} more" if len(missing) > 10 else "")
+        warnings.warn(
+            f"{source}: of episode {episode.number} these frames cannot be decoded and count as missing (observed "
+            f"False): {some}",
+            stacklevel=2,
+        )

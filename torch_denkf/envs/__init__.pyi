@@ -1,0 +1,7 @@
+from .kitti import KITTIReplayEnv
+from .linear import LinearGaussianEnv
+from .ur5.collect import collect_ur5_demos
+from .ur5.expert import UR5Expert
+from .ur5.table import UR5TableEnv
+
+__all__ = ["KITTIReplayEnv", "LinearGaussianEnv", "UR5Expert", "UR5TableEnv", "collect_ur5_demos"]

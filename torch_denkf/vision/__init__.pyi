@@ -1,0 +1,26 @@
+from .camera import KITTI_HEIGHT, CanonicalCamera
+from .expansion import Expansion, focus_of_expansion
+from .flow import coarse_flow, dense_flow, median_turn
+from .motion import image_motion
+from .poses import KITTI_DT, poses_to_state, state_to_poses
+from .road import road_correlation
+from .shapes import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
+
+__all__ = [
+    "CanonicalCamera",
+    "Expansion",
+    "FLOW_SHAPE",
+    "KITTI_DT",
+    "KITTI_HEIGHT",
+    "ROAD_PITCHES",
+    "ROAD_SHAPE",
+    "ROAD_SHIFTS",
+    "coarse_flow",
+    "dense_flow",
+    "focus_of_expansion",
+    "image_motion",
+    "median_turn",
+    "poses_to_state",
+    "road_correlation",
+    "state_to_poses",
+]
