@@ -29,7 +29,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
     filter.compile(chunk=2, backend="eager")
     compiled = filter.sequence(frames.copy(), detach_every=2)
     compiled_step = filter.step(eager[:, 2].copy())
-    assert sorted(facts[0] for facts in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
+    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
     assert_close(compiled, eager, filter.out_keys, dtype)
     assert_close(compiled_step, eager_step, filter.out_keys, dtype)
     ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
