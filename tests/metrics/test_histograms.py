@@ -54,7 +54,7 @@ def test_ranks_are_uniform_for_a_skewed_calibrated_ensemble(members):
     counts = rank_histogram(draws[:, :-1], draws[:, -1])
     assert counts.shape == (2, members + 1)
     assert counts.sum(1).tolist() == [n, n]
-    low, high = histogram_band(n, members + 1)
+    low, high = histogram_band(n, members + 1, level=0.9999)  # six histograms
     assert bool(((low <= counts) & (counts <= high)).all())
     assert stats.chisquare(counts[0].numpy()).pvalue > 0.001
 

@@ -200,7 +200,7 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] 
         ValueError: if the shapes differ, or if a variance is negative.
 
     Reference:
-        Gneiting, Balabdaoui & Raftery 2007, "Probabilistic forecasts, calibration and sharpness", J. R. Stat. Soc. B 69.
+        Gneiting, Balabdaoui & Raftery 2007, "Probabilistic forecasts, calibration and sharpness", JRSS B 69.
 
     Example:
         >>> pit(torch.zeros(3, 1), torch.ones(3, 1), torch.tensor([[-1.2816], [0.0], [1.2816]])).flatten()
