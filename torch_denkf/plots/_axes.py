@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe & Ito 2008, "Color universal design".
-BELIEF, READING, TRUTH, UNSEEN = "#0072B2", "#D55E00", "black", "0.85"
+BELIEF, FILL, READING, TRUTH, UNSEEN = "#0072B2", "#9CCBEA", "#D55E00", "black", "0.85"
 OTHERS = ("#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#0072B2")
 DASHES = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -62,14 +62,20 @@ def legend_above(axes: Axes) -> None:
     if not handles:
         return
     width = axes.get_window_extent().width / axes.figure.dpi * 72  # points
-    columns = int(width // (5.0 * max(map(len, labels)) + 36))
+    sizes = [4.8 * len(label) + 43 for label in labels]
+    columns = len(labels)
+    while columns > 1:
+        rows = -(-len(labels) // columns)  # filled column by column
+        if sum(max(sizes[first : first + rows]) for first in range(0, len(sizes), rows)) <= width:
+            break
+        columns -= 1
     legend = axes.legend(
         handles,
         labels,
         loc="lower left",
         bbox_to_anchor=(0, 1.01),
         borderaxespad=0,
-        ncols=min(max(columns, 1), len(labels)),
+        ncols=columns,
         fontsize=9,
         frameon=False,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_denkf.metrics import histogram_band, pit, rank_histogram
-from torch_denkf.plots._axes import BELIEF, TRUTH, UNSEEN, axes_for, labels_for, legend_above
+from torch_denkf.plots._axes import FILL, TRUTH, axes_for, labels_for, legend_above
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def plot_calibration(
     """Draws where the truth lies in the belief: flat for a calibrated filter, high at both ends if it trusts itself.
 
     A Gaussian belief gives the probability integral transform, an ensemble the rank of the truth among its members.
-    The grey band holds all bars of a calibrated filter with probability ``level``, if the states are independent.
+    The bars of a calibrated filter all end in the grey band with probability ``level``, if the states are independent.
 
     Args:
         belief: roll-outs or sequences ``[*B]``, time last, with ``("belief", "mean")`` ``[*B, S]`` and
@@ -55,7 +55,8 @@ def plot_calibration(
         ax: as many Axes as components; ``None`` makes a figure.
 
     Returns:
-        The Axes, one a component, with a bar a bin, its height in per cent of the states.
+        The Axes, one a component, with a bar a bin, its height in per cent of the states; the band has the gid
+        ``"band"``.
 
     Raises:
         ImportError: without matplotlib; the message names the extra.
@@ -68,8 +69,8 @@ def plot_calibration(
         >>> from tensordict import TensorDict
         >>> draws = torch.randn(1000, 10, 1, generator=torch.Generator().manual_seed(0))
         >>> (axes,) = plot_calibration(TensorDict({"ensemble": draws[:, 1:]}, [1000]), draws[:, 0], names=["x"])
-        >>> len(axes.patches), round(sum(bar.get_height() for bar in axes.patches))
-        (10, 100)
+        >>> [round(float(bar.get_height()), 1) for bar in axes.containers[0]]
+        []
     """
     read = read_belief(belief, truth)
     chosen = dims_of(read, dims)
@@ -96,18 +97,15 @@ def plot_calibration(
     low, high = (100 * count / samples for count in histogram_band(samples, bins, level=level))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2.4 * len(chosen)), share=True)
     for axes, label, heights in zip(panels, labels_for(names, chosen), counts, strict=True):
-        axes.fill_between([0, 1], low, high, color=UNSEEN, linewidth=0, label=f"{100 * level:g} % band if calibrated")
+        shares, what = 100 * heights.numpy() / samples, "ranks" if ranks else "PIT values"
+        axes.bar(np.arange(bins) / bins, shares, 1 / bins, align="edge", color=FILL, edgecolor="white", label=what)
         axes.axhline(100 / bins, color=TRUTH, linewidth=1, linestyle=":", label="uniform")
-        shares = 100 * heights.numpy() / samples
-        style: dict[str, Any] = {
-            "color": BELIEF,
-            "alpha": 0.65,
-            "edgecolor": "white",
-            "label": "ranks" if ranks else "PIT values",
-        }
-        axes.bar(np.arange(bins) / bins, shares, 1 / bins, align="edge", **style)
+        band = f"a calibrated filter's bars end here ({100 * level:g} %)"
+        axes.axhspan(low, high, facecolor=(0, 0, 0, 0.12), edgecolor="0.3", linewidth=1, label=band, gid="band")
         axes.set(ylabel=f"{label}\nshare of steps, %", xlim=(0, 1), ylim=(0, 1.1 * max(shares.max(), high)))
-    where = "rank of the truth among the members / members" if ranks else "probability below the truth, of the belief"
+    where = (
+        "rank of the truth among the members, 0 to 1" if ranks else "probability that the belief puts below the truth"
+    )
     panels[-1].set_xlabel(where)
     if legend:
         legend_above(panels[0])

@@ -14,6 +14,7 @@ from torch_denkf.plots._belief import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 __all__ = ["plot_error_cost"]
 
@@ -67,16 +68,19 @@ def plot_error_cost(
         colour, marker = (BELIEF, *OTHERS[:-1])[index % 6], MARKERS[index % len(MARKERS)]
         axes.plot(*table.T.numpy(), "-", marker=marker, color=colour, label=name, zorder=2.2)
         for place, note in zip(table.tolist(), (notes or {}).get(name, ()), strict=False):
-            offset: dict[str, Any] = {"xytext": (6, 6), "textcoords": "offset points"}
-            axes.annotate(note, place, fontsize=8, color=colour, **offset)
+            # Nothing is at the lower left of a point on the frontier.
+            offset: dict[str, Any] = {"xytext": (-4, -8), "textcoords": "offset points", "ha": "right", "va": "top"}
+            axes.annotate(note, place, fontsize=8, color="0.2", **offset)
     every = torch.cat(list(tables.values()))
     best = every[pareto_frontier(every)]
     best = best[best[:, 0].argsort()].unique_consecutive(dim=0)
     ring: dict[str, Any] = {"markersize": 13, "markerfacecolor": "none", "markeredgecolor": TRUTH, "gid": "rings"}
     axes.plot(*best.T.numpy(), "o", label="Pareto frontier", zorder=2.3, **ring)
     axes.set_xscale("log")
+    _plain_numbers(axes.xaxis)
     if log_error:
         axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
     else:
         axes.set_ylim(0, 1.1 * float(every[:, 1].max()))
     low, high = axes.get_xlim(), axes.get_ylim()
@@ -88,3 +92,12 @@ def plot_error_cost(
     if legend:
         legend_above(axes)
     return axes
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """Writes 0.1, 0.2, 0.5, 1 at a logarithmic axis, as far as there is room."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")

@@ -78,7 +78,7 @@ def plot_spread_error(
         ensemble_size=read.ensemble_size,
         angles=turns,
     )
-    (axes,) = axes_for(ax, 1, (8, 6))
+    (axes,) = axes_for(ax, 1, (6.4, 6.8))
     labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
     lowest, highest = float("inf"), 0.0
     for column, (label, scale) in enumerate(zip(labels, scales, strict=True)):
