@@ -10,6 +10,7 @@ from torch_denkf.data.lerobot import LeRobotExperienceReplay
 from torch_denkf.data.lorenz96 import lorenz96_step, lorenz96_tendency
 from torch_denkf.data.mirror import mirror_drive
 from torch_denkf.data.motion import with_motion
+from torch_denkf.data.trajectories import write_trajectory
 from torch_denkf.data.ur5_replay import UR5ExperienceReplay
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "steps_between",
     "with_motion",
     "write_drives",
+    "write_trajectory",
 ]

@@ -61,7 +61,7 @@ def legend_above(axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
-    width = axes.get_window_extent().width / axes.figure.dpi * 72  # points
+    width = 1.1 * axes.get_window_extent().width / axes.figure.dpi * 72  # points; the layout to come widens it
     sizes = [4.8 * len(label) + 43 for label in labels]
     columns = len(labels)
     while columns > 1:

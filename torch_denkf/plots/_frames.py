@@ -75,7 +75,7 @@ def write_gif(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
         out.write(_GIF_HEAD + width.to_bytes(2, "little") + height.to_bytes(2, "little") + bytes(3) + _GIF_FOREVER)
         for number, frame in enumerate(_chain(first, frames)):
             hundredths = round(100 * (number + 1) / fps) - round(100 * number / fps)
-            image = Image.fromarray(frame).quantize(256, dither=Image.Dither.NONE)
+            image = Image.fromarray(frame).quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             for block in GifImagePlugin.getdata(image, duration=10 * hundredths, include_color_table=True):
                 out.write(block)
         out.write(b";")

@@ -102,7 +102,7 @@ def plot_path(
     axes.set(xlabel=f"{names[0]}, {unit}", ylabel=f"{names[1]}, {unit}")
     if len(chosen) == 3:
         axes.set_zlabel(f"{names[2]}, {unit}")  # type: ignore[attr-defined]
-        axes.set_aspect("equal")
+        _cube(axes)
     else:
         axes.set_aspect("equal", adjustable="datalim")
     if legend:
@@ -159,3 +159,16 @@ def _draw_ellipses(
         patch = Ellipse(centre, large, small, angle=angle, gid=f"step {step}", **style)
         patch.set_label(None if first else f"{100 * level:g} % of the belief")
         axes.add_patch(patch)
+
+
+def _cube(axes: Any) -> None:
+    """Gives the three axes one span, so that a metre is a metre along each."""
+    from matplotlib.ticker import MaxNLocator
+
+    limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+    middle, half = limits.mean(1), float(np.ptp(limits, axis=1).max()) / 2
+    for centre, set_limits in zip(middle, (axes.set_xlim, axes.set_ylim, axes.set_zlim), strict=True):
+        set_limits(centre - half, centre + half)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
+    axes.set_box_aspect((1, 1, 1), zoom=0.9)
