@@ -51,9 +51,9 @@ def write_trajectory(
     Example:
         >>> import tempfile, torch
         >>> state = torch.tensor([[0.0, 0.0, 0.0], [10.0, 1.0, 0.0]])
-        >>> file = write_trajectory(f"{tempfile.mkdtemp()}/path.txt", state, torch.tensor([0.0, 0.1]), layout="tum")
+        >>> file = write_trajectory(f"{tempfile.mkdtemp()}/path.txt", state, torch.tensor([0.0, 0.5]), layout="tum")
         >>> print(file.read_text().splitlines()[1])
-        0.100000000 -1.000000000 0.000000000 10.000000000 0.000000000 0.000000000 0.000000000 1.000000000
+        0.500000000 -1.000000000 0.000000000 10.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
     if layout not in ("kitti", "tum"):
         raise ValueError(f'layout must be "kitti" or "tum"; got {layout!r}')

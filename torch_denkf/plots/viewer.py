@@ -54,7 +54,7 @@ def log_rollout(
         pixels: pictures, see :func:`torch_denkf.plots.belief_video`.
         truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
         observed: ``[T, 1]`` bool, or its key; by default ``"observed"`` of the roll-out where it is there.
-        dims: of the state, two or three coordinates of the path.
+        dims: of the state, two coordinates of the path on the ground, or three in space.
         components: of the state, to log over time; all by default.
         names: a label for each of them.
         time: seconds of the steps ``[T]``, or the seconds between two. The timeline ``"step"`` is always there,
@@ -88,12 +88,12 @@ def log_rollout(
     if file is not None:
         Path(file).parent.mkdir(parents=True, exist_ok=True)
         recording.save(str(file))
-    lines, points = (rr.LineStrips2D, rr.Points2D) if len(place) == 2 else (rr.LineStrips3D, rr.Points3D)
-    paths = {"belief": (read.mean[:, place].numpy(), _BELIEF)}
+    paths = {"belief": (_in_space(read.mean[:, place]), _BELIEF)}
     if read.truth is not None:
-        paths["truth"] = (with_truth(read, place).numpy(), _TRUTH)
+        paths["truth"] = (_in_space(with_truth(read, place)), _TRUTH)
+    recording.log("path", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for name, (path, colour) in paths.items():
-        recording.log(f"path/{name}", lines([path], colors=[colour]), static=True)
+        recording.log(f"path/{name}", rr.LineStrips3D([path], colors=[colour]), static=True)
     spread = None if read.var is None else 1.645 * read.var.sqrt()
     for step in range(len(read.mean)):
         recording.set_time("step", sequence=step)
@@ -102,9 +102,9 @@ def log_rollout(
         if pictures is not None:
             recording.log("camera", rr.Image(as_picture(pictures[step])))
         for name, (path, colour) in paths.items():
-            recording.log(f"path/{name}/now", points(path[step : step + 1], colors=[colour]))
+            recording.log(f"path/{name}/now", rr.Points3D(path[step : step + 1], colors=[colour]))
         if read.ensemble is not None:
-            recording.log("path/ensemble", points(read.ensemble[step][:, place].numpy(), colors=[_MEMBERS]))
+            recording.log("path/ensemble", rr.Points3D(_in_space(read.ensemble[step][:, place]), colors=[_MEMBERS]))
         if read.observed is not None:
             recording.log("observed", rr.Scalars(float(read.observed[step].any())))
         for dim, label in zip(parts, labels, strict=True):
@@ -118,6 +118,11 @@ def log_rollout(
                 recording.log(["components", label, name], rr.Scalars(value))
     recording.flush()
     return recording
+
+
+def _in_space(points: Tensor) -> np.ndarray:
+    """Points ``[N, 2]`` or ``[N, 3]`` in the three coordinates of a space that z points up in."""
+    return np.pad(points.numpy(), ((0, 0), (0, 3 - points.shape[-1])))
 
 
 def _rerun() -> Any:
