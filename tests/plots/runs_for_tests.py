@@ -31,6 +31,6 @@ def ensemble_run(steps=40, members=19, seed=0):
     truth = torch.stack([t.cos(), t.sin(), t], -1)
     ensemble = truth.unsqueeze(1) + 0.1 * torch.randn(steps, members, 3, generator=rng)
     observed = torch.ones(steps, 1, dtype=torch.bool)
-    observed[10:15] = observed[30] = False
+    observed[10:15] = observed[30:31] = False
     belief = {"ensemble": ensemble, "mean": ensemble.mean(1), "var": ensemble.var(1)}
     return TensorDict({"belief": belief, "state": truth, "observed": observed}, [steps])

@@ -54,7 +54,7 @@ def plot_error_cost(
         >>> [len(line.get_xdata()) for line in axes.get_lines()[:3]]
         [1, 2, 1]
     """
-    tables = {name: number(torch.as_tensor(value)).double() for name, value in points.items()}
+    tables = {name: number(torch.as_tensor(value, dtype=torch.float64)) for name, value in points.items()}
     tables = {name: table.reshape(-1, 2) if table.shape == (2,) else table for name, table in tables.items()}
     for name, table in tables.items():
         if table.ndim != 2 or table.shape[-1] != 2 or not len(table):
