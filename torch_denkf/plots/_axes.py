@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -56,9 +56,16 @@ def axes_for(
     return given
 
 
-def legend_above(axes: Axes) -> None:
-    """Adds a legend over the Axes, in as many columns as fit; for a headline use ``axes.figure.suptitle``."""
-    handles, labels = axes.get_legend_handles_labels()
+def legend_above(axes: Axes, *others: Axes) -> None:
+    """Adds a legend over the Axes for all that is labelled in it and in the others, in as many columns as fit.
+
+    For a headline use ``axes.figure.suptitle``.
+    """
+    found: dict[str, Any] = {}
+    for part in (axes, *others):
+        for handle, label in zip(*part.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    labels, handles = list(found), list(found.values())
     if not handles:
         return
     width = 1.1 * axes.get_window_extent().width / axes.figure.dpi * 72  # points; the layout to come widens it
