@@ -128,7 +128,7 @@ def test_errors_say_what_to_do():
         plot_path(run["belief", "mean"], spread="ellipses")
     with pytest.raises(ValueError, match="two dimensions, or three"):
         plot_path(run, dims=[0])
-    with pytest.raises(ValueError, match="three need subplot_kw"):
+    with pytest.raises(ValueError, match="three need projection"):
         plot_path(run, dims=[0, 1, 2], ax=Figure().add_subplot())
     with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
         plot_path(run, dims=[0, 3])

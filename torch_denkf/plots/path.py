@@ -131,7 +131,7 @@ def _axes(ax: Axes | None, count: int) -> Axes:
     (axes,) = axes_for(ax, 1, (8, 6))
     if hasattr(axes, "set_zlabel") != (count == 3):
         raise ValueError(
-            f"{count} dims do not fit the Axes; three need subplot_kw={{'projection': '3d'}}, two must not"
+            f"{count} dims do not fit the Axes; three need projection='3d', two must not"
         )
     return axes
 
