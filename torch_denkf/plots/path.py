@@ -130,9 +130,7 @@ def _axes(ax: Axes | None, count: int) -> Axes:
         return new_figure((8, 6)).add_subplot(projection="3d")
     (axes,) = axes_for(ax, 1, (8, 6))
     if hasattr(axes, "set_zlabel") != (count == 3):
-        raise ValueError(
-            f"{count} dims do not fit the Axes; three need projection='3d', two must not"
-        )
+        raise ValueError(f"{count} dims do not fit the Axes; three need projection='3d', two must not")
     return axes
 
 
