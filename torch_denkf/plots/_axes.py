@@ -68,7 +68,9 @@ def legend_above(axes: Axes, *others: Axes) -> None:
     labels, handles = list(found), list(found.values())
     if not handles:
         return
-    width = 1.1 * axes.get_window_extent().width / axes.figure.dpi * 72  # points; the layout to come widens it
+    pixels, whole = axes.get_window_extent().width, axes.figure.bbox.width
+    pixels *= 1.1 if pixels > 0.7 * whole else 1.0  # the layout to come widens one that has the figure to itself
+    width = 72 * pixels / axes.figure.dpi  # points
     sizes = [4.8 * len(label) + 43 for label in labels]
     columns = len(labels)
     while columns > 1:
