@@ -44,6 +44,14 @@ def test_a_step_refuses_nan_and_leaves_the_belief_as_it_was(make):
     assert not filter.step(td)[MEAN].isfinite().all()
 
 
+def test_noise_that_is_given_and_is_not_finite_is_named():
+    filter = linear_denkf("perturbed", noisy=True)
+    td = filter.draw_noise(filter.initialise(TensorDict({"observation": torch.zeros(2)})))
+    td["noise", "transition"][3, 1] = torch.inf
+    with pytest.raises(ValueError, match=r"NaN or infinity in \[\('noise', 'transition'\)\]"):
+        filter.step(td)
+
+
 @pytest.mark.parametrize(
     "make",
     [linear_denkf, linear_kalman, lambda: bootstrap(50), *(lambda n=n: linear_filter(n) for n in ("EKF", "UKF"))],
@@ -83,8 +91,9 @@ def test_only_readings_are_left_out_of_a_prediction(float64):
     td = filter.initialise(TensorDict({"wind": torch.tensor([3.0, -1.0])}))
     moved = td[MEAN] @ F.mT + td["wind"]
     close(filter.predict(td), {MEAN: moved}, [MEAN])
-    with pytest.raises(KeyError, match="which no module must find"):
-        filter.step(td, without=["analysis"])
+    for name in ("analysis", "observed"):  # a mask that is not there hides nothing
+        with pytest.raises(KeyError, match="which no module must find"):
+            filter.step(td, without=[name])
     with pytest.raises(TypeError, match="list of keys"):
         filter.step(td, without="observation")
 
