@@ -7,6 +7,7 @@ from torch import nn
 from torchrl.envs import FrameSkipTransform, TransformedEnv
 
 from tests.filters.factories import (
+    FixedEnsemble,
     linear_denkf,
     linear_kalman,
     toy_denkf,
@@ -54,6 +55,27 @@ def test_stored_beliefs_start_anew_where_marks_say_so_and_nowhere_else(float64):
     out = filter.sequence(stored.copy())
     assert out[ENSEMBLE][1, 5].equal(stored[ENSEMBLE][1, 5])
     assert not out[ENSEMBLE][0, 5].equal(stored[ENSEMBLE][0, 5])
+
+
+class MeanIfThere(FixedEnsemble):
+    """An initial belief around a mean, if there is one."""
+
+    def __init__(self, members):
+        super().__init__(members)
+        self.optional_keys = [MEAN]
+
+    def compute(self, mean=None, *, batch_size):
+        ensemble, *others = super().compute(batch_size=batch_size)
+        return ensemble if mean is None else ensemble + mean.unsqueeze(-2), *others
+
+
+@pytest.mark.parametrize("run", ["initialise", "sequence"])
+def test_a_start_knows_nothing_of_the_belief_that_is_there(run):
+    filter = linear_denkf()
+    filter.initial = MeanIfThere(filter.initial.members)
+    frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5]).set(MEAN, torch.ones(3, 5, 2))
+    out = filter.sequence(frames)[:, 0] if run == "sequence" else filter.initialise(frames[:, 0])
+    assert (out[ENSEMBLE] == filter.initial.members).all()
 
 
 # ----------------------------------------------------------------------------------------------------------- groups
@@ -110,11 +132,13 @@ def test_no_steps_are_refused():
 def test_keep_returns_what_is_asked_for(float64):
     filter, frames = toy_denkf(), toy_frames((2, 6))
     filter.draw_noise(frames)
-    expected, keep = filter.sequence(frames.copy()), [MEAN, ("sensor", "ensemble"), ("info", "nis")]
+    expected = filter.sequence(frames.copy())
     for chunk in (0, 2):
-        out = filter.compile(chunk=chunk, backend="eager").sequence(frames.copy(), keep=keep)
-        assert set(out.exclude(*frames.keys()).keys(True, True)) == set(keep)
-        close(out, expected, keep)
+        filter.compile(chunk=chunk, backend="eager")
+        for keep in ([MEAN, ("sensor", "ensemble"), ("info", "nis")], [VAR, MEAN]):
+            out = filter.sequence(frames.copy(), keep=keep)
+            assert set(out.exclude(*frames.keys()).keys(True, True)) == set(keep)
+            close(out, expected, keep)
     with pytest.raises(ValueError, match=r"keep names \['nothing'\]"):
         filter.sequence(frames, keep=["nothing"])
 

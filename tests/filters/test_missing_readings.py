@@ -23,6 +23,7 @@ from torch_denkf.modules import (
 )
 
 ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
+LOG_WEIGHT = ("belief", "log_weight")
 BELIEF = [ENSEMBLE, MEAN, VAR]
 
 
@@ -68,6 +69,20 @@ def test_a_step_without_a_frame_is_the_forecast(float64, make):
     assert out.get("observation", None) is None
     with pytest.raises(KeyError, match="'observation'"):
         filter.step(td.exclude("observation"))
+
+
+@pytest.mark.parametrize("observed", [None, True])
+def test_a_prediction_does_not_resample_and_leaves_the_mask_alone(float64, observed):
+    """Where there is no frame, particles and weights go on as they are, whatever the mask of the last frame said."""
+    filter, (F, *_) = bootstrap(50, noisy=False), linear_system()
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    td["belief", "log_weight"] = torch.randn(50).log_softmax(-1)
+    if observed is not None:
+        td["observed"] = torch.tensor([observed])
+    out = filter.predict(td.copy())
+    close(out, {ENSEMBLE: td[ENSEMBLE] @ F.mT, LOG_WEIGHT: td[LOG_WEIGHT]}, [ENSEMBLE, LOG_WEIGHT], atol=1e-14)
+    mask = out.get("observed", None)
+    assert mask is None if observed is None else mask.item() is True
 
 
 def test_only_readings_are_left_out_of_a_prediction(float64):

@@ -46,6 +46,17 @@ def test_every_element_is_a_step_diagnostics_and_all(name, anew):
 
 
 @every_filter
+def test_marks_that_say_nothing_do_not_hide_a_missing_belief(name):
+    """Without a belief before it an element starts anew, though ``is_init`` says that none begins."""
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter, anew=(3,))
+    data["is_init"] = torch.zeros(2, 7, 1, dtype=torch.bool)
+    rows = [filter(data[:, t].copy()).select(*filter.out_keys) for t in range(7)]
+    close(torch.stack(rows, 1), steps, filter.out_keys)
+    close(filter.sequence(data.copy()), steps, filter.out_keys)
+
+
+@every_filter
 def test_within_a_slice_the_belief_is_the_filters_own(name):
     """The beliefs that a policy stored are of older parameters: only where a slice begins one is taken."""
     filter = FILTERS[name]()

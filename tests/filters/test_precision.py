@@ -1,5 +1,6 @@
 """Mixed precision is refused by name; process noise of zero, in an ensemble, in a replaced network."""
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -47,6 +48,18 @@ def test_float64_readings_are_refused_by_name():
     # A dictionary is one robot's: numbers, lists and arrays come in the filter's precision.
     belief = filter.initialise({"observation": torch.zeros(2, dtype=torch.float64).numpy()})
     assert filter.step(belief)[MEAN].dtype == torch.float32
+
+
+def test_a_mask_in_a_dictionary_stays_a_mask():
+    filter = linear_filter("EKF")
+    belief = filter.initialise({"observation": np.zeros(2)})
+    frame = {"observation": np.array([3.0, np.nan]), "observed": np.array([True, False])}
+    given = {key: belief[key].numpy() for key in filter.carry_keys}
+    nested = {"belief": {key[-1]: value for key, value in given.items()}}
+    expected = belief.copy().update({"observation": torch.tensor([3.0, torch.nan]), "observed": [True, False]})
+    out = filter.step({**frame, **nested})
+    assert out["observed"].dtype == torch.bool
+    close(out, filter.step(expected), [MEAN, COV])
 
 
 @pytest.mark.parametrize("kind", [EKF, UKF])
