@@ -1,4 +1,4 @@
-"""Modules that a filter calls on a TensorDict: with hooks, with a forward of their own, and the noise they find there."""
+"""Modules that a filter calls on a TensorDict: with hooks, with a forward of their own, and the noise they find."""
 
 import pytest
 import torch

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -98,3 +98,16 @@ def test_a_noise_of_unknown_size_leaves_steps_and_sequences_eager():
     assert not filter.compiled._functions
     drawn = filter.draw_noise(frames.copy())["noise"]
     assert set(drawn.keys()) == {"analysis"}, "as far as it is known"
+
+
+def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
+    """As if the sequence were taken step by step; the noise drawn where it is needed is that drawn in bulk."""
+    filter = toy_denkf(sensor_layer="flipout", layer="none", action=False)
+    frames, outs = toy_frames((3, 5), masks=0, resets=False).exclude("action"), []
+    for bulk in (False, True):
+        torch.manual_seed(1)
+        given = frames.copy()
+        if bulk:
+            given["noise", "sensor"] = filter["sensor"].draw_noise([3, 5], time=True, dtype=torch.float64)
+        outs.append(filter.sequence(given)["sensor", "ensemble"])
+    assert outs[0].equal(outs[1])
