@@ -170,6 +170,23 @@ def test_nested_reset_key(float64):
     assert ensemble[:, 1:][~start[:, 1:]].equal(rollout["next", "belief", "ensemble"][:, :-1][~start[:, 1:]])
 
 
+@pytest.mark.parametrize("resetting", [[], ["one"], ["two"], ["one", "two"]])
+def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
+    done = ["done", "terminated", "truncated"]
+    groups = [RenameTransform(done, [(name, key) for key in done], create_copy=True) for name in ("one", "two")]
+    env = TransformedEnv(base_env(batch_size=[3]), Compose(*groups, DEnKFTransform(known_start_filter())))
+    given, masks = torch.randn(3, 6, 2), {"one": [0, 1, 0], "two": [0, 0, 1]}
+    td = TensorDict({("belief", "ensemble"): given}, [3])
+    for name, mask in masks.items():
+        td[name, "_reset"] = torch.tensor(mask if name in resetting else [0, 0, 0]).bool().unsqueeze(-1)
+    assert {("one", "_reset"), ("two", "_reset")} <= set(env.reset_keys)
+    out = env.transform[-1]._reset(td, TensorDict({"observation": torch.zeros(3, 2)}, [3]))
+    expected = given.clone()
+    for name in resetting:
+        expected[masks[name].index(1)] = torch.tensor(PRIOR_MEAN)
+    assert out["belief", "ensemble"].equal(expected)
+
+
 @pytest.mark.parametrize("update_at_reset", [False, True])
 def test_diagnostics(float64, update_at_reset):
     keys = [("info", "nis"), ("info", "innovation"), ("forecast", "ensemble")]
