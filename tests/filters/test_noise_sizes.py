@@ -7,6 +7,8 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
+from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
+from torch_denkf.modules._base import run_module
 
 MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
 
@@ -111,3 +113,31 @@ def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
             given["noise", "sensor"] = filter["sensor"].draw_noise([3, 5], time=True, dtype=torch.float64)
         outs.append(filter.sequence(given)["sensor", "ensemble"])
     assert outs[0].equal(outs[1])
+
+
+class SideBySide(SubModel):
+    """Two noise modules for one reading, one behind the other."""
+
+    def __init__(self, *modules):
+        super().__init__(nn.ModuleList(modules), ["observation"], [("sensor", "noise")])
+
+    def on_entries(self, entries, call):
+        parts = [run_module(module, entries, call)[module.out_keys[0]] for module in self.module]
+        return {("sensor", "noise"): torch.cat(parts, -1)}
+
+
+def test_parts_of_different_sizes_say_nothing_of_the_whole():
+    """What is drawn in bulk leaves that noise out; a sequence, which has seen the variances, draws it."""
+    plain, other = linear_denkf("perturbed", noisy=True), linear_denkf("perturbed", noisy=True)
+    _, _, H, R = linear_system()
+    sd = torch.cat([R, R[:1]]).sqrt()
+    for filter in (plain, other):
+        filter.module["observation"] = LinearObservation(torch.cat([H, H[:1]]))
+    plain.module["noise"] = ConstantNoise(sd, in_key="observation")
+    other.module["noise"] = SideBySide(*(ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:])))
+    frames, outs = TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]), []
+    assert set(other.draw_noise(frames.copy())["noise"].keys()) == {"transition"}
+    for filter in (plain, other):
+        torch.manual_seed(1)
+        outs.append(filter.sequence(frames.copy())[MEAN])
+    torch.testing.assert_close(outs[1], outs[0])
