@@ -3,9 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from torch_denkf.filters import Filter
+from torch_denkf.modules import FromSensor
 
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
@@ -77,3 +79,17 @@ def test_a_start_that_is_updated_needs_no_action():
     start = filter.initialise(td.copy())
     assert start.get(("forecast", "speed"), None) is None
     torch.testing.assert_close(start[MEAN], plain.initialise(td.copy())[MEAN])
+
+
+def test_a_start_from_the_sensors_reading_runs_the_sensor():
+    """Also where it is not updated with that frame: the initial belief reads what the frame modules write."""
+    plain, (_, _, _, R) = linear_denkf(), linear_system()
+    sensor = TensorDictModule(lambda raw: 2.0 * raw, ["raw"], ["observation"])
+    initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, sensor_key="observation")
+    names = ("noise", "transition", "observation", "analysis")
+    filter = Filter({"sensor": sensor, **{name: plain[name] for name in names}}, initial=initial)
+    out = filter.initialise(TensorDict({"raw": torch.tensor([[1.0, -3.0]])}, [1]))
+    # 5 standard errors of 20,000 members.
+    assert ((out[MEAN] - torch.tensor([2.0, -6.0])).abs() < 5 * (R / 20_000).sqrt()).all()
+    torch.testing.assert_close(out[VAR][0], R, rtol=5 * (2 / 20_000) ** 0.5, atol=0)
+    assert filter.initialise({"raw": torch.zeros(2)})[MEAN].shape == (2,)
