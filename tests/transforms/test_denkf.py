@@ -70,7 +70,7 @@ def env(request):
     env.close()
 
 
-def test_point_01_specs(env):
+def test_specs(env):
     check_env_specs(env)
     shape = (*env.batch_size, 6, 2)
     for spec in (env.full_observation_spec, env.full_state_spec):
@@ -78,7 +78,7 @@ def test_point_01_specs(env):
     assert ("belief", "mean") in env.full_observation_spec.keys(True, True)
 
 
-def test_point_02_partial_resets(env):
+def test_partial_resets(env):
     prior = torch.tensor(PRIOR_MEAN)
     rollout = random_rollout(env)
     if not env.batch_size:
@@ -104,7 +104,7 @@ def test_point_02_partial_resets(env):
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("kind", ["[]", "[3]", "serial outside"])
-def test_point_03_steps_equal_the_sequence(kind, update_at_reset):
+def test_steps_equal_the_sequence(kind, update_at_reset):
     env = make_env(kind, partial(fixed_filter, update_at_reset=update_at_reset))
     env = TransformedEnv(env, InitTracker())
     rollout = random_rollout(env)
@@ -118,7 +118,7 @@ def test_point_03_steps_equal_the_sequence(kind, update_at_reset):
     assert frames["forecast", "ensemble"].shape == frames["belief", "ensemble"].shape
 
 
-def test_point_04_collector_replay_buffer_loss_gradients():
+def test_collector_replay_buffer_loss_gradients():
     filter = toy_filter()
     env = TransformedEnv(
         toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2),
@@ -151,7 +151,7 @@ def test_point_04_collector_replay_buffer_loss_gradients():
 
 
 @pytest.mark.parametrize("copy", [lambda t: pickle.loads(pickle.dumps(t)), deepcopy, lambda t: t.clone()])
-def test_point_05_copies_compute_the_same(copy):
+def test_copies_compute_the_same(copy):
     transform = DEnKFTransform(toy_filter())
     rollouts = []
     for part in (transform, copy(transform)):
@@ -160,7 +160,7 @@ def test_point_05_copies_compute_the_same(copy):
     assert_equal(*rollouts, BELIEF)
 
 
-def test_point_05_state_dict():
+def test_state_dict():
     first, second = (DEnKFTransform(toy_filter()) for _ in range(2))
     env, other = (TransformedEnv(toy_base_env(batch_size=[3]), part) for part in (first, second))
 
@@ -175,13 +175,13 @@ def test_point_05_state_dict():
     assert set(first.state_dict()) == {f"filter.{name}" for name in first.filter.state_dict()}
 
 
-def test_point_05_float64(float64):
+def test_float64(float64):
     rollout = random_rollout(filtered_env(random_filter, batch_size=[3]))
     assert {rollout["next", key].dtype for key in (("belief", "ensemble"), ("belief", "var"))} == {torch.float64}
     check_env_specs(filtered_env(random_filter, batch_size=[3]))
 
 
-def test_point_06_kalman_filter_in_the_transform(float64):
+def test_kalman_filter_in_the_transform(float64):
     kf = linear_kalman()
     env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
     check_env_specs(env)
@@ -190,7 +190,7 @@ def test_point_06_kalman_filter_in_the_transform(float64):
     assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
 
 
-def test_point_06_a_large_ensemble_follows_the_kalman_filter(float64):
+def test_a_large_ensemble_follows_the_kalman_filter(float64):
     size, rollouts = 20_000, []
     kf = linear_kalman()
     env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(linear_kalman()))
@@ -205,7 +205,7 @@ def test_point_06_a_large_ensemble_follows_the_kalman_filter(float64):
     assert (ours["var"] / exact["var"] - 1).abs().max() < 10 * (2 / size) ** 0.5
 
 
-def test_point_07_nothing_observed_is_pure_prediction(float64):
+def test_nothing_observed_is_pure_prediction(float64):
     env = filtered_env(fixed_filter, batch_size=[3], missing=1.0)
     rollout = env.rollout(5)
     assert rollout["observation"].isnan().all()
@@ -237,7 +237,7 @@ class MaskColumns(Transform):
         return observation_spec
 
 
-def test_point_07_partial_mask_is_the_filter_of_the_rest(float64):
+def test_partial_mask_is_the_filter_of_the_rest(float64):
     F, _, H, R = linear_system()
     start = FixedEnsemble(torch.randn(6, 2))
 
@@ -255,7 +255,7 @@ def test_point_07_partial_mask_is_the_filter_of_the_rest(float64):
     assert_equal(both, single, BELIEF, atol=1e-12)
 
 
-def test_point_08_same_seed_same_rollout(env):
+def test_same_seed_same_rollout(env):
     def run(seed):
         torch.manual_seed(seed)  # of the filter, where it runs in this process
         env.set_seed(seed)
@@ -267,7 +267,7 @@ def test_point_08_same_seed_same_rollout(env):
 
 
 @pytest.mark.parametrize("kind", ["[3]", "serial inside", "serial outside", "parallel inside", "parallel outside"])
-def test_point_08_rows_and_workers_differ(kind):
+def test_rows_and_workers_differ(kind):
     env = make_env(kind, random_filter)
     try:
         unseeded = env.reset()["belief", "ensemble"]
@@ -283,7 +283,7 @@ def test_point_08_rows_and_workers_differ(kind):
         env.close()
 
 
-def test_point_09_nothing_on_self():
+def test_nothing_on_self():
     transform = DEnKFTransform(random_filter())
     env = TransformedEnv(base_env(batch_size=[3]), transform)
     before = {name: value for name, value in vars(transform).items() if name not in ("_modules", "_parent")}
@@ -300,7 +300,7 @@ def test_point_09_nothing_on_self():
     assert env.rollout(3).shape == (3, 3)
 
 
-def test_point_09_spec_cache_is_cleared_on_append():
+def test_spec_cache_is_cleared_on_append():
     env = TransformedEnv(base_env(batch_size=[3]))
     assert "belief" not in env.full_observation_spec
     assert "belief" not in env.full_state_spec
