@@ -1,0 +1,154 @@
+"""Who trains, who tunes, who validates and who is tested; and batches of their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.kitti.streams import DISTURBANCES, Stream, mirror, rows
+
+VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
+UNITS = (0.1, 0.03)
+
+
+@dataclass
+class Statistics:
+    """Means and standard deviations of the training drives alone."""
+
+    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
+    scale: torch.Tensor
+    pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
+    pixel_scale: torch.Tensor
+    dt: float  # s
+
+    @property
+    def unit(self) -> torch.Tensor:
+        """What counts as an error of one, in (m/s, rad/s)."""
+        return self.scale * torch.tensor(UNITS)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a stream, with the share of the batches that it gets."""
+
+    stream: Stream
+    begin: float = 0.0  # shares of its rows
+    end: float = 1.0
+    weight: float = 1.0
+
+    def read(self, cache: Path) -> TensorDict:
+        """The stretch, ``[n]``."""
+        data = self.stream.read(cache)
+        return data[int(self.begin * len(data)) : int(self.end * len(data))]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One drive is left out for the test; it may not be in the other lists.
+
+    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones;
+    see ``unseen_readings`` for drives that are in both lists.
+    """
+
+    name: str
+    train: list[Part]  # of the sensor
+    tune: list[Part]  # of the filter
+    validation: list[Part]
+    test: list[Stream] = field(default_factory=list)
+
+    def __post_init__(self):
+        tested = {stream.drive for stream in self.test}
+        leaked = {part.stream.drive for part in (*self.train, *self.tune, *self.validation)} & tested
+        if leaked:
+            raise ValueError(f"fold {self.name}: {sorted(leaked)} would be trained and tested on")
+
+    @property
+    def trained(self) -> set[str]:
+        """Drives that the sensor sees."""
+        return {part.stream.drive for part in self.train}
+
+    @property
+    def shared(self) -> set[str]:
+        """Drives for both sensor and filter."""
+        return self.trained & {part.stream.drive for part in self.tune}
+
+
+def with_disturbances(parts: Sequence[Part]) -> list[Part]:
+    """Each part clean, and with half as much weight again in all disturbances together."""
+    disturbed = []
+    for part in parts:
+        disturbed.append(part)
+        for condition in DISTURBANCES:
+            stream = replace(part.stream, condition=condition)
+            disturbed.append(replace(part, stream=stream, weight=0.5 * part.weight / len(DISTURBANCES)))
+    return disturbed
+
+
+def with_spans(parts: Sequence[Part]) -> list[Part]:
+    """Each clean part, and with less weight in pairs of two and of three steps."""
+    longer = [
+        replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
+        for part in parts
+        for steps, weight in ((2, 0.25), (3, 0.12))
+        if part.stream.condition == "clean"
+    ]
+    return [*parts, *longer]
+
+
+def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
+    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
+    velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
+    loc, scale = velocity.mean(0), velocity.std(0)
+    loc[1], scale[1] = 0.0, velocity[:, 1].square().mean().sqrt()
+    frames = [rows(part, torch.arange(1, len(part), max(len(part) // 50, 1)), "image")["pixels"] for part in data]
+    frames = torch.cat(frames)
+    dt = torch.stack([part["dt"][0, 0] for part in data])
+    if (dt / dt[0] - 1).abs().max() > 0.01:
+        raise ValueError(f"the drives have frame times of {dt.unique().tolist()} s; a study needs the same")
+    return Statistics(loc, scale, frames.mean((0, 2, 3)), frames.std((0, 2, 3)), float(dt[0]))
+
+
+class FrameSampler:
+    """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
+
+    def __init__(self, parts: Sequence[Part], cache: Path, sensor: str, streams_per_batch: int = 8):
+        parts = [part for part in parts if part.stream.steps == 1 or sensor == "flow"]
+        self.data, self.sensor, self.count = [part.read(cache) for part in parts], sensor, streams_per_batch
+        self.steps = torch.tensor([part.stream.steps for part in parts])
+        self.weight = torch.tensor([part.weight for part in parts])
+
+    def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
+        """Observed frames ``[batch]``, every second one mirrored."""
+        chosen = []
+        for number in torch.multinomial(self.weight, self.count, replacement=True, generator=generator).tolist():
+            data = self.data[number]
+            index = torch.randint(1, len(data), (batch // self.count,), generator=generator)
+            frames = rows(data, index, self.sensor)
+            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
+        return torch.cat(chosen)
+
+    def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
+        """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
+        chosen, weight = [], self.weight * (self.steps == 1)
+        for number in torch.multinomial(weight, self.count, replacement=True, generator=generator).tolist():
+            data = self.data[number]
+            first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
+            frames = rows(data, torch.arange(first, first + length), self.sensor)
+            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
+        return with_start(torch.stack(chosen), start_std, generator)
+
+
+def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
+    """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
+    noise = torch.randn(len(windows), 1, 5, generator=generator)
+    windows["start"] = windows["state"] + start_std * noise
+    is_init = torch.zeros(*windows.batch_size, 1, dtype=torch.bool)
+    is_init[:, 0] = True
+    return windows.set("is_init", is_init)

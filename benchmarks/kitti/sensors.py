@@ -1,0 +1,202 @@
+"""Sensors by name, and their training: alone, and as stand-ins that have not seen what they read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from benchmarks.kitti.folds import Fold, FrameSampler, Part, Statistics, statistics
+from benchmarks.kitti.readings import read_sensor, read_spans
+from torch_denkf.functional import crps_ensemble
+from torch_denkf.modules import FlowSensor, ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
+
+SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
+
+
+def flow_sensor(statistics: Statistics) -> SubModel:
+    """Optical flow and road correlation."""
+    return FlowSensor(dt=statistics.dt, ensemble_size=SAMPLES)
+
+
+def image_sensor(statistics: Statistics) -> SubModel:
+    """The paper's: Table I on a grey frame and its difference to the one before."""
+    return ImageSensor(
+        2,
+        image_shape=(2, 50, 150),
+        trunk=convolutional_trunk(2),
+        ensemble_size=SAMPLES,
+        loc=statistics.loc,
+        scale=statistics.scale,
+        pixel_loc=statistics.pixel_loc,
+        pixel_scale=statistics.pixel_scale,
+        encoding_key=("sensor", "encoding"),
+    )
+
+
+SENSORS: dict[str, Callable[[Statistics], SubModel]] = {"flow": flow_sensor, "image": image_sensor}
+
+
+class SensorLoss(nn.Module):
+    """CRPS of the sensor's samples against the true velocities, in units of a good sensor's errors."""
+
+    def __init__(self, sensor: SubModel, unit: Tensor):
+        super().__init__()
+        self.sensor = sensor
+        self.register_buffer("unit", unit)
+
+    def forward(self, frames: TensorDict) -> dict[str, Tensor]:
+        """Scores frames ``[N]``; the terms are losses of v and of theta_dot."""
+        samples = self.sensor(frames)["sensor", "ensemble"]
+        score = crps_ensemble(samples, frames["target_observation"]) / self.unit
+        v, theta_dot = score[frames["observed"].squeeze(-1)].mean(0)
+        return {"loss_v": v, "loss_theta_dot": theta_dot}
+
+
+def sensor_error(sensor: SubModel, parts: Sequence[Part], cache: Path, kind: str, unit: Tensor) -> dict[str, float]:
+    """CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
+    scores = []
+    for part in parts:
+        read = read_sensor(sensor, part.read(cache), kind)
+        score = (crps_ensemble(read["sensor", "ensemble"], read["target_observation"]) / unit).mean(-1)
+        scores.append(score[read["observed"].squeeze(-1)].mean())
+    return {"crps": float(torch.stack(scores).mean())}
+
+
+def train_sensor(
+    sensor: SubModel,
+    parts: Sequence[Part],
+    held_out: Sequence[Part],
+    *,
+    kind: str,
+    facts: Statistics,
+    out: Path,
+    cache: Path,
+    seed: int,
+    updates: int,
+    lr: float = 2e-3,
+    keep: str = "best",
+) -> SubModel:
+    """Trains a sensor alone, or reads it where that was done before."""
+    if (out / "sensor.pt").exists():
+        sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
+        return sensor
+    model, sampler = nn.ModuleDict({"sensor": sensor}), FrameSampler(parts, cache, kind)
+    stage = Stage(
+        "sensor",
+        SensorLoss(sensor, facts.unit),
+        lambda generator, _: sampler.frames(generator),
+        updates,
+        lr=lr,
+        weight_decay=0.02,
+    )
+    FilterTrainer(
+        model,
+        [stage],
+        out=out,
+        validate=lambda: sensor_error(sensor, held_out, cache, kind, facts.unit),
+        validate_every=max(updates // 4, 1),
+        save_every=200,
+        seed=seed,
+        keep=keep,
+    ).fit()
+    write_checkpoint(out / "sensor.pt", {"sensor": sensor.state_dict()})
+    return sensor
+
+
+def unseen_readings(
+    sensor: SubModel,
+    fold: Fold,
+    *,
+    kind: str,
+    facts: Statistics,
+    out: Path,
+    cache: Path,
+    seed: int,
+    updates: int,
+    lr: float = 1e-3,
+) -> list[tuple[TensorDict, TensorDict, float]]:
+    """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+
+    A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives that
+    are in both lists are read by one of two sensors that stand in: each is trained on one half of those drives, and
+    reads the other.
+
+    Returns:
+        for each part of the tuning drives, and mirrored: readings to tune with, readings to validate with, the weight.
+    """
+    shared = list(dict.fromkeys(p.stream.drive for p in fold.tune if p.stream.drive in fold.trained))
+    readers = {}
+    for half in (shared[0::2], shared[1::2]) if shared else ():
+        stand_in = deepcopy(sensor)
+        parts = [part for part in fold.train if part.stream.drive not in half]
+        folder = out / ("without-" + "-".join(half))
+        held_out = [part for part in fold.tune if part.stream.drive in half]
+        settings = {"kind": kind, "facts": facts, "out": folder, "cache": cache, "seed": seed, "updates": updates}
+        train_sensor(stand_in, parts, held_out, lr=lr, keep="last", **settings)
+        readers |= dict.fromkeys(half, stand_in)
+    result = []
+    for part in fold.tune:
+        reader = readers.get(part.stream.drive, sensor)
+        for mirrored in (False, True):
+            reading = read_spans(reader, part, cache, kind, mirrored)
+            split = int(0.7 * len(reading))
+            result.append((reading[:split], reading[split:], part.weight))
+    return result
+
+
+@dataclass
+class SensorOfFold:
+    """What all filters of a fold have in common: the trained sensor and its readings of drives that it has not seen."""
+
+    kind: str
+    sensor: SubModel
+    facts: Statistics
+    readings: list[tuple[TensorDict, TensorDict, float]]  # see unseen_readings
+
+    @property
+    def validation(self) -> list[TensorDict]:
+        """Readings to choose by; not the mirrored ones: they say the same."""
+        return [reading for _, reading, _ in self.readings[::2]]
+
+
+def sensor_of_fold(
+    fold: Fold,
+    kind: str,
+    *,
+    out: Path,
+    cache: Path,
+    seed: int,
+    updates: int,
+    fine_tuning: int,
+    pretrained: SubModel | None = None,
+) -> SensorOfFold:
+    """Trains a fold's sensor, or reads it where that was done before.
+
+    Args:
+        fold: who trains, tunes, validates.
+        kind: name of the sensor.
+        out: checkpoints and logs.
+        cache: of the streams.
+        seed: of all random numbers.
+        updates: of a sensor that starts anew.
+        fine_tuning: updates of one that is ``pretrained``, and of the stand-ins that read shared drives.
+        pretrained: where to start.
+    """
+    torch.manual_seed(seed)
+    facts = statistics(fold.train, cache)
+    sensor = SENSORS[kind](facts)
+    common = {"kind": kind, "facts": facts, "cache": cache, "seed": seed}
+    rates, lr = {"updates": updates}, 2e-3
+    if pretrained is not None:
+        sensor.load_state_dict(pretrained.state_dict())
+        rates, lr = {"updates": fine_tuning, "lr": 1e-3, "keep": "last"}, 1e-3
+    read = unseen_readings(sensor, fold, out=out, lr=lr, updates=rates["updates"], **common) if fold.shared else []
+    train_sensor(sensor, fold.train, fold.validation, out=out / "sensor", **common, **rates)
+    return SensorOfFold(kind, sensor, facts, read or unseen_readings(sensor, fold, out=out, updates=0, **common))
