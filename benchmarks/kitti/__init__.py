@@ -1,1 +1,1 @@
-"""Parts of examples/kitti_odometry.py: what is read, built, trained, measured and drawn."""
+"""Visual odometry on KITTI, leaving one drive out after the other."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.scores import cost, counted
 from benchmarks.kitti.folds import VELOCITIES, Part
 from benchmarks.kitti.readings import all_frames, lose_frames, read_spans
-from benchmarks.kitti.recipes import REACH, Recipe
+from benchmarks.kitti.recipes import REACH, KITTIRecipe
 from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
-from benchmarks.kitti.training import run_filter, velocities
+from benchmarks.kitti.training import FLOOR, run_filter
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_gaussian
 from torch_denkf.metrics import (
@@ -30,30 +30,25 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
+from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
 WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
-_NAMES = ("filter", "sensor", "drive", "condition", "window", "seed")
-_ERRORS = ("translation_m_per_m", "rotation_deg_per_m", "coverage90", "coverage90_v", "coverage90_theta_dot")
-_VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae_theta_dot_deg_per_s")
-_BELIEF = ("crps_v_m_per_s", "nll", "nees", "spread_skill")
-_OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent", "devkit_r_rel_deg_per_m", "blind")
-_COST = ("parameters", "ms_per_step")
-COLUMNS = (*_NAMES, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS, *_COST)
+TIMED = 100  # steps to time a filter on
 
 
-def hold_last(reading: TensorDict, dt: float) -> Tensor:
+def last_velocities(reading: TensorDict, dt: float) -> Tensor:
     """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
 
     A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
     """
-    mean, steps = reading["sensor", "ensemble"].mean(1), reading["steps"].squeeze(-1).tolist()
-    held, path = reading["state"][0, VELOCITIES], []
-    for row, seen in enumerate(reading["observed"].squeeze(-1).tolist()):
-        if seen and abs(float(held[0])) * steps[row] * dt <= REACH:
-            held = mean[row] / steps[row]
-        path.append(held)
-    return torch.stack(path)
+    steps = reading["steps"]
+
+    def near(row: int, held: Tensor) -> Tensor:
+        return held[:1].double().abs() * steps[row] * dt <= REACH
+
+    mean = reading["sensor", "ensemble"].mean(1) / steps.clamp_min(1)
+    return hold_last(mean, reading["observed"], reading["state"][0, VELOCITIES], near)
 
 
 def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
@@ -62,7 +57,7 @@ def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
 
 
 def evaluate(
-    recipe: Recipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
+    recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
@@ -73,14 +68,16 @@ def evaluate(
         readings[condition] = [all_frames(read_spans(model["sensor"], part, cache, kind))]
     pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
     out = run_filter(recipe, model, [reading for _, reading in pairs])
-    costs, rows, beliefs = cost(recipe, model, pairs[0][1]), defaultdict(list), {}
+    first = pairs[0][1][:TIMED]
+    costs = cost(model, lambda: run_filter(recipe, model, [first]), len(first))
+    rows, beliefs = defaultdict(list), {}
     for (condition, reading), belief in zip(pairs, out, strict=True):
         beliefs.setdefault(condition, belief)
         truth = clean["state"].double()
         common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
         common["blind"] = 1 - float(reading["observed"][1:].float().mean())
         estimates = {filter_name: belief["belief", "mean"][:, :5].double()}
-        estimates["dead_reckoning"] = integrate(hold_last(reading, recipe.facts.dt), truth, recipe.facts.dt)
+        estimates["dead_reckoning"] = integrate(last_velocities(reading, recipe.facts.dt), truth, recipe.facts.dt)
         if condition == "clean":
             estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
         for name, states in estimates.items():
@@ -95,18 +92,6 @@ def _mean(rows: list[dict]) -> dict:
     return {
         key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
     }
-
-
-@torch.no_grad()
-def cost(recipe: Recipe, model: Filter, reading: TensorDict, steps: int = 100) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of one drive there: the least of three runs."""
-    parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
-    seconds = []
-    for _ in range(3):
-        begun = time.perf_counter()
-        run_filter(recipe, model, [reading[:steps]])
-        seconds.append(time.perf_counter() - begun)
-    return {"parameters": sum(parameters.values()), "ms_per_step": 1e3 * min(seconds) / len(reading[:steps])}
 
 
 def errors(states: Tensor, truth: Tensor) -> list[dict]:
@@ -148,7 +133,7 @@ def calibration(belief: TensorDict) -> dict[str, float]:
     """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
     equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
     members = belief["belief", "ensemble"].shape[1] if equal else None
-    mean, variance, truth = (value.double() for value in velocities(belief))
+    mean, variance, truth = (value.double() for value in counted(belief, VELOCITIES, FLOOR))
     covered = interval_coverage(mean, variance, truth, level=0.9)
     covariance = torch.diag_embed(variance)
     return {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -101,6 +101,37 @@ def with_spans(parts: Sequence[Part]) -> list[Part]:
     return [*parts, *longer]
 
 
+def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
+    """The fold that leaves ``test`` out.
+
+    All others train both sensor and filter, see ``unseen_readings``; rendered drives validate, or, without them, the
+    drive that follows the test drive.
+    """
+    drives = list(dict.fromkeys(stream.drive for stream in streams))
+    of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
+    at = drives.index(test)
+    others = [*drives[at + 1 :], *drives[:at]]
+
+    def parts(names: Sequence[str]) -> list[Part]:
+        return [Part(s, weight=1 / len(names) / len(of[name])) for name in names for s in of[name]]
+
+    if len(others) < 2 + (not held_out):
+        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
+    own = parts(sorted(others if held_out else others[1:], key=lambda name: -_rows(of[name][0])))
+    if not held_out:
+        checked = parts(others[:1])
+        return Fold(test, with_spans(with_disturbances(own)), *map(with_disturbances, (own, checked)), test=of[test])
+    rendered = [replace(part, weight=1.5 / len(train)) for part in train]
+    checked = [replace(part, weight=1 / len(held_out)) for part in held_out]
+    sensor = with_spans([*with_disturbances(own), *with_disturbances(rendered)])
+    tune = [*own, *(replace(part, weight=0.3 * part.weight) for part in checked)]
+    return Fold(test, sensor, with_disturbances(tune), with_disturbances(checked), test=of[test])
+
+
+def _rows(stream: Stream) -> int:
+    return sum(1 for _ in (Path(stream.root) / "sequences" / stream.drive / stream.camera).glob("*.png"))
+
+
 def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
     """Means and standard deviations over clean training drives, each counted mirrored, too."""
     data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
@@ -126,23 +157,28 @@ class FrameSampler:
 
     def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
         """Observed frames ``[batch]``, every second one mirrored."""
-        chosen = []
-        for number in torch.multinomial(self.weight, self.count, replacement=True, generator=generator).tolist():
-            data = self.data[number]
-            index = torch.randint(1, len(data), (batch // self.count,), generator=generator)
-            frames = rows(data, index, self.sensor)
-            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return torch.cat(chosen)
+        count = batch // self.count
+        return torch.cat(
+            self._draw(generator, self.weight, lambda n: torch.randint(1, n, (count,), generator=generator))
+        )
 
     def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
         """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
-        chosen, weight = [], self.weight * (self.steps == 1)
+        steps = torch.arange(length)
+        chosen = self._draw(
+            generator,
+            self.weight * (self.steps == 1),
+            lambda n: torch.randint(1, n - length + 1, (), generator=generator) + steps,
+        )
+        return with_start(torch.stack(chosen), start_std, generator)
+
+    def _draw(self, generator: torch.Generator, weight: Tensor, index: Callable[[int], Tensor]) -> list[TensorDict]:
+        chosen: list[TensorDict] = []
         for number in torch.multinomial(weight, self.count, replacement=True, generator=generator).tolist():
             data = self.data[number]
-            first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
-            frames = rows(data, torch.arange(first, first + length), self.sensor)
+            frames = rows(data, index(len(data)), self.sensor)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return with_start(torch.stack(chosen), start_std, generator)
+        return chosen
 
 
 def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:

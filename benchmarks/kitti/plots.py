@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.plots import draw_band, plt, save
 from benchmarks.kitti.folds import VELOCITIES
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # after the choice of a back-end without a window
 
 
 def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, file: Path) -> None:
@@ -41,13 +38,10 @@ def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, 
     path.legend()
     seconds, seen = torch.arange(len(truth)) * dt, belief["observed"].squeeze(-1)
     for name, dim, unit, factor in (("v", 3, "v, m/s", 1.0), ("w", 4, "theta_dot, deg/s", 57.2958)):
-        axis, band = axes[name], 1.645 * deviation[:, dim] * factor
+        axis, std = axes[name], deviation[:, dim] * factor
         reading = belief["sensor", "ensemble"][..., dim - 3].mean(1) / belief["steps"].clamp_min(1).squeeze(-1) * factor
         axis.plot(seconds[seen], reading[seen], ".", color="tab:red", markersize=2, label="sensor readings")
-        low, high = mean[:, dim] * factor - band, mean[:, dim] * factor + band
-        axis.fill_between(seconds, low, high, color="tab:blue", alpha=0.3, label="90 % of the belief")
-        axis.plot(seconds, truth[:, dim] * factor, "k-", linewidth=1, label="truth")
-        axis.plot(seconds, mean[:, dim] * factor, "b-", linewidth=1, label="filter")
+        low, high = draw_band(axis, seconds, mean[:, dim] * factor, std, truth[:, dim] * factor)
         axis.set(xlabel="s", ylabel=unit)
         shown = torch.cat([truth[:, dim] * factor, low, high])
         axis.set_ylim(float(shown.min()) - 0.5, float(shown.max()) + 0.5)
@@ -59,8 +53,7 @@ def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, 
     axes["l"].legend()
     _spread_against_error(axes["s"], deviation[1:, VELOCITIES], (mean - truth)[1:, VELOCITIES].abs())
     figure.suptitle(title)
-    figure.savefig(file, dpi=90)
-    plt.close(figure)
+    save(figure, file, dpi=90)
 
 
 def _spread_against_error(axis, spread: torch.Tensor, error: torch.Tensor, bins: int = 8) -> None:

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
+from benchmarks.common.scores import SensorLoss
 from benchmarks.kitti.folds import Fold, FrameSampler, Part, Statistics, statistics
 from benchmarks.kitti.readings import read_sensor, read_spans
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import FlowSensor, ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
+from torch_denkf.training import Stage, train_part
 
 SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
 
@@ -43,20 +44,10 @@ def image_sensor(statistics: Statistics) -> SubModel:
 SENSORS: dict[str, Callable[[Statistics], SubModel]] = {"flow": flow_sensor, "image": image_sensor}
 
 
-class SensorLoss(nn.Module):
-    """CRPS of the sensor's samples against the true velocities, in units of a good sensor's errors."""
-
-    def __init__(self, sensor: SubModel, unit: Tensor):
-        super().__init__()
-        self.sensor = sensor
-        self.register_buffer("unit", unit)
-
-    def forward(self, frames: TensorDict) -> dict[str, Tensor]:
-        """Scores frames ``[N]``; the terms are losses of v and of theta_dot."""
-        samples = self.sensor(frames)["sensor", "ensemble"]
-        score = crps_ensemble(samples, frames["target_observation"]) / self.unit
-        v, theta_dot = score[frames["observed"].squeeze(-1)].mean(0)
-        return {"loss_v": v, "loss_theta_dot": theta_dot}
+def sensor_loss(sensor: SubModel, unit: Tensor) -> SensorLoss:
+    """CRPS of v and of theta_dot, in units of a good sensor's errors."""
+    terms = {"loss_v": slice(0, 1), "loss_theta_dot": slice(1, 2)}
+    return SensorLoss(sensor, lambda frames: frames["target_observation"], unit, terms)
 
 
 def sensor_error(sensor: SubModel, parts: Sequence[Part], cache: Path, kind: str, unit: Tensor) -> dict[str, float]:
@@ -84,30 +75,18 @@ def train_sensor(
     keep: str = "best",
 ) -> SubModel:
     """Trains a sensor alone, or reads it where that was done before."""
-    if (out / "sensor.pt").exists():
-        sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
-        return sensor
-    model, sampler = nn.ModuleDict({"sensor": sensor}), FrameSampler(parts, cache, kind)
-    stage = Stage(
-        "sensor",
-        SensorLoss(sensor, facts.unit),
-        lambda generator, _: sampler.frames(generator),
-        updates,
-        lr=lr,
-        weight_decay=0.02,
-    )
-    FilterTrainer(
-        model,
-        [stage],
+    sampler = FrameSampler(parts, cache, kind)
+    loss = sensor_loss(sensor, facts.unit)
+    return train_part(
+        sensor,
+        Stage("sensor", loss, lambda generator, _: sampler.frames(generator), updates, lr=lr, weight_decay=0.02),
         out=out,
         validate=lambda: sensor_error(sensor, held_out, cache, kind, facts.unit),
         validate_every=max(updates // 4, 1),
         save_every=200,
         seed=seed,
         keep=keep,
-    ).fit()
-    write_checkpoint(out / "sensor.pt", {"sensor": sensor.state_dict()})
-    return sensor
+    )
 
 
 def unseen_readings(

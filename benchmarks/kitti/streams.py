@@ -6,17 +6,16 @@ import contextlib
 import hashlib
 import shutil
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import cv2
 import torch
 from tensordict import TensorDict
 from torchrl.envs.transforms import Transform
-from tqdm import tqdm
 
+from benchmarks.common.jobs import side_by_side
 from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_kitti_drive, with_motion
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
@@ -99,21 +98,14 @@ def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = N
     return streams
 
 
-def _prepare(job: tuple[Stream, Path]) -> None:
-    stream, cache = job
-    stream.read(cache)
-
-
 def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
     """Computes what is not on disk yet, drives side by side."""
     cache.mkdir(parents=True, exist_ok=True)
-    jobs = [(stream, cache) for stream in streams]
-    if processes < 2:
-        for job in tqdm(jobs, desc="flow of all drives", disable=None):
-            _prepare(job)
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        list(tqdm(pool.map(_prepare, jobs), total=len(jobs), desc="flow of all drives", disable=None))
+    side_by_side([partial(_prepare, stream, cache) for stream in streams], processes, "flow of all drives")
+
+
+def _prepare(stream: Stream, cache: Path) -> None:
+    stream.read(cache)
 
 
 def spans(stream: Stream, sensor: str) -> list[Stream]:

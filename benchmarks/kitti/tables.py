@@ -1,17 +1,27 @@
-"""The table of all folds, as CSV and as Markdown."""
+"""The table of all folds: its columns, and its Markdown."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from statistics import mean, median, stdev
 
-from benchmarks.kitti.evaluation import COLUMNS
+from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.kitti.streams import CONDITIONS
 
+IDENTITY = ("filter", "sensor", "drive", "condition", "window", "seed")
+_ERRORS = ("translation_m_per_m", "rotation_deg_per_m", "coverage90", "coverage90_v", "coverage90_theta_dot")
+_VELOCITY = ("rmse_v_m_per_s", "mae_v_m_per_s", "rmse_theta_dot_deg_per_s", "mae_theta_dot_deg_per_s")
+_BELIEF = ("crps_v_m_per_s", "nll", "nees", "spread_skill")
+_OTHERS = ("pathlength_m_per_m", "pathlength_deg_per_m", "devkit_t_rel_percent", "devkit_r_rel_deg_per_m", "blind")
+_COST = ("parameters", "ms_per_step")
+COLUMNS = Columns(
+    (*IDENTITY, *_ERRORS, *_VELOCITY, *_BELIEF, *_OTHERS, *_COST),
+    text=IDENTITY[:4],
+    whole=IDENTITY[4:],
+    order=lambda row: tuple(row[key] for key in IDENTITY),
+)
 FAIRNESS = (
     "In each fold and seed all filters start from the same sensor's weights and learn from the same windows of its "
     "readings, with as many updates and steps back-propagated, at the same rate; each then trains its own copy of the "
@@ -19,28 +29,8 @@ FAIRNESS = (
     "from the same seven values for the coverage on the same validation readings."
 )
 TITLES = {"dead_reckoning": "dead reckoning", "floor": "floor: true v and theta_dot"}
-
-
-def write_csv(rows: Sequence[dict], file: Path) -> None:
-    """All rows, one for each filter, sensor, drive, condition, window and seed."""
-    rows = sorted(rows, key=lambda row: (*(row[key] for key in COLUMNS[:4]), row["window"], row["seed"]))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{v:.5g}" if isinstance(v, float) else v for key, v in row.items() if v == v})
-
-
-def read_csv(file: Path) -> list[dict]:
-    """Rows as :func:`write_csv` wrote them."""
-    with file.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    text = {"filter", "sensor", "drive", "condition"}
-    whole = {"window", "seed"}
-    return [
-        {k: v if k in text else int(v) if k in whole else float(v or "nan") for k, v in row.items()} for row in rows
-    ]
+END_POINT = ("translation_m_per_m", "rotation_deg_per_m")
+PATH_LENGTH = ("pathlength_m_per_m", "pathlength_deg_per_m")
 
 
 def by_drive(rows: Iterable[dict], column: str) -> dict[str, float]:
@@ -49,8 +39,13 @@ def by_drive(rows: Iterable[dict], column: str) -> dict[str, float]:
     for row in rows:
         value = row.get(column, math.nan)
         if value == value:
-            values[row["drive"].split("/")[0]][row["seed"]].append(value)
+            values[drive_of(row)][row["seed"]].append(value)
     return {drive: median(mean(cameras) for cameras in seeds.values()) for drive, seeds in sorted(values.items())}
+
+
+def drive_of(row: dict) -> str:
+    """The drive without its camera."""
+    return row["drive"].split("/")[0]
 
 
 def summary(rows: Iterable[dict], column: str) -> str:
@@ -62,38 +57,59 @@ def summary(rows: Iterable[dict], column: str) -> str:
     return f"{mean(values):.3f}{error}"
 
 
-def pick(rows: Sequence[dict], **wanted) -> list[dict]:
-    """Rows with these entries."""
-    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
-
-
 def markdown(rows: Sequence[dict], header: str) -> str:
     """Means over drives for each condition, errors by window, and each drive's own."""
-    seeds, drives = sorted({row["seed"] for row in rows}), sorted({row["drive"].split("/")[0] for row in rows})
+    seeds = {row["seed"] for row in rows}
     methods = sorted({(row["filter"], row["sensor"]) for row in rows if row["filter"] != "floor"}, key=_order)
     window = 100 if any(row["window"] == 100 for row in rows) else max(row["window"] for row in rows)
+    floor = [{**row, "sensor": "truth"} for row in pick(rows, filter="floor", sensor=methods[0][1])]
     lines = [
         header,
+        *(["", FAIRNESS] if len({name for name, _ in methods} - {"dead_reckoning"}) > 1 else []),
         "",
         f"End point error over {window} steps: mean over the drives that are long enough ± its standard error; each "
         f"drive's figure is the median of {len(seeds)} seed(s). Coverage: share of true v and theta_dot inside the "
         "filter's 90 % intervals.",
         "",
-        "| condition | filter | sensor | m/m | deg/m | coverage v | coverage theta_dot |",
-        "|---|---|---|---|---|---|---|",
+        *head("condition", "filter", "sensor", "m/m", "deg/m", "coverage v", "coverage theta_dot"),
     ]
-    for condition in CONDITIONS:
-        chosen = [(*method, pick(rows, condition=condition, window=window)) for method in methods]
-        lines += [_line(condition, *method) for method in chosen]
-    filters = {name for name, _ in methods} - {"dead_reckoning"}
-    if len(filters) > 1:
-        lines[1:1] = ["", FAIRNESS]
-    first = methods[0][1]
-    floor = pick(rows, filter="floor", sensor=first, window=window)
-    lines.append(_line("clean", "floor", "truth", [{**row, "sensor": "truth"} for row in floor]))
-    lines += ["", *_by_window(rows, methods, first), "", *_by_drive(rows, methods, drives, window)]
-    lines += ["", *_reference(rows, methods, window)]
+    shown = [(condition, *method) for condition in CONDITIONS for method in methods]
+    for condition, name, sensor in [*shown, ("clean", "floor", "truth")]:
+        own = pick([*rows, *floor], condition=condition, window=window, filter=name, sensor=sensor)
+        cells = [summary(own, key) for key in (*END_POINT, "coverage90_v", "coverage90_theta_dot")]
+        lines.append(line(condition, TITLES.get(name, name), sensor, *cells))
+    lines += ["", *_by_window([*rows, *floor], [*methods, ("floor", "truth")])]
+    lines += ["", *_by_drive(rows, methods, window), "", *_reference(rows, methods, window)]
     return "\n".join(lines) + "\n"
+
+
+def _order(method: tuple[str, str]) -> tuple:
+    return method[1] != "flow", method[0] == "dead_reckoning", method[0]
+
+
+def _pair(rows: Sequence[dict], columns: Sequence[str] = END_POINT) -> str:
+    """Means over the drives of an error of translation and one of rotation."""
+    values = [list(by_drive(rows, column).values()) for column in columns]
+    return ", ".join(f"{mean(each):.3f}" if each else "-" for each in values)
+
+
+def _by_window(rows: Sequence[dict], methods: Sequence[tuple[str, str]]) -> list[str]:
+    windows = sorted({row["window"] for row in rows})
+    lines = ["Errors by length, clean: m/m, deg/m", "", *head("filter", "sensor", *windows)]
+    for name, sensor in methods:
+        chosen = pick(rows, filter=name, sensor=sensor, condition="clean")
+        lines.append(line(TITLES.get(name, name), sensor, *(_pair(pick(chosen, window=each)) for each in windows)))
+    return lines
+
+
+def _by_drive(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window: int) -> list[str]:
+    titles = [f"{TITLES.get(name, name)}, {sensor}" for name, sensor in methods]
+    lines = [f"Each drive, clean, {window} steps (50 where it is shorter): m/m, deg/m", "", *head("drive", *titles)]
+    clean = pick(rows, condition="clean")
+    for drive in sorted({drive_of(row) for row in rows}):
+        own = [[row for row in pick(clean, filter=f, sensor=s) if drive_of(row) == drive] for f, s in methods]
+        lines.append(line(drive, *(_pair(pick(each, window=window) or pick(each, window=50)) for each in own)))
+    return lines
 
 
 def _reference(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window: int) -> list[str]:
@@ -103,66 +119,13 @@ def _reference(rows: Sequence[dict], methods: Sequence[tuple[str, str]], window:
         f"Both metrics over {window} steps, end point / path length as in the reference script: m/m, deg/m; parameters "
         "and time of a step of one drive on one thread, both without the sensor",
         "",
-        "| filter | sensor | " + " | ".join(conditions) + " | parameters | ms |",
-        "|---|---|" + "---|" * (len(conditions) + 2),
+        *head("filter", "sensor", *conditions, "parameters", "ms"),
     ]
     for name, sensor in methods:
         own = pick(rows, filter=name, sensor=sensor, window=window)
-        cells = []
-        for condition in conditions:
-            at = pick(own, condition=condition)
-            end = f"{_mean(at, 'translation_m_per_m')}, {_mean(at, 'rotation_deg_per_m')}"
-            cells.append(f"{end} / {_mean(at, 'pathlength_m_per_m')}, {_mean(at, 'pathlength_deg_per_m')}")
+        cells = [f"{_pair(at)} / {_pair(at, PATH_LENGTH)}" for at in (pick(own, condition=c) for c in conditions)]
         for column, digits in (("parameters", 0), ("ms_per_step", 2)):
             values = list(by_drive(own, column).values())
             cells.append(f"{median(values):.{digits}f}" if values else "")
-        lines.append(f"| {TITLES.get(name, name)} | {sensor} | {' | '.join(cells)} |")
+        lines.append(line(TITLES.get(name, name), sensor, *cells))
     return lines
-
-
-def _order(method: tuple[str, str]) -> tuple:
-    return method[1] != "flow", method[0] == "dead_reckoning", method[0]
-
-
-def _line(condition: str, name: str, sensor: str, rows: Sequence[dict]) -> str:
-    rows = pick(rows, filter=name, sensor=sensor)
-    cells = [summary(rows, key) for key in ("translation_m_per_m", "rotation_deg_per_m")]
-    cells += [summary(rows, key) for key in ("coverage90_v", "coverage90_theta_dot")]
-    return f"| {condition} | {TITLES.get(name, name)} | {sensor} | " + " | ".join(cells) + " |"
-
-
-def _by_window(rows: Sequence[dict], methods: Sequence[tuple[str, str]], first: str) -> list[str]:
-    windows = sorted({row["window"] for row in rows})
-    lines = ["Errors by length, clean: m/m, deg/m", "", "| filter | sensor | " + " | ".join(map(str, windows)) + " |"]
-    lines.append("|---|---|" + "---|" * len(windows))
-    for name, sensor in [*methods, ("floor", first)]:
-        chosen = pick(rows, filter=name, sensor=sensor, condition="clean")
-        cells = []
-        for window in windows:
-            at = pick(chosen, window=window)
-            cells.append(f"{_mean(at, 'translation_m_per_m')}, {_mean(at, 'rotation_deg_per_m')}")
-        lines.append(f"| {TITLES.get(name, name)} | {sensor if name != 'floor' else 'truth'} | {' | '.join(cells)} |")
-    return lines
-
-
-def _mean(rows: Sequence[dict], column: str) -> str:
-    values = list(by_drive(rows, column).values())
-    return f"{mean(values):.3f}" if values else "-"
-
-
-def _by_drive(rows: Sequence[dict], methods: Sequence, drives: Sequence[str], window: int) -> list[str]:
-    titles = " | ".join(f"{TITLES.get(name, name)}, {sensor}" for name, sensor in methods)
-    lines = [f"Each drive, clean, {window} steps (50 where it is shorter): m/m, deg/m", "", f"| drive | {titles} |"]
-    lines.append("|---|" + "---|" * len(methods))
-    for drive in drives:
-        cells: list[str] = []
-        for name, sensor in methods:
-            own = [r for r in pick(rows, filter=name, sensor=sensor, condition="clean") if _of(r, drive)]
-            at = pick(own, window=window) or pick(own, window=50)
-            cells.append(f"{_mean(at, 'translation_m_per_m')}, {_mean(at, 'rotation_deg_per_m')}")
-        lines.append(f"| {drive} | {' | '.join(cells)} |")
-    return lines
-
-
-def _of(row: dict, drive: str) -> bool:
-    return row["drive"].split("/")[0] == drive

@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from benchmarks.common.scores import SensorLoss, belief_crps, coverage
+from benchmarks.common.training import fit_filter, read_filter
 from benchmarks.kitti.folds import VELOCITIES, Fold, FrameSampler, Statistics
 from benchmarks.kitti.readings import ReadingSampler, all_frames, lose_frames, read_spans
-from benchmarks.kitti.recipes import FILTERS, Recipe
-from benchmarks.kitti.sensors import SENSORS, SensorLoss, SensorOfFold
+from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
+from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_gaussian
-from torch_denkf.metrics import interval_coverage
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint
+from torch_denkf.training import Stage, parameters_without, read_checkpoint
 
 INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4)
+FLOOR = 1e-8  # of the variances of v and theta_dot
 
 
 @dataclass(frozen=True)
 class Budget:
     """Updates of each stage; steps of the filter's windows."""
 
-    sensor: int = 3000
-    fine_tuning: int = 300  # of a sensor that comes trained on rendered drives
-    filter: int = 300
-    end_to_end: int = 40
-    length: int = 24
+    sensor: int = 3000  # updates of the sensor
+    fine_tuning: int = 300  # updates of a sensor that comes trained on rendered drives
+    filter: int = 300  # updates of a filter on readings
+    end_to_end: int = 40  # updates of sensor and filter together
+    length: int = 24  # steps of the filter's windows
 
 
 @torch.no_grad()
-def run_filter(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
+def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
     """Filters readings of one length side by side, ``[K, N]``, each from its true first state."""
     batch = torch.stack([reading.copy() for reading in readings])
     batch["is_init"] = torch.zeros(*batch.batch_size, 1, dtype=torch.bool)
@@ -46,7 +46,7 @@ def run_filter(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) ->
         return recipe.part(model, sensor=False).sequence(batch)
 
 
-def run_all(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
+def run_all(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
     """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
     groups = defaultdict(list)
     for seed, reading in enumerate(readings):
@@ -54,19 +54,9 @@ def run_all(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> li
     return [run_filter(recipe, model, group) for group in groups.values()]
 
 
-def velocities(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """Means and variances of a belief's (v, theta_dot), and the truth ``[*K, N - 1, 2]``: the first row is given."""
-    values = out["belief", "mean"], out["belief", "var"], out["state"]
-    mean, variance, truth = (value[..., 1:, VELOCITIES] for value in values)
-    return mean, variance.clamp_min(1e-8), truth  # particles that are all the same have none, and no likelihood
-
-
-def filter_error(recipe: Recipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
+def filter_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
     """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
-    scores = [
-        (crps_gaussian(*velocities(out)) / recipe.facts.unit).mean((1, 2)) for out in run_all(recipe, model, readings)
-    ]
-    return {"crps": float(torch.cat(scores).mean())}
+    return {"crps": belief_crps(run_all(recipe, model, readings), VELOCITIES, recipe.unit, FLOOR)}
 
 
 def gain_error(fold: Fold, base: SensorOfFold) -> float:
@@ -103,7 +93,7 @@ def train_filter(
     seed: int,
     budget: Budget,
     loggers: Sequence[str] = ("csv",),
-) -> tuple[Recipe, Filter]:
+) -> tuple[KITTIRecipe, Filter]:
     """Trains one filter on a fold, or goes on where it was broken off; the model at the end is the best one."""
     torch.manual_seed(seed)
     facts, kind = base.facts, base.kind
@@ -113,88 +103,56 @@ def train_filter(
     model = recipe.build()
     # How wrong the first velocity of a training window is; its pose is right.
     start_std = torch.cat([torch.zeros(3), 0.2 * facts.scale])
-    readings = [tune for tune, _, _ in base.readings]
-    windows = ReadingSampler(readings, [share for *_, share in base.readings], budget.length, gain_error(fold, base))
-    frames = FrameSampler(fold.train, cache, kind)
-    third = max(budget.end_to_end // 3, 1)
-    stages = [
-        Stage(
-            "filter",
-            recipe.loss(recipe.part(model, sensor=False, start_std=start_std)),
-            lambda generator, _: windows.windows(generator, start_std),
-            budget.filter,
-            lr=5e-3,
-            validate=lambda: filter_error(recipe, model, base.validation),
-        ),
-        Stage(
-            "end_to_end",
-            EndToEndLoss(
-                recipe.loss(recipe.part(model, sensor=True, start_std=start_std)), SensorLoss(sensor, facts.unit)
+
+    def objective(with_sensor: bool) -> nn.Module:
+        return recipe.loss(recipe.part(model, sensor=with_sensor, start_std=start_std))
+
+    def stages() -> list[Stage]:
+        readings, weights = [tune for tune, _, _ in base.readings], [share for *_, share in base.readings]
+        windows = ReadingSampler(readings, weights, budget.length, gain_error(fold, base))
+        frames = FrameSampler(fold.train, cache, kind)
+        third = max(budget.end_to_end // 3, 1)
+        return [
+            Stage(
+                "filter",
+                objective(with_sensor=False),
+                lambda generator, _: windows.windows(generator, start_std),
+                budget.filter,
+                lr=5e-3,
+                validate=lambda: filter_error(recipe, model, base.validation),
             ),
-            lambda generator, length: frames.windows(generator, length, start_std),
-            budget.end_to_end,
-            # The noise model knows by now how wrong the sensor is on new drives; on those it has seen it would forget.
-            parameters=[p for name, p in model.named_parameters() if not name.startswith("module.noise.")],
-            lr=1e-4,
-            lengths={0: 4, third: 8, 2 * third: 16},
-            validate=lambda: filter_error(
-                recipe, model, [read_spans(sensor, part, cache, kind) for part in fold.validation]
+            Stage(
+                "end_to_end",
+                EndToEndLoss(objective(with_sensor=True), sensor_loss(sensor, facts.unit)),
+                lambda generator, length: frames.windows(generator, length, start_std),
+                budget.end_to_end,
+                # The noise model knows how wrong the sensor is on new drives; on those it has seen it would forget.
+                parameters=parameters_without(model, {"noise"} & set(model.module.keys())),
+                lr=1e-4,
+                lengths={0: 4, third: 8, 2 * third: 16},
+                validate=lambda: filter_error(
+                    recipe, model, [read_spans(sensor, part, cache, kind) for part in fold.validation]
+                ),
             ),
-        ),
-    ]
-    FilterTrainer(
-        model,
-        stages,
-        out=out,
-        validate_every=max(budget.filter // 3, 1),
-        save_every=200,
-        loggers=loggers,
-        seed=seed,
-    ).fit()
-    inflation = calibrate(recipe, model, base.validation)
-    save_settings(out, filter_name, kind, facts, inflation)
+        ]
+
+    def covered() -> Tensor:
+        runs = run_all(recipe, model, base.validation)
+        return torch.stack([coverage(out, VELOCITIES, FLOOR) for out in runs]).mean(0)
+
+    settings = {"validate_every": max(budget.filter // 3, 1), "save_every": 200, "loggers": loggers, "seed": seed}
+    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts)}
+    fit_filter(recipe, model, stages, covered, out=out, inflations=INFLATIONS, notes=notes, **settings)
     return recipe, model
 
 
-def calibrate(recipe: Recipe, model: Filter, readings: Sequence[TensorDict], level: float = 0.9) -> float:
-    """Sets the inflation with which the filter's intervals hold their share of the truth."""
-    distance = {}
-    for inflation in INFLATIONS:
-        recipe.set_inflation(model, inflation)
-        runs = run_all(recipe, model, readings)
-        covered = torch.stack([interval_coverage(*map(_rows, velocities(out)), level=level) for out in runs]).mean(0)
-        distance[inflation] = float((covered - level).abs().sum())
-    best = min(distance, key=distance.get)
-    recipe.set_inflation(model, best)
-    return best
-
-
-def _rows(value: Tensor) -> Tensor:
-    return value.flatten(0, -2)
-
-
-def save_settings(folder: Path, filter_name: str, kind: str, facts: Statistics, inflation: float) -> None:
-    """Leaves beside the checkpoints what :func:`load_filter` needs to build the filter anew."""
-    folder.mkdir(parents=True, exist_ok=True)
-    numbers = {key: value.tolist() if isinstance(value, Tensor) else value for key, value in asdict(facts).items()}
-    (folder / "filter.json").write_text(
-        json.dumps({"filter": filter_name, "sensor": kind, "inflation": inflation, "statistics": numbers})
-    )
-
-
-def load_filter(folder: Path) -> tuple[Recipe, Filter, str, str]:
+def load_filter(folder: Path) -> tuple[KITTIRecipe, Filter, str, str]:
     """A recipe, its trained filter, and the names of filter and sensor.
 
     Raises:
         FileNotFoundError: if no training was finished in the folder.
     """
-    if not (folder / "filter.json").exists() or not (folder / "best_end_to_end.pt").exists():
-        raise FileNotFoundError(f"no finished training in {folder}: it lacks filter.json or best_end_to_end.pt")
-    settings = json.loads((folder / "filter.json").read_text())
-    numbers = settings["statistics"]
-    facts = Statistics(**{k: torch.tensor(v) if isinstance(v, list) else v for k, v in numbers.items()})
-    recipe = FILTERS[settings["filter"]](SENSORS[settings["sensor"]](facts), facts)
-    model = recipe.build()
-    model.load_state_dict(read_checkpoint(folder / "best_end_to_end.pt")["model"])
-    recipe.set_inflation(model, settings["inflation"])
-    return recipe, model, settings["filter"], settings["sensor"]
+    saved = read_checkpoint(folder / "filter.pt")
+    facts = Statistics(**saved["facts"])
+    recipe = FILTERS[saved["filter"]](SENSORS[saved["sensor"]](facts), facts)
+    return recipe, read_filter(recipe, recipe.build(), saved), saved["filter"], saved["sensor"]

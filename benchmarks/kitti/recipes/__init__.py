@@ -1,11 +1,7 @@
-"""Filters by name. One of your own: a :class:`Recipe` with ``@register``, in a file in this folder."""
+"""Filters by name. One of your own: a :class:`KITTIRecipe` with ``@register``, in a file in this folder."""
 
-from importlib import import_module
-from pkgutil import iter_modules
+from benchmarks.kitti.recipes._base import FILTERS, REACH, KITTIRecipe, register
 
-from benchmarks.kitti.recipes._base import FILTERS, REACH, Recipe, register
+FILTERS.import_all(__name__, __path__)
 
-for _module in iter_modules(__path__):
-    import_module(f"{__name__}.{_module.name}")
-
-__all__ = ["FILTERS", "REACH", "Recipe", "register"]
+__all__ = ["FILTERS", "REACH", "KITTIRecipe", "register"]

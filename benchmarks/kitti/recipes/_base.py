@@ -9,7 +9,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from benchmarks.kitti.folds import Statistics
+from benchmarks.common.recipes import Recipe, Registry
+from benchmarks.kitti.folds import VELOCITIES, Statistics
 from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     DiagonalNoise,
@@ -23,50 +24,32 @@ from torch_denkf.modules import (
 REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 HISTORY = ("belief", "history")  # velocities of the past steps
 INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is where the drive starts
-FILTERS: dict[str, type[Recipe]] = {}
+FILTERS = Registry()
+register = FILTERS.register
 
 
-def register(recipe: type[Recipe]) -> type[Recipe]:
-    """Makes a filter available to all commands under its class's name in lower case."""
-    FILTERS[recipe.__name__.lower()] = recipe
-    return recipe
-
-
-class Recipe:
-    """How to compose, train and tune one filter. All read the same sensor, and all carry the state
-    [x m, y m, theta rad, v m/s, theta_dot rad/s] in the first five entries of their mean.
+class KITTIRecipe(Recipe):
+    """A filter of a vehicle: all carry the state [x m, y m, theta rad, v m/s, theta_dot rad/s] in the first five
+    entries of their mean.
 
     Args:
         sensor: the fold's.
         facts: statistics of its training drives.
     """
 
-    needs_training = False  # True where the state follows from the readings only by learned weights
+    dims = VELOCITIES
 
     def __init__(self, sensor: SubModel, facts: Statistics):
-        self.sensor, self.facts = sensor, facts
+        self.sensor, self.facts, self.unit = sensor, facts, facts.unit
         self.flow = isinstance(sensor, FlowSensor)
         self.encoding = sensor.encoding_features if self.flow else sensor.module["head"].layers[-1].in_features
-
-    def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
-        """Everything behind the sensor, by name, in order."""
-        raise NotImplementedError
 
     def initial(self, std: Sequence[float] | Tensor, state_key: str) -> TensorDictModuleBase:
         """The belief around a state ``[*B, 5]``."""
         raise NotImplementedError
 
-    def loss(self, model: Filter) -> nn.Module:
-        """What the training minimises, on windows with the true ``"state"``."""
-        raise NotImplementedError
-
-    def set_inflation(self, model: Filter, factor: float) -> None:
-        """The one number that is chosen on the validation readings: a factor on the belief's spread."""
-        raise NotImplementedError
-
-    def noise(self) -> SubModel:
-        """R, from what the sensor saw."""
-        return DiagonalNoise(2, r=self.facts.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
+    def noise(self):
+        return DiagonalNoise(2, r=self.unit, in_features=self.encoding, in_key=("sensor", "encoding"))
 
     def observation(self, **kwargs) -> PairObservation:
         """What is read of pairs of frames: metres by the flow sensor; one that was trained on grey values hedges."""
@@ -83,7 +66,7 @@ class Recipe:
     @property
     def state_scale(self) -> Tensor:
         """Units of the loss; the pose follows from the velocities and does not count."""
-        return torch.cat([torch.full((3,), torch.inf), self.facts.unit])
+        return torch.cat([torch.full((3,), torch.inf), self.unit])
 
     def build(self) -> Filter:
         """The whole filter."""

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 from tensordict.nn import TensorDictSequential
 
-from benchmarks.kitti.recipes._base import HISTORY, Recipe, register
+from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
 from benchmarks.kitti.sensors import SAMPLES
 from torch_denkf.modules import (
     AroundState,
@@ -17,13 +17,12 @@ from torch_denkf.modules import (
     UnicycleMotion,
     WithHistory,
 )
-from torch_denkf.objectives import DEnKFLoss
 
 LAGS = 4  # past steps that an innovation may still correct
 
 
 @register
-class DEnKF(Recipe):
+class DEnKF(KITTIRecipe):
     """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
 
     def modules(self):
@@ -50,8 +49,7 @@ class DEnKF(Recipe):
         return WithHistory(AroundState(std, ensemble_size=SAMPLES, state_key=state_key), LAGS)
 
     def loss(self, model):
-        share = self.state_scale.isfinite().float().mean().item()  # a score is the mean over what counts: two of five
-        return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
+        return self.ensemble_loss(model)
 
     def set_inflation(self, model, factor):
         next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor
@@ -62,4 +60,4 @@ class ADEnKF(DEnKF):
     """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
 
     def loss(self, model):
-        return DEnKFLoss(model, state=0.0, transition=0.0, sensor=0.0, nll=1.0, detach_every=8)
+        return self.likelihood_loss(model)

@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import torch
 
-from benchmarks.kitti.recipes._base import Recipe, register
+from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
 from torch_denkf.modules import (
     CholeskyNoise,
@@ -22,11 +22,14 @@ from torch_denkf.modules import (
     UKFTransition,
     UnicycleNoise,
 )
-from torch_denkf.objectives import GaussianLoss
 
 
-class _Gaussian(Recipe):
-    """Known motion of the pose; its correlation with the velocities carries the corrections."""
+class _Gaussian(KITTIRecipe):
+    """Known motion of the pose; its correlation with the velocities carries the corrections.
+
+    Inflation goes into Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply
+    the pose's variance in every step, too, which nothing observes: it would grow without bound.
+    """
 
     Transition, Analysis = EKFTransition, EKFAnalysis
 
@@ -45,20 +48,10 @@ class _Gaussian(Recipe):
         loc, scale = torch.zeros(size), torch.full((size,), torch.inf)
         loc[3:5], scale[3:5] = self.facts.loc, self.facts.scale
         keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
-        return DiagonalNoise(2, r=self.facts.unit, in_features=size, loc=loc, scale=scale, **keys)
+        return DiagonalNoise(2, r=self.unit, in_features=size, loc=loc, scale=scale, **keys)
 
     def initial(self, std, state_key):
         return ClonedPrior(GaussianAround(std, state_key=state_key), LONGEST - 1)
-
-    def loss(self, model):
-        return GaussianLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
-
-    def set_inflation(self, model, factor):
-        # In Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply the pose's
-        # variance in every step, too, which nothing observes: it would grow without bound.
-        for module in model.modules():
-            if isinstance(module, ScaledNoise):
-                module.factor = factor
 
 
 @register
@@ -78,4 +71,4 @@ class BKF(_Gaussian):
     """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant; the pose's motion is linearised."""
 
     def process_noise(self):
-        return CholeskyNoise(2, r=self.facts.unit, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        return CholeskyNoise(2, r=self.unit, in_key=("belief", "mean"), out_key=("forecast", "noise"))

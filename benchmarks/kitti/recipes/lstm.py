@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from benchmarks.kitti.recipes._base import INITIAL_STD, Recipe, register
+from benchmarks.kitti.recipes._base import INITIAL_STD, KITTIRecipe, register
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import GaussianAround, WithMemory
 from torch_denkf.objectives import GaussianLoss
@@ -13,7 +13,7 @@ HIDDEN = 64  # about as many parameters as the other filters have
 
 
 @register
-class LSTM(Recipe):
+class LSTM(KITTIRecipe):
     """Reads encoding, reading and the number of steps that it spans; the pose follows by the known motion."""
 
     needs_training = True
@@ -41,7 +41,7 @@ class LSTM(Recipe):
         return WithMemory(GaussianAround(std, state_key=state_key), HIDDEN)
 
     def loss(self, model):
-        return GaussianLoss(model, transition=0.0, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
+        return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)
 
     def set_inflation(self, model, factor):
         model["lstm"].inflation = factor

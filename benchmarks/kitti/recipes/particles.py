@@ -2,79 +2,46 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-
 import torch
 
-from benchmarks.kitti.recipes._base import Recipe, register
+from benchmarks.common.recipes import Particles
+from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
 from torch_denkf.modules import (
     AroundState,
     ClonedPrior,
     ClonedTransition,
     DiagonalNoise,
-    GaussianLikelihood,
-    LearnedLikelihood,
     NoisyTransition,
-    ParticleAnalysis,
-    ResampledTransition,
     WithWeights,
 )
-from torch_denkf.objectives import MixtureLoss
-
-PARTICLES = 100  # as both papers train with
 
 
-class _Particles(Recipe):
+class _Particles(Particles, KITTIRecipe):
     """Particles move by the known motion with learned noise of their velocities."""
 
-    resampling, learned = "soft", None
+    likelihood_keys = {"observed_key": ("forecast", "observed")}  # noqa: RUF012
 
-    def modules(self):
-        facts, keys = self.facts, {"observed_key": ("forecast", "observed")}
-        motion = NoisyTransition(
-            self.transition(torch.zeros_like),
+    def motion(self):
+        facts = self.facts
+        noise = DiagonalNoise(
+            2,
+            r=self.unit,
+            in_features=5,
             # Of the mean velocities alone: an infinite scale hides the pose.
-            DiagonalNoise(
-                2,
-                r=facts.unit,
-                in_features=5,
-                loc=torch.cat([torch.zeros(3), facts.loc]),
-                scale=torch.cat([torch.full((3,), torch.inf), facts.scale]),
-                in_key=("belief", "mean"),
-                out_key=("forecast", "noise"),
-            ),
-            [3, 4],
-            before=True,
+            loc=torch.cat([torch.zeros(3), facts.loc]),
+            scale=torch.cat([torch.full((3,), torch.inf), facts.scale]),
+            in_key=("belief", "mean"),
+            out_key=("forecast", "noise"),
         )
-        modules = OrderedDict()
-        if self.learned:
-            likelihood = LearnedLikelihood(
-                self.encoding,
-                2,
-                bound=self.learned,
-                scale=facts.unit,
-                reading_key=("sensor", "ensemble"),
-                **keys,
-            )
-        else:
-            modules["noise"] = self.noise()
-            likelihood = GaussianLikelihood(**keys)
-        modules["transition"] = ResampledTransition(ClonedTransition(motion), self.resampling)
-        modules["observation"] = self.observation(history_key=None)
-        modules["likelihood"] = likelihood
-        modules["analysis"] = ParticleAnalysis()
-        return modules
+        return ClonedTransition(NoisyTransition(self.transition(torch.zeros_like), noise, [3, 4], before=True))
+
+    def observation(self):
+        return KITTIRecipe.observation(self, history_key=None)
 
     def initial(self, std, state_key):
-        around = AroundState(std, ensemble_size=PARTICLES, state_key=state_key)
+        around = AroundState(std, ensemble_size=self.particles, state_key=state_key)
         return WithWeights(ClonedPrior(around, LONGEST - 1))
-
-    def loss(self, model):
-        return MixtureLoss(model, sensor=0.0, dims=(3, 4), state_scale=self.facts.unit)
-
-    def set_inflation(self, model, factor):
-        next(module for module in model.modules() if isinstance(module, ParticleAnalysis)).tempering = factor**-2
 
 
 @register
