@@ -64,6 +64,10 @@ class Recipe:
         """R, from what the sensor saw."""
         raise NotImplementedError
 
+    def observation(self) -> SubModel:
+        """H."""
+        raise NotImplementedError
+
     def loss(self, model: Filter) -> nn.Module:
         """What the training minimises, on windows with the true state: by default a Gaussian belief's score."""
         return GaussianLoss(model, sensor=0.0, dims=self.dims, state_scale=self.unit)
@@ -97,7 +101,7 @@ class Particles(Recipe):
     reading_key: NestedKey = ("sensor", "ensemble")
     likelihood_keys: ClassVar[dict[str, NestedKey]] = {}
 
-    def motion(self) -> SubModel:
+    def noisy_motion(self) -> SubModel:
         """The motion with its noise."""
         raise NotImplementedError
 
@@ -105,12 +109,8 @@ class Particles(Recipe):
         """Modules between forecast and likelihood; none by default."""
         return OrderedDict()
 
-    def observation(self) -> SubModel:
-        """H."""
-        raise NotImplementedError
-
     def modules(self):
-        motion, modules = self.motion(), OrderedDict()
+        motion, modules = self.noisy_motion(), OrderedDict()
         if not self.learned:
             modules["noise"] = self.noise()
         modules |= {"transition": ResampledTransition(motion, self.resampling), **self.readings()}

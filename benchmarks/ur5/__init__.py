@@ -1,1 +1,1 @@
-"""Parts of examples/ur5_manipulation.py: what is collected, built, trained, measured."""
+"""A UR5 that one camera watches: joints, gripper and end effector."""

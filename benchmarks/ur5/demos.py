@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,32 +24,19 @@ class Collections:
     Demo i of the first two collections is the same episode. Those that the replay's hash puts on the test side are
     tested on; of the others, the first numbers are sequences for the filter, which the sensor never sees, so that the
     filter learns how wrong its sensor is on new demos; all the rest are the sensor's.
-
-    Args:
-        root: folder of the collections.
-        cache: folder of their decoded pictures.
-        size: side of the pictures in pixels.
-        demos: in the simulator.
-        frames: drawn at random steps of each.
-        sequences: of the first demos, with all frames.
-        tune: of these, at most so many train the filters.
-        validation: and at most so many decide.
-        real: demos of ``real_like``, with all frames.
-        real_train: of these, on the train side.
-        steps: of a sequence.
     """
 
-    root: Path
-    cache: Path
-    size: int = 224
-    demos: int = 2000
-    frames: int = 16
-    sequences: int = 220
-    tune: int = 80
-    validation: int = 16
-    real: int = 130
-    real_train: int = 20
-    steps: int = 350
+    root: Path = Path("runs/ur5-demos")  # folder of the demos
+    out: Path = Path("runs/ur5")  # checkpoints, logs, table, beliefs, decoded pictures
+    size: int = 224  # side of the pictures in pixels
+    demos: int = 2000  # in the simulator, few frames each
+    frames: int = 16  # drawn at random steps of each
+    sequences: int = 220  # of these demos, whole
+    tune: int = 80  # of these, at most so many train the filters
+    validation: int = 16  # and at most so many decide
+    real: int = 130  # demos of real_like, whole
+    real_train: int = 20  # of these, on the train side
+    steps: int = 350  # of a sequence
 
     def collect(self, processes: int = 1, *, real: bool = True) -> None:
         """Collects what is missing, of ``real_like`` only if asked to."""
@@ -60,24 +48,13 @@ class Collections:
 
     def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
         """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
-        return UR5ExperienceReplay(self.root / name, split=split, cache=self.cache, **kwargs)
+        return UR5ExperienceReplay(self.root / name, split=split, cache=self.out / "cache", **kwargs)
 
 
-def all_states(collections: Collections) -> Tensor:
-    """States of all demos of the simulator that the sensor may see, ``[N, T, 10]``: they need no pictures."""
-    data = collections.replay("sim-frames", "train")
-    return torch.stack([row_block(data, e)["state"] for e in data.episodes if e.demo >= collections.sequences])
-
-
-def all_actions(collections: Collections) -> Tensor:
-    """Actions of the same demos, ``[N, T, 7]``."""
-    data = collections.replay("sim-frames", "train")
-    return torch.stack([row_block(data, e)["action"] for e in data.episodes if e.demo >= collections.sequences])
-
-
-def row_block(data: UR5ExperienceReplay, episode) -> TensorDict:
-    """The rows of one demo without their pictures, ``[T]``."""
-    return data.storage[episode.start : episode.start + episode.length]
+def sequences_of(data: UR5ExperienceReplay, chosen: Callable[[int], bool]) -> tuple[Tensor, Tensor]:
+    """States ``[N, T, 10]`` and actions ``[N, T, 7]`` of some demos: they need no pictures."""
+    rows = [data.storage[e.start : e.start + e.length] for e in data.episodes if chosen(e.demo)]
+    return tuple(torch.stack([row[key] for row in rows]) for key in ("state", "action"))
 
 
 class FramePool:

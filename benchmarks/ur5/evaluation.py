@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,20 +10,21 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.scores import cost
+from benchmarks.common.training import read_filter
+from benchmarks.ur5.demos import JOINTS, STATE
+from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all, with_missing
+from benchmarks.ur5.recipes import UR5Recipe
+from benchmarks.ur5.sensors import WRIST, Preset
+from benchmarks.ur5.tables import BLACKOUT
+from benchmarks.ur5.training import filter_error, joint_coverage, run_filter
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage, state_errors
 from torch_denkf.modules import ImageSensor
-from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all
-from benchmarks.ur5.recipes import Recipe
-from benchmarks.ur5.sensors import WRIST, Preset
-from benchmarks.ur5.training import coverage, filter_error, run_filter
+from torch_denkf.training import hold_last
 
-NAMES = ("filter", "sensor", "domain", "training", "condition", "ensemble_size", "seed")
-SCORES = ("joint_mae_deg", "ee_mae_cm", "coverage90", *(f"J{i + 1}_deg" for i in range(JOINTS)))
-BLACKOUT = ("blackout_joint_mae_deg", "std_before_deg", "std_blind_deg", "std_after_deg")
-COLUMNS = (*NAMES, *SCORES, *BLACKOUT, "validation_crps", "parameters", "ms_per_step", "demos")
+TIMED = 100  # steps to time a filter on
 AFTER = 15  # steps after a blackout at which the spread is taken again
 
 
@@ -55,15 +55,6 @@ def blackout(mean: Tensor, var: Tensor, truth: Tensor, begin: Tensor) -> dict[st
     return dict(zip(BLACKOUT, (float(error.mae[:JOINTS].rad2deg().mean()), *values), strict=True))
 
 
-def hold_last(values: Tensor, seen: Tensor, start: Tensor) -> Tensor:
-    """Readings ``[N, T, S]`` where seen ``[N, T, 1]``, else the last one, or the start ``[N, S]``."""
-    held, last = [], start
-    for value, mask in zip(values.unbind(1), seen.unbind(1), strict=True):
-        last = torch.where(mask, value, last)
-        held.append(last)
-    return torch.stack(held, 1)
-
-
 def conditions_of(clean: TensorDict, salted: TensorDict) -> dict[str, TensorDict]:
     """Readings of the test demos in all conditions."""
     return {name: salted if name == "salt_and_pepper" else fail(clean, name) for name in CONDITIONS}
@@ -88,12 +79,12 @@ def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) ->
     return rows
 
 
-def filter_rows(recipe: Recipe, model: Filter, readings: dict[str, TensorDict], names: dict) -> list[dict]:
+def filter_rows(recipe: UR5Recipe, model: Filter, readings: dict[str, TensorDict], names: dict) -> list[dict]:
     """A filter in all conditions."""
-    costs, rows = cost(recipe, model, readings["clean"]), []
+    own, rows = costs(recipe, model, readings["clean"]), []
     outs = run_filter(recipe, model, torch.cat(list(readings.values()))).split(len(readings["clean"]))
     for (condition, reading), out in zip(readings.items(), outs, strict=True):
-        rows.append({**names, "condition": condition, **scores(out), **costs, "demos": len(out)})
+        rows.append({**names, "condition": condition, **scores(out), **own, "demos": len(out)})
         if condition == "black20":
             mean, var = out["belief", "mean"][..., :STATE], out["belief", "var"]
             rows[-1] |= blackout(mean, var, out["state"], blackouts(*reading.shape))
@@ -102,19 +93,13 @@ def filter_rows(recipe: Recipe, model: Filter, readings: dict[str, TensorDict], 
 
 def scores(out: TensorDict) -> dict[str, float]:
     """Errors and coverage of beliefs ``[N, T]``."""
-    return {**errors(out["belief", "mean"][..., :STATE], out["state"]), "coverage90": float(coverage(out).mean())}
+    return {**errors(out["belief", "mean"][..., :STATE], out["state"]), "coverage90": float(joint_coverage(out))}
 
 
-@torch.no_grad()
-def cost(recipe: Recipe, model: Filter, readings: TensorDict, steps: int = 100) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of one demo there, one thread: the least of three runs."""
-    parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
-    seconds, row = [], readings[:1, :steps]
-    for _ in range(3):
-        begun = time.perf_counter()
-        run_filter(recipe, model, row)
-        seconds.append(time.perf_counter() - begun)
-    return {"parameters": sum(parameters.values()), "ms_per_step": 1e3 * min(seconds) / row.shape[1]}
+def costs(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict[str, float]:
+    """Parameters behind the sensor, and milliseconds a step of one demo there."""
+    row = readings[:1, :TIMED]
+    return cost(model, lambda: run_filter(recipe, model, row), row.shape[1])
 
 
 def size_rows(
@@ -122,8 +107,7 @@ def size_rows(
     sensor: ImageSensor,
     codes: TensorDict,
     sizes: Sequence[int],
-    weights: dict,
-    inflation: float,
+    saved: dict,
     names: dict,
     validation: TensorDict,
 ) -> list[dict]:
@@ -134,9 +118,7 @@ def size_rows(
     rows = []
     for size in sizes:
         recipe = make(size)
-        model = recipe.build()
-        model.load_state_dict(weights)
-        recipe.set_inflation(model, inflation)
+        model = read_filter(recipe, recipe.build(), saved)
         parts, first = [], None
         for part in codes.split(8):  # a large ensemble of all demos takes gigabytes
             readings = read_all(sensor, part, size)
@@ -145,17 +127,17 @@ def size_rows(
         out = torch.cat(parts)
         row = {**names, "condition": "clean", "ensemble_size": size, "demos": len(out)}
         crps = validation_crps(recipe, model, read_all(sensor, validation, size))
-        rows.append({**row, **scores(out), **cost(recipe, model, first), "validation_crps": crps})
+        rows.append({**row, **scores(out), **costs(recipe, model, first), "validation_crps": crps})
     return rows
 
 
-def validation_crps(recipe: Recipe, model: Filter, readings: TensorDict) -> float:
+def validation_crps(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> float:
     """CRPS of a filter on clean demos and on the same with missing frames, in the units of the loss."""
-    return filter_error(recipe, model, [readings, fail(readings, "missing", seed=1)])["crps"]
+    return filter_error(recipe, model, with_missing(readings))["crps"]
 
 
 def save_beliefs(
-    recipe: Recipe,
+    recipe: UR5Recipe,
     model: Filter,
     readings: dict[str, TensorDict],
     data: UR5ExperienceReplay,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.common.tables import pick
 from benchmarks.ur5.pictures import draw_end_effector, draw_ensemble_size, draw_joints, draw_video
-from benchmarks.ur5.study import read_rows
-from benchmarks.ur5.tables import pick
+from benchmarks.ur5.study import rows_of
 
 
 def draw_all(out: Path) -> Iterator[Path]:
@@ -37,7 +37,7 @@ def draw_all(out: Path) -> Iterator[Path]:
         if clean:
             draw_end_effector(clean, folder / f"{domain}-paths.png", [belief.stem for belief in clean])
             yield folder / f"{domain}-paths.png"
-    rows = pick(read_rows(out), filter="denkf", domain="sim", training="sim", condition="clean")
+    rows = pick(rows_of(out), filter="denkf", domain="sim", training="sim", condition="clean")
     for sensor in {row["sensor"] for row in rows}:
         own = pick(rows, sensor=sensor)
         if len({row["ensemble_size"] for row in own}) > 1:

@@ -14,14 +14,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torch_denkf.modules import LearnedTransition, SubModel, run_module
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
+from torch_denkf.modules import LearnedTransition, SubModel, run_module
+from torch_denkf.training import Stage, train_part
 
 SIZE = STATE + JOINTS  # of the filters' state
 FADING = 0.95  # of a bias in a step, before training
 RATES = list(range(STATE, SIZE))
+ERRORS = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((3,), PLACE_UNIT)])  # units of a filter's loss
 NOISY = [*range(JOINTS, SIZE)]  # place and rates; the joints follow from their rates
 
 
@@ -178,9 +179,6 @@ def train_motion(
     motion: ArmMotion, states: Tensor, actions: Tensor, *, out: Path, seed: int, updates: int
 ) -> ArmMotion:
     """Trains the motion on true sequences ``[N, T, 10]`` and actions ``[N, T, 7]``, or reads it where that was done."""
-    if (out / "motion.pt").exists():
-        motion.load_state_dict(read_checkpoint(out / "motion.pt")["motion"])
-        return motion
     full = with_rates(states)
 
     def pairs(index: Tensor) -> TensorDict:
@@ -198,18 +196,13 @@ def train_motion(
     checked = (
         pairs(torch.arange(held, count)[:: max((count - held) // 4000, 1)]) if held < count else pairs(torch.arange(1))
     )
-    FilterTrainer(
-        nn.ModuleDict({"motion": motion}),
-        [Stage("motion", loss, sample, updates, lr=5e-3)],
+    return train_part(
+        motion,
+        Stage("motion", loss, sample, updates, lr=5e-3),
         out=out,
         validate=lambda: {"error": float(sum(loss(checked).values()))},
         validate_every=max(updates // 4, 1),
         save_every=max(updates // 2, 1),
         seed=seed,
         device="cpu",
-    ).fit()
-    write_checkpoint(out / "motion.pt", {"motion": motion.state_dict()})
-    return motion
-
-
-ERRORS = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((3,), PLACE_UNIT)])  # units of a filter's loss
+    )

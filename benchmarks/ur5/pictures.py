@@ -11,19 +11,15 @@ from fractions import Fraction
 from pathlib import Path
 
 import cv2
-import matplotlib
 import numpy as np
 import torch
-
-from torch_denkf.envs import UR5TableEnv
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # after the choice of a back-end without a window
 from matplotlib.collections import PolyCollection
 from matplotlib.ticker import MaxNLocator
 
+from benchmarks.common.plots import BAND, draw_band, plt, save
+from torch_denkf.envs import UR5TableEnv
+
 STEP = 0.08  # s
-BAND = 1.645  # standard deviations either side: 90 % of a Gaussian
 NAMES = ("J1", "J2", "J3", "J4", "J5", "J6", "J7, gripper", "x", "y", "z")
 FACTORS = np.array([180 / np.pi] * 7 + [100.0] * 3)  # to degrees and centimetres
 KEYS = {"pixels": 4, "truth": 2, "mean": 2, "var": 2, "ensemble": 3, "observed": 1}  # and their dimensions
@@ -172,13 +168,10 @@ def draw_joints(npz: Path | str, path: Path | str, title: str = "") -> None:
     belief = read_belief(npz)
     seconds = np.arange(len(belief["truth"])) * STEP
     truth, mean = belief["truth"] * FACTORS, belief["mean"] * FACTORS
-    band = BAND * np.sqrt(belief["var"]) * FACTORS
+    std = np.sqrt(belief["var"]) * FACTORS
     figure, axes = plt.subplots(5, 2, figsize=(12, 12), sharex=True, layout="constrained")
     for dim, axis in enumerate(axes.T.flat):
-        low, high = mean[:, dim] - band[:, dim], mean[:, dim] + band[:, dim]
-        axis.fill_between(seconds, low, high, color="tab:blue", alpha=0.3, linewidth=0, label="90 % of the belief")
-        axis.plot(seconds, truth[:, dim], "k-", linewidth=1.2, label="truth")
-        axis.plot(seconds, mean[:, dim], color="tab:blue", linewidth=1.2, label="mean of the belief")
+        draw_band(axis, seconds, mean[:, dim], std[:, dim], truth[:, dim])
         _shade(axis, belief["observed"])
         axis.set(ylabel=f"{NAMES[dim]}, {'deg' if dim < 7 else 'cm'}", xlim=(0, seconds[-1]))
     axes[-1, 0].set_xlabel("s")
@@ -190,7 +183,7 @@ def draw_joints(npz: Path | str, path: Path | str, title: str = "") -> None:
     figure.legend(handles, labels, ncols=4, loc="outside lower center")
     if title:
         figure.suptitle(title)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_end_effector(npzs: Sequence[Path | str], path: Path | str, titles: Sequence[str] = ()) -> None:
@@ -227,7 +220,7 @@ def draw_end_effector(npzs: Sequence[Path | str], path: Path | str, titles: Sequ
         _equal_scales(axis, np.concatenate([truth, mean]))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, ncols=len(labels), loc="lower center")
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_ensemble_size(rows: Iterable[dict], path: Path | str) -> None:
@@ -261,7 +254,7 @@ def draw_ensemble_size(rows: Iterable[dict], path: Path | str) -> None:
         axis.minorticks_off()
         axis.set(xlabel="members", title=label, ylim=(0, 1.08 * table[:, column].max()))
         axis.grid(alpha=0.3)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _shade(axis, observed: np.ndarray) -> None:
@@ -281,9 +274,3 @@ def _equal_scales(axis, points: np.ndarray) -> None:
     for ticks in (axis.xaxis, axis.yaxis, axis.zaxis):
         ticks.set_major_locator(MaxNLocator(4))
     axis.set_box_aspect((1, 1, 1), zoom=0.87)
-
-
-def _save(figure, path: Path | str) -> None:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)

@@ -13,12 +13,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data import UR5ExperienceReplay
-from torch_denkf.modules import ImageSensor
-from torch_denkf.transforms import SaltAndPepper
 from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.motion import with_rates
 from benchmarks.ur5.sensors import BlackIsMissing
+from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.modules import ImageSensor
+from torch_denkf.transforms import SaltAndPepper
 
 CONDITIONS = ("clean", "black20", "missing", "salt_and_pepper")
 BLACK, MISSING = 20, 0.3  # consecutive black frames; share of frames that do not arrive
@@ -96,6 +96,11 @@ def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
         seen &= ~((step >= begin.unsqueeze(-1)) & (step < begin.unsqueeze(-1) + BLACK)).unsqueeze(-1)
     seen[:, 0] = readings["observed"][:, 0]
     return out.set("observed", seen)
+
+
+def with_missing(readings: TensorDict) -> TensorDict:
+    """Clean demos, and the same with missing frames: what filters are validated on."""
+    return torch.cat([readings, fail(readings, "missing", seed=1)])
 
 
 def blackouts(count: int, steps: int, seed: int = 0) -> Tensor:

@@ -10,12 +10,13 @@ import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 
-from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
-from torch_denkf.transforms import Brightness, SaltAndPepper
+from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk
+from torch_denkf.functional import crps_ensemble
+from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.training import Stage, train_part
+from torch_denkf.transforms import Brightness, SaltAndPepper
 
 SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
@@ -102,43 +103,33 @@ def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
 
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
-    return _sensor(facts, keypoint_trunk(), samples, layer="dropout", rate=0.05)
+    head = {"num_cells": (128, 64), "layer": "dropout", "rate": 0.05}
+    return _sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
     """The same with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
-    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, layer="flipout")
+    head = {"num_cells": (128, 64), "layer": "flipout"}
+    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, *_moments(facts), **head)
 
 
-def _sensor(facts: Statistics, trunk: nn.Module, samples: int, **kwargs) -> ImageSensor:
-    loc, scale = _moments(facts)
+def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
+    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
+    return _sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
+
+
+def _sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
     return ImageSensor(
-        11,
+        len(loc),
         image_shape=(3, facts.size, facts.size),
         trunk=trunk,
         ensemble_size=samples,
-        num_cells=(128, 64),
-        **kwargs,
         loc=loc,
         scale=scale,
         pixel_loc=facts.pixel_loc,
         pixel_scale=facts.pixel_scale,
         encoding_key=("sensor", "encoding"),
-    )
-
-
-def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
-    return ImageSensor(
-        STATE,
-        image_shape=(3, facts.size, facts.size),
-        trunk=convolutional_trunk(3),
-        ensemble_size=samples,
-        loc=facts.loc,
-        scale=facts.scale,
-        pixel_loc=facts.pixel_loc,
-        pixel_scale=facts.pixel_scale,
-        encoding_key=("sensor", "encoding"),
+        **head,
     )
 
 
@@ -221,21 +212,6 @@ def disturb(frames: TensorDict, generator: torch.Generator) -> TensorDict:
     return SaltAndPepper(p=0.33, generator=own)(frames)
 
 
-class SensorLoss(nn.Module):
-    """CRPS of the sensor's samples against what it should read, in units of a good sensor's errors."""
-
-    def __init__(self, sensor: ImageSensor, observe: Callable[[Tensor], Tensor]):
-        super().__init__()
-        self.sensor, self.observe = sensor, observe
-        self.register_buffer("unit", unit_of(sensor.loc.numel()))
-
-    def forward(self, frames: TensorDict) -> dict[str, Tensor]:
-        """Scores frames ``[N]``; the terms are losses of the joints and of the place."""
-        target = self.observe(frames["state"])
-        score = (crps_ensemble(self.sensor(frames)["sensor", "ensemble"], target) / self.unit).mean(0)
-        return {"loss_joints": score[:-3].mean(), "loss_place": score[-3:].mean()}
-
-
 @torch.no_grad()
 def sensor_error(sensor: ImageSensor, preset: Preset, pool: FramePool) -> dict[str, float]:
     """CRPS in the same units, and mean absolute errors in degrees and cm."""
@@ -265,25 +241,21 @@ def train_sensor(
     seed: int,
     updates: int,
     lr: float = 2e-3,
-    schedule: str = "one_cycle",
     batch: int = 64,
 ) -> ImageSensor:
     """Trains a sensor, or goes on where that was broken off, or reads it where it was done."""
-    if (out / "sensor.pt").exists():
-        sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
-        return sensor.eval()
+    terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
     stage = Stage(
         "sensor",
-        SensorLoss(sensor, preset.observe),
+        SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms),
         lambda generator, _: disturb(train.sample(generator, batch), generator),
         updates,
         lr=lr,
         weight_decay=0.02,
-        schedule=schedule,
     )
-    FilterTrainer(
-        nn.ModuleDict({"sensor": sensor}),
-        [stage],
+    return train_part(
+        sensor,
+        stage,
         out=out,
         validate=lambda: sensor_error(sensor, preset, held_out),
         monitor="crps",
@@ -291,6 +263,4 @@ def train_sensor(
         save_every=200,
         seed=seed,
         device="cpu",
-    ).fit()
-    write_checkpoint(out / "sensor.pt", {"sensor": sensor.state_dict()})
-    return sensor.eval()
+    ).eval()

@@ -1,42 +1,55 @@
-"""The jobs of the table: a sensor, then filters on it, in a domain; each can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from tyro.conf import OmitArgPrefixes, Positional
 
-from torch_denkf.filters import Filter
-from torch_denkf.modules import ImageSensor
-from torch_denkf.training import read_checkpoint, write_checkpoint
-from benchmarks.ur5.demos import Collections, FramePool, Roles, all_actions, all_states, real_roles, row_block, sim_roles
+from benchmarks.common.arguments import some_of
+from benchmarks.common.jobs import once, read_rows
+from benchmarks.ur5.demos import Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
 from benchmarks.ur5.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
 from benchmarks.ur5.motion import ArmMotion, train_motion
 from benchmarks.ur5.readings import read_all, read_codes
-from benchmarks.ur5.recipes import FILTERS, Recipe
+from benchmarks.ur5.recipes import FILTERS, UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
 from benchmarks.ur5.training import Budget, train_filter
+from torch_denkf.filters import Filter
+from torch_denkf.modules import ImageSensor
+from torch_denkf.training import read_checkpoint, write_checkpoint
 
 TRAININGS = ("sim", "real_like", "fine_tuned")
 SALTED = 3  # every third tuning demo is read with salt and pepper, too
 PICTURED = 3  # test demos whose beliefs are left for the plots
+SINGLE = ("dekf", "dukf", "bkf", "lstm")  # no ensemble
 
 
 @dataclass(frozen=True)
-class Study:
-    """All that a job needs to know."""
+class Study(Collections):
+    """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
-    collections: Collections
-    out: Path
-    budget: Budget = field(default_factory=Budget)
+    collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
+    left in --out. What was broken off goes on where it stopped. See benchmarks/ur5/README.md.
+    """
+
+    command: Positional[Literal["collect", "table", "pictures"]] = "table"
+    filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
+    sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
+    trainings: some_of(TRAININGS) = TRAININGS
+    seeds: tuple[int, ...] = (0,)
     sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512, 1024)  # of the ensemble, for one row each
+    processes: int = 1  # that collect
+    budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
+    smoke: bool = False  # a tiny run of everything
 
 
 class Base:
@@ -56,15 +69,22 @@ class Base:
         self.domain = "sim" if training == "sim" else "real_like"
         self.name = f"{training}-{kind}-{seed}"
         self.parent = Base(study, kind, "sim", seed) if training == "fine_tuned" else None
-        collections = study.collections
-        self.roles: Roles = sim_roles(collections) if training == "sim" else real_roles(collections)
+        self.roles: Roles = sim_roles(study) if training == "sim" else real_roles(study)
+        self.states, self.actions = self._truth()
         self.sensor, self.facts = self._sensor()
         self._motions: dict[bool, ArmMotion] = {}
+
+    def _truth(self) -> tuple[Tensor, Tensor]:
+        """States and actions of the demos that the sensor may see."""
+        study, roles = self.study, self.roles
+        if self.training == "sim":
+            return sequences_of(study.replay("sim-frames", "train"), lambda demo: demo >= study.sequences)
+        chosen = {*roles.sensor, *roles.tune, *roles.validation}
+        return sequences_of(study.replay("real_like-sequences", "train"), chosen.__contains__)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
         """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
         out = self.study.out / "sensors" / self.name
-        self.states, self.actions = self._truth()
         if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
             facts = Statistics(**read_checkpoint(out / "facts.pt"))
             sensor = self.preset.build(facts, SAMPLES)
@@ -75,9 +95,9 @@ class Base:
         return sensor, facts
 
     def _train_sensor(self, out: Path) -> tuple[ImageSensor, Statistics]:
-        collections, roles, budget = self.study.collections, self.roles, self.study.budget
+        study, roles, budget = self.study, self.roles, self.study.budget
         name = "sim-frames" if self.training == "sim" else "real_like-sequences"
-        data = collections.replay(name, "train", frames_only=True)
+        data = study.replay(name, "train", frames_only=True)
         held_out = set(sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation)
         pool, checked = FramePool(data, roles.sensor), FramePool(data, held_out)
         torch.manual_seed(self.seed)
@@ -98,15 +118,6 @@ class Base:
         train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
         return sensor, facts
 
-    def _truth(self) -> tuple[Tensor, Tensor]:
-        collections = self.study.collections
-        if self.training == "sim":
-            return all_states(collections), all_actions(collections)
-        data, roles = collections.replay("real_like-sequences", "train"), self.roles
-        chosen = {*roles.sensor, *roles.tune, *roles.validation}
-        rows = [row_block(data, episode) for episode in data.episodes if episode.demo in chosen]
-        return tuple(torch.stack([row[key] for row in rows]) for key in ("state", "action"))
-
     def motion(self, actions: bool) -> ArmMotion:
         """The motion, trained on true states."""
         if self.parent is not None:
@@ -123,16 +134,14 @@ class Base:
     def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
         """Features of the demos of a role, in a domain of which they may not be."""
         domain = self.domain if domain is None else domain
-        collections = self.study.collections
-        roles = self.roles if domain == self.domain else real_roles(collections)
-        demos = getattr(roles, role)
+        demos = getattr(self.roles if domain == self.domain else real_roles(self.study), role)
         if condition == "salt_and_pepper" and role == "tune":
             demos = demos[::SALTED]
         file = self.study.out / "codes" / f"{self.name}-{domain}-{role}-{condition}.pt"
-        data = collections.replay(f"{domain}-sequences", "test" if role == "test" else "train")
+        data = self.study.replay(f"{domain}-sequences", "test" if role == "test" else "train")
         return read_codes(self.sensor, data, demos, condition=condition, file=file)
 
-    def recipe(self, name: str, size: int = MEMBERS) -> Recipe:
+    def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
         """A filter's recipe, with a sensor of its own."""
         kind = FILTERS[name]
         motion, error = self.motion(kind.actions), self.error()
@@ -145,7 +154,7 @@ class Base:
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
 
-    def train(self, name: str) -> tuple[Recipe, Filter, Path]:
+    def train(self, name: str) -> tuple[UR5Recipe, Filter, Path]:
         """Trains a filter, or reads it."""
         recipe, out = self.recipe(name), self.study.out / "filters" / f"{name}-{self.name}"
         begin = None if self.parent is None else self.parent.train(name)[1]
@@ -158,6 +167,17 @@ class Base:
         """What a sensor reads of the test demos, in all conditions."""
         clean, salted = (self.codes("test", condition, domain) for condition in ("clean", "salt_and_pepper"))
         return conditions_of(read_all(sensor, clean, MEMBERS), read_all(sensor, salted, MEMBERS))
+
+
+def run_all(study: Study) -> None:
+    """Trains and tests everything: all filters with the first sensor in the simulator, the DEnKF everywhere."""
+    for seed in study.seeds:
+        for kind in study.sensors:
+            first = kind == study.sensors[0]
+            trainings = [name for name in study.trainings if first or name == "sim"]
+            for training in trainings:
+                chosen = [name for name in study.filters if name == "denkf" or (first and training == "sim")]
+                run_jobs(study, chosen, kind, training, seed, changed=first and len(trainings) > 1)
 
 
 def run_jobs(
@@ -173,33 +193,17 @@ def run_jobs(
         seed: of all random numbers.
         changed: whether DEnKF of the simulator is tested on the changed domain, too, as it is.
     """
-    base = Base(study, kind, training, seed)
+    base, folder = Base(study, kind, training, seed), study.out / "rows"
     names = {"sensor": kind, "training": training, "seed": seed}
     for domain in ("sim", "real_like") if training == "sim" and changed else (base.domain,):
         own = {**names, "domain": domain}
-        _once(study, f"sensor-{base.name}-{domain}", partial(_sensor, base, own))
+        once(folder / f"sensor-{base.name}-{domain}.json", partial(_sensor, base, own))
         for name in filters if domain == base.domain else set(filters) & {"denkf"}:
             size = 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
-            _once(
-                study,
-                f"{name}-{base.name}-{domain}",
-                partial(_filter, base, {**own, "filter": name, "ensemble_size": size}),
-            )
+            rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": size})
+            once(folder / f"{name}-{base.name}-{domain}.json", rows)
     if "denkf" in filters and changed and training == "sim":
-        _once(study, f"sizes-{base.name}", partial(_sizes, base, {**names, "domain": "sim", "filter": "denkf"}))
-
-
-SINGLE = ("dekf", "dukf", "bkf", "lstm")  # no ensemble
-
-
-def _once(study: Study, name: str, rows) -> None:
-    file = study.out / "rows" / f"{name}.json"
-    if file.exists():
-        return
-    file.parent.mkdir(parents=True, exist_ok=True)
-    beside = file.with_name(file.name + ".part")
-    beside.write_text(json.dumps(rows()))
-    beside.replace(file)
+        once(folder / f"sizes-{base.name}.json", partial(_sizes, base, {**names, "domain": "sim", "filter": "denkf"}))
 
 
 def _sensor(base: Base, names: dict) -> list[dict]:
@@ -215,7 +219,7 @@ def _filter(base: Base, names: dict) -> list[dict]:
     rows[0]["validation_crps"] = validation_crps(recipe, model, own)
     pictured = domain == "sim" or base.training == "fine_tuned"
     if names["filter"] == "denkf" and pictured:
-        data = base.study.collections.replay(f"{domain}-sequences", "test")
+        data = base.study.replay(f"{domain}-sequences", "test")
         demos, folder = base.roles.test[:PICTURED], base.study.out / "beliefs"
         save_beliefs(recipe, model, readings, data, demos, folder, f"denkf-{base.kind}-{domain}")
     return rows
@@ -223,13 +227,12 @@ def _filter(base: Base, names: dict) -> list[dict]:
 
 def _sizes(base: Base, names: dict) -> list[dict]:
     recipe, _, out = base.train(names["filter"])
-    saved = read_checkpoint(out / "filter.pt")
     sizes = [size for size in base.study.sizes if size != MEMBERS]  # that one is in the table
     make = partial(base.recipe, names["filter"])
-    test, validation = base.codes("test"), base.codes("validation")
-    return size_rows(make, recipe.sensor, test, sizes, saved["model"], saved["inflation"], names, validation)
+    saved, validation = read_checkpoint(out / "filter.pt"), base.codes("validation")
+    return size_rows(make, recipe.sensor, base.codes("test"), sizes, saved, names, validation)
 
 
-def read_rows(out: Path) -> list[dict]:
+def rows_of(out: Path) -> list[dict]:
     """All rows that a study's folder holds."""
-    return [row for file in sorted((out / "rows").glob("*.json")) for row in json.loads(file.read_text())]
+    return read_rows(sorted((out / "rows").glob("*.json")))

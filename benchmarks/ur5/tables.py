@@ -1,16 +1,27 @@
-"""The table, as CSV and as Markdown."""
+"""The table: its columns, and its Markdown."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from statistics import median
 
-from benchmarks.ur5.evaluation import BLACKOUT, COLUMNS, NAMES
+from benchmarks.common.tables import Columns, head, line, pick
+from benchmarks.ur5.demos import JOINTS
 from benchmarks.ur5.readings import CONDITIONS
 
-TEXT, WHOLE = ("filter", "sensor", "domain", "training", "condition"), ("ensemble_size", "seed", "demos")
+NAMES = ("filter", "sensor", "domain", "training", "condition", "ensemble_size", "seed")
+ANGLES = tuple(f"J{number + 1}_deg" for number in range(JOINTS))
+BLACKOUT = ("blackout_joint_mae_deg", "std_before_deg", "std_blind_deg", "std_after_deg")
+_SCORES = ("joint_mae_deg", "ee_mae_cm", "coverage90", *ANGLES, *BLACKOUT, "validation_crps")
+COLUMNS = Columns(
+    (*NAMES, *_SCORES, "parameters", "ms_per_step", "demos"),
+    text=NAMES[:5],
+    whole=("ensemble_size", "seed", "demos"),
+    order=lambda row: (
+        *(row[key] for key in ("domain", "sensor", "training", "filter")),
+        *(CONDITIONS.index(row["condition"]), row["ensemble_size"], row["seed"]),
+    ),
+)
 FAIRNESS = (
     "All filters of a sensor start from the same sensor's weights and the same learned motion, and learn from the same "
     "windows of its readings with as many updates; each then trains its own copy of the sensor's head. Each has one "
@@ -20,60 +31,27 @@ FAIRNESS = (
 )
 
 
-def write_csv(rows: Sequence[dict], file: Path) -> None:
-    """All rows, one for each filter, sensor, domain, training, condition, ensemble size and seed."""
-    rows = sorted(
-        rows, key=lambda row: tuple(row[key] for key in ("domain", "sensor", "training", "filter")) + _place(row)
-    )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{value:.5g}" if isinstance(value, float) else value for key, value in row.items()})
-
-
-def _place(row: dict) -> tuple:
-    return CONDITIONS.index(row["condition"]), row["ensemble_size"], row["seed"]
-
-
-def read_csv(file: Path) -> list[dict]:
-    """Rows as :func:`write_csv` wrote them; what is empty is left out."""
-    with file.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    return [
-        {k: v if k in TEXT else int(v) if k in WHOLE else float(v) for k, v in row.items() if v != ""} for row in rows
-    ]
-
-
-def pick(rows: Iterable[dict], **wanted) -> list[dict]:
-    """Rows with these entries."""
-    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
-
-
-def over_seeds(rows: Iterable[dict], column: str) -> float | None:
-    """Median over the seeds."""
+def over_seeds(rows: Iterable[dict], column: str, form: str = "{:.2f}") -> str:
+    """Median over the seeds, written; empty where no row has the column."""
     values = [row[column] for row in rows if column in row]
-    return median(values) if values else None
+    return form.format(median(values)) if values else ""
 
 
 def markdown(rows: Sequence[dict], header: str) -> str:
     """A table for each domain and training, one of failing cameras, and one of ensemble sizes."""
-    seeds = sorted({row["seed"] for row in rows})
-    lines = [header, "", FAIRNESS, "", f"Medians over {len(seeds)} seed(s)."]
-    main = [row for row in rows if not _resized(row, rows)]
+    lines = [header, "", FAIRNESS, "", f"Medians over {len({row['seed'] for row in rows})} seed(s)."]
+    resized = [row for row in rows if _resized(row, rows)]
+    main = [row for row in rows if row not in resized]
     for domain in sorted({row["domain"] for row in main}, reverse=True):
-        lines += ["", f"**{domain}**", "", "| trained | sensor | filter | " + " | ".join(CONDITIONS) + " | J1 to J7 |"]
-        lines.append("|---|---|---|" + "---|" * (len(CONDITIONS) + 1))
+        lines += ["", f"**{domain}**", "", *head("trained", "sensor", "filter", *CONDITIONS, "J1 to J7")]
         here = pick(main, domain=domain)
-        for key in sorted({_method(row) for row in here}, key=_order(here)):
-            own = [row for row in here if _method(row) == key]
+        for method in sorted({_method(row) for row in here}, key=_order(here)):
+            own = [row for row in here if _method(row) == method]
             cells = [_cell(pick(own, condition=condition)) for condition in CONDITIONS]
-            clean = pick(own, condition="clean")
-            joints = ", ".join(f"{over_seeds(clean, f'J{i}_deg'):.1f}" for i in range(1, 8)) if clean else ""
-            lines.append(f"| {key[0]} | {key[1]} | {key[2]} | {' | '.join(cells)} | {joints} |")
+            joints = ", ".join(over_seeds(pick(own, condition="clean"), angle, "{:.1f}") for angle in ANGLES)
+            lines.append(line(*method, *cells, joints))
     lines += ["", "Cells: joints deg / end effector cm / share of the true joints in the 90 % intervals.", ""]
-    return "\n".join([*lines, *_blackouts(main), "", *_sizes(rows)]) + "\n"
+    return "\n".join([*lines, *_blackouts(main), "", *_sizes(rows, resized)]) + "\n"
 
 
 def _method(row: dict) -> tuple[str, str, str]:
@@ -82,23 +60,23 @@ def _method(row: dict) -> tuple[str, str, str]:
 
 def _order(rows: Sequence[dict]):
     def key(method: tuple[str, str, str]) -> tuple:
-        own = [row for row in rows if _method(row) == method]
-        return method[0], method[1], method[2] != "sensor", over_seeds(pick(own, condition="clean"), "joint_mae_deg")
+        own = [row["joint_mae_deg"] for row in pick(rows, condition="clean") if _method(row) == method]
+        return *method[:2], method[2] != "sensor", median(own)
 
     return key
 
 
 def _cell(rows: Sequence[dict]) -> str:
-    joints, place, covered = (over_seeds(rows, key) for key in ("joint_mae_deg", "ee_mae_cm", "coverage90"))
-    return "" if joints is None else f"{joints:.2f} / {place:.2f} / {100 * covered:.0f} %"
+    if not rows:
+        return ""
+    covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in rows], "percent", "{:.0f}")
+    return f"{over_seeds(rows, 'joint_mae_deg')} / {over_seeds(rows, 'ee_mae_cm')} / {covered} %"
 
 
 def _resized(row: dict, rows: Sequence[dict]) -> bool:
     """Whether a row is one of the ensemble sizes that is not the filter's own: those have clean rows alone."""
-    keys = [key for key in NAMES if key != "condition"]
-    return row["filter"] != "sensor" and not any(
-        other["condition"] == "black20" and all(other[key] == row[key] for key in keys) for other in rows
-    )
+    same = {key: row[key] for key in NAMES if key != "condition"}
+    return row["filter"] != "sensor" and not pick(rows, condition="black20", **same)
 
 
 def _blackouts(rows: Sequence[dict]) -> list[str]:
@@ -106,36 +84,26 @@ def _blackouts(rows: Sequence[dict]) -> list[str]:
         "The camera black for 20 frames: error of the joints in these frames, and the mean standard deviation of the "
         "joints before, in the last of them, and 15 steps after, deg",
         "",
-        "| domain | trained | sensor | filter | error | before | last black | after |",
-        "|---|---|---|---|---|---|---|---|",
+        *head("domain", "trained", "sensor", "filter", "error", "before", "last black", "after"),
     ]
     chosen = [row for row in pick(rows, condition="black20") if BLACKOUT[0] in row]
     for key in sorted({(row["domain"], *_method(row)) for row in chosen}, reverse=True):
         own = [row for row in chosen if (row["domain"], *_method(row)) == key]
-        cells = [f"{over_seeds(own, column):.2f}" for column in BLACKOUT]
-        lines.append(f"| {' | '.join(key)} | {' | '.join(cells)} |")
+        lines.append(line(*key, *(over_seeds(own, column) for column in BLACKOUT)))
     return lines
 
 
-def _sizes(rows: Sequence[dict]) -> list[str]:
-    resized = [row for row in rows if _resized(row, rows)]
+def _sizes(rows: Sequence[dict], resized: Sequence[dict]) -> list[str]:
     if not resized:
         return []
-    first = resized[0]
-    same = {key: first[key] for key in ("filter", "sensor", "domain", "training")}
+    same = {key: resized[0][key] for key in ("filter", "sensor", "domain", "training")}
     own = pick(rows, condition="clean", **same)
-    lines = [
-        f"Size of the ensemble, {first['filter']}, clean",
-        "",
-        "| members | CRPS, validation demos | joints deg | end effector cm | 90 % hold | ms |",
-    ]
-    lines.append("|---|---|---|---|---|---|")
+    titles = ("members", "CRPS, validation demos", "joints deg", "end effector cm", "90 % hold", "ms")
+    lines = [f"Size of the ensemble, {same['filter']}, clean", "", *head(*titles)]
     for size in sorted({row["ensemble_size"] for row in own}):
         at = pick(own, ensemble_size=size)
-        values = [over_seeds(at, key) for key in ("joint_mae_deg", "ee_mae_cm", "coverage90", "ms_per_step")]
-        crps = over_seeds(at, "validation_crps")
-        chosen_by = "" if crps is None else f"{crps:.3f}"
-        lines.append(
-            f"| {size} | {chosen_by} | {values[0]:.2f} | {values[1]:.3f} | {100 * values[2]:.0f} % | {values[3]:.2f} |"
-        )
+        covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
+        cells = [over_seeds(at, "validation_crps", "{:.3f}"), over_seeds(at, "joint_mae_deg")]
+        cells += [over_seeds(at, "ee_mae_cm", "{:.3f}"), covered, over_seeds(at, "ms_per_step")]
+        lines.append(line(size, *cells))
     return lines

@@ -22,7 +22,7 @@ class _Particles(Particles, KITTIRecipe):
 
     likelihood_keys = {"observed_key": ("forecast", "observed")}  # noqa: RUF012
 
-    def motion(self):
+    def noisy_motion(self):
         facts = self.facts
         noise = DiagonalNoise(
             2,
@@ -37,7 +37,7 @@ class _Particles(Particles, KITTIRecipe):
         return ClonedTransition(NoisyTransition(self.transition(torch.zeros_like), noise, [3, 4], before=True))
 
     def observation(self):
-        return KITTIRecipe.observation(self, history_key=None)
+        return super().observation(history_key=None)
 
     def initial(self, std, state_key):
         around = AroundState(std, ensemble_size=self.particles, state_key=state_key)

@@ -7,28 +7,30 @@ from copy import deepcopy
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
-from torch_denkf.filters import Filter
-from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
+from benchmarks.common.recipes import Recipe, Registry
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.motion import ERRORS, FADING, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
 from benchmarks.ur5.sensors import MEMBERS, BlackIsMissing, NearForecast, Preset, Statistics
+from torch_denkf.filters import Filter
+from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
 
 WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
-FILTERS: dict[str, type[Recipe]] = {}
 INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states
 
 
-def register(recipe: type[Recipe]) -> type[Recipe]:
-    """Makes a filter available to all commands under its class's name in lower case."""
-    FILTERS[recipe.__name__.lower()] = recipe
-    return recipe
+FILTERS = Registry()
+register = FILTERS.register
 
 
-class Recipe:
-    """How to compose, train and tune one filter. All read the same sensor and begin with the same motion, and all
-    carry the table's ten numbers in the first ten entries of their mean.
+class UR5Recipe(Recipe):
+    """A filter of an arm: all read the same sensor and begin with the same motion, and all carry the table's ten
+    numbers in the first ten entries of their mean.
+
+    What is inflated is all noise: Q, R, and the sensor's samples around their mean. Gains stay, and spreads grow by it.
+    Inflating the belief itself would do harm here: only the sum of a number and its bias is seen, and what they differ
+    by would grow.
 
     Args:
         sensor: whose trunk stays as it is, and whose head is trained with the filter.
@@ -40,6 +42,7 @@ class Recipe:
         ensemble_size: members of an ensemble.
     """
 
+    dims, unit, scaled = range(STATE), ERRORS, (ScaledNoise, NearForecast)
     actions = False  # whether the motion reads the joints' targets
     bias = True  # whether the state holds the sensor's slow errors
 
@@ -56,34 +59,13 @@ class Recipe:
         self.ensemble_size, self.error = ensemble_size, error
         self.encoding = sensor.module["head"].layers[-1].in_features
 
-    def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
-        """Everything behind the sensor, by name, in order."""
-        raise NotImplementedError
-
     def belief(self, std: Tensor, state_key: str) -> TensorDictModuleBase:
         """The belief around a state ``[*B, S]``."""
         raise NotImplementedError
 
-    def loss(self, model: Filter) -> nn.Module:
-        """What the training minimises, on windows with the true ``"state"`` and ``"motion"``."""
-        raise NotImplementedError
-
-    def set_inflation(self, model: Filter, factor: float) -> None:
-        """The one number that is chosen on the validation demos: a factor on all standard deviations of noise.
-
-        Of Q, R, and the sensor's samples around their mean: gains stay, and spreads grow by it. Inflating the belief
-        itself would do harm here: only the sum of a number and its bias is seen, and what they differ by would grow.
-        """
-        for module in model.modules():
-            if isinstance(module, (ScaledNoise, NearForecast)):
-                module.factor = factor
-
-    def noise(self) -> SubModel:
-        """R, from what the sensor saw."""
-        return ScaledNoise(self._noise())
-
-    def _noise(self) -> SubModel:
-        return DiagonalNoise(STATE, r=WHITE * self.error, in_features=self.encoding, in_key=("sensor", "encoding"))
+    def noise(self):
+        keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding")}
+        return ScaledNoise(DiagonalNoise(STATE, r=WHITE * self.error, **keys))
 
     @property
     def size(self) -> int:
@@ -128,7 +110,7 @@ class Recipe:
     @property
     def state_scale(self) -> Tensor:
         """Units of the loss; rates and biases do not count."""
-        return torch.cat([ERRORS, torch.full((self.size - STATE,), torch.inf)])
+        return torch.cat([self.unit, torch.full((self.size - STATE,), torch.inf)])
 
     @property
     def start_std(self) -> Tensor:

@@ -7,11 +7,10 @@ from collections import OrderedDict
 import torch
 from torch import Tensor
 
-from torch_denkf.modules import AroundState, EnsembleAnalysis, NoisyTransition
-from torch_denkf.objectives import DEnKFLoss
 from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.recipes._base import Recipe, register
+from benchmarks.ur5.recipes._base import UR5Recipe, register
 from benchmarks.ur5.sensors import NEAR, NearForecast
+from torch_denkf.modules import AroundState, EnsembleAnalysis, NoisyTransition
 
 ARM = [index for index in range(STATE) if index != JOINTS - 1]  # what the gripper's opening says nothing about
 ARM_TAPER, PLACE_TAPER = 0.7, 0.8  # of joints among each other, and with the place: chosen on the validation demos
@@ -33,7 +32,7 @@ def localisation(size: int) -> tuple[Tensor, Tensor]:
 
 
 @register
-class DEnKF(Recipe):
+class DEnKF(UR5Recipe):
     """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples."""
 
     def modules(self):
@@ -49,8 +48,7 @@ class DEnKF(Recipe):
         return AroundState(std, ensemble_size=self.ensemble_size, state_key=state_key)
 
     def loss(self, model):
-        share = self.state_scale.isfinite().float().mean().item()  # a score is the mean over what counts
-        loss = DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
+        loss = self.ensemble_loss(model)
         loss.set_keys(state="motion_and_bias" if self.bias else "motion")
         return loss
 
@@ -67,4 +65,4 @@ class ADEnKF(DEnKF):
     """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
 
     def loss(self, model):
-        return DEnKFLoss.ad_enkf(model, detach_every=8)
+        return self.likelihood_loss(model)

@@ -6,6 +6,10 @@ from collections import OrderedDict
 
 import torch
 
+from benchmarks.ur5.demos import JOINTS
+from benchmarks.ur5.motion import RATES
+from benchmarks.ur5.recipes._base import UR5Recipe, register
+from benchmarks.ur5.sensors import NEAR, NearForecast
 from torch_denkf.modules import (
     CholeskyNoise,
     EKFAnalysis,
@@ -16,14 +20,9 @@ from torch_denkf.modules import (
     UKFAnalysis,
     UKFTransition,
 )
-from torch_denkf.objectives import GaussianLoss
-from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.motion import ERRORS, RATES
-from benchmarks.ur5.recipes._base import Recipe, register
-from benchmarks.ur5.sensors import NEAR, NearForecast
 
 
-class _Gaussian(Recipe):
+class _Gaussian(UR5Recipe):
     """Noise of the rates moves the joints in the same step, as it does the members of an ensemble."""
 
     Analysis = EKFAnalysis
@@ -44,9 +43,6 @@ class _Gaussian(Recipe):
 
     def belief(self, std, state_key):
         return GaussianAround(std, state_key=state_key)
-
-    def loss(self, model):
-        return GaussianLoss(model, sensor=0.0, dims=range(STATE), state_scale=ERRORS)
 
 
 @register

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
+from benchmarks.ur5.demos import STATE
+from benchmarks.ur5.motion import AtRest
+from benchmarks.ur5.recipes._base import INITIAL, UR5Recipe, register
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import GaussianAround, WithMemory
 from torch_denkf.objectives import GaussianLoss
-from benchmarks.ur5.demos import STATE
-from benchmarks.ur5.motion import ERRORS, AtRest
-from benchmarks.ur5.recipes._base import INITIAL, Recipe, register
 
 HIDDEN = 128
 
 
 @register
-class LSTM(Recipe):
+class LSTM(UR5Recipe):
     """Reads encoding and reading, and in the first step where the arm began, which all others are told as well."""
 
     bias = False
@@ -43,7 +43,7 @@ class LSTM(Recipe):
         return WithMemory(AtRest(GaussianAround(std[:STATE], state_key=state_key), state_key, STATE), HIDDEN)
 
     def loss(self, model):
-        return GaussianLoss(model, transition=0.0, sensor=0.0, dims=range(STATE), state_scale=ERRORS)
+        return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)
 
     def set_inflation(self, model, factor):
         model["lstm"].inflation = factor
