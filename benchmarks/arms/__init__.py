@@ -1,1 +1,1 @@
-"""What examples/dm_control_arms.py is made of."""
+"""A filter between an arm and its policy: dm_control's reacher and manipulator."""

@@ -1,4 +1,4 @@
-"""The arms of examples/dm_control_arms.py: their geometry and controller, and how their readings come about."""
+"""The arms: their geometry and controller, and how their readings come about."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def wrap(angle: Tensor) -> Tensor:
 
 @dataclass
 class Arm:
-    """What the example needs to know of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
+    """What the study needs to know of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
 
     domain: str
     task: str

@@ -1,34 +1,22 @@
-"""A filter between an arm and its policy: dm_control's reacher and manipulator from noisy encoders or from pixels.
-
-    python examples/dm_control_arms.py                                    # reacher, noisy joint angles
-    python examples/dm_control_arms.py --task manipulator --from pixels
-
-Collects episodes, trains a DEnKF of the arm's joints (with the action in its transition), appends it to the environment
-and lets one controller move the arm to a goal three times: on the readings (the last one, and a smoothed difference as
-velocity), on ``("belief", "mean")`` and on the truth; with all readings, and with 30 % of them missing. The goal is
-known (reacher: the target's joint angles by inverse kinematics; manipulator: a pose, drawn anew each episode), the arm
-is not. Pixels need OpenGL, encoders do not.
-"""
+"""The study: episodes, the filter of the arm's joints, its training, and one controller on three estimates."""
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-# Before anything imports mujoco: encoders need no OpenGL, and pixels none with a window.
-os.environ.setdefault("MUJOCO_GL", "egl" if "pixels" in " ".join(sys.argv) else "disabled")
+from typing import Annotated, Literal
 
 import torch
-from benchmarks.arms.arms import ARMS, NOISE, SIDE, Arm, HoldReading, make_env, make_one, wrap
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
+from tyro.conf import arg
 
+from benchmarks.arms.arms import ARMS, NOISE, SIDE, Arm, HoldReading, make_env, make_one, wrap
+from benchmarks.common.tables import head, line
 from torch_denkf import modules as m
 from torch_denkf.filters import DEnKF
 from torch_denkf.objectives import DEnKFLoss
@@ -36,6 +24,31 @@ from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.transforms import DEnKFTransform
 
 DRIFT = 0.004  # rad a step: noise of the angles, which the learned accelerations do not have
+
+
+@dataclass(frozen=True)
+class Study:
+    """A filter between an arm and its policy: dm_control's reacher and manipulator, noisy encoders or pixels.
+
+    Collects episodes, trains a DEnKF of the arm's joints, appends it to the environment, and lets one controller move
+    the arm to a goal on the readings, on the belief and on the truth. See benchmarks/arms/README.md.
+    """
+
+    task: Literal[tuple(sorted(ARMS))] = "reacher"
+    source: Annotated[Literal["proprioception", "pixels"], arg(name="from")] = "proprioception"
+    demos: int | None = None  # episodes to train on; by default 100, from pixels 240
+    episodes: int = 20  # episodes to test on
+    steps: int | None = None  # of an episode; by default 200, from pixels 120
+    sensor_updates: int = 1500
+    updates: int = 500
+    seed: int = 0
+    out: Path = Path("runs/dm_control_arms")
+    smoke: bool = False  # some seconds, to see that it runs, on both tasks
+
+    @property
+    def pixels(self) -> bool:
+        """Whether pictures are read."""
+        return self.source == "pixels"
 
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
@@ -69,13 +82,13 @@ class ArmTransition(m.SubModel):
         return self.arm.join(angles, velocity)
 
 
-def collect(arm: Arm, pixels: bool, args: argparse.Namespace) -> TensorDict:
+def collect(arm: Arm, study: Study) -> TensorDict:
     """Episodes of the controller on the truth with noise on its actions; many short ones where pictures are learned."""
-    at_once, steps = (30, min(60, args.steps)) if pixels else (args.demos, args.steps)
-    env = make_env(arm, pixels, min(at_once, args.demos))
+    at_once, steps = (30, min(60, study.steps)) if study.pixels else (study.demos, study.steps)
+    env = make_env(arm, study.pixels, min(at_once, study.demos))
     policy = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
-    rounds = range(-(-args.demos // at_once))
-    data = torch.cat([run(env, policy, steps, args.seed + number).exclude("next") for number in rounds])
+    rounds = range(-(-study.demos // at_once))
+    data = torch.cat([run(env, policy, steps, study.seed + number).exclude("next") for number in rounds])
     env.close()
     return data
 
@@ -102,12 +115,12 @@ def make_filter(arm: Arm, data: TensorDict, pixels: bool) -> DEnKF:
     )
 
 
-def train(denkf: DEnKF, data: TensorDict, args: argparse.Namespace) -> None:
+def train(denkf: DEnKF, data: TensorDict, study: Study) -> None:
     """The sensor, if there is one, on single frames of half of the episodes; the rest on windows of the others."""
     scale, sensor = denkf.initial.std, denkf[0] if "pixels" in denkf.in_keys else None
 
     def fit(stage: Stage) -> None:
-        trainer = FilterTrainer(denkf, [stage], out=args.out / stage.name, loggers=(), device="cpu", seed=args.seed)
+        trainer = FilterTrainer(denkf, [stage], out=study.out / stage.name, loggers=(), device="cpu", seed=study.seed)
         trainer.fit(resume=False)
 
     def draw(count: int, generator: torch.Generator) -> Tensor:
@@ -127,15 +140,17 @@ def train(denkf: DEnKF, data: TensorDict, args: argparse.Namespace) -> None:
             error = sensor(batch)["sensor", "ensemble"].mean(-2) - batch["state"][..., :size]
             return {"loss_sensor": (error / scale[:size]).square().mean()}
 
-        sample = lambda generator, length: frames[draw(len(frames), generator).squeeze(-1)]  # noqa: E731
-        fit(Stage("sensor", loss_sensor, sample, args.sensor_updates, parameters=sensor.parameters()))
+        def sample_frames(generator: torch.Generator, _: int | None) -> TensorDict:
+            return frames[draw(len(frames), generator).squeeze(-1)]
+
+        fit(Stage("sensor", loss_sensor, sample_frames, study.sensor_updates, parameters=sensor.parameters()))
         with torch.no_grad():  # once, instead of in every window
             data = torch.stack([sensor(episode) for episode in data])
     data = data.exclude("pixels")
     parts = {name: denkf[name] for name in ("transition", "observation", "noise", "analysis")}
     loss = DEnKFLoss(DEnKF(sensor=None, **parts, initial=denkf.initial), sensor=0.0, state_scale=scale)
-    lengths = {0: 10, args.updates // 3: 25, args.updates * 3 // 4: 100}
-    fit(Stage("filter", loss, sample_windows, args.updates, lr=3e-3, lengths=lengths))
+    lengths = {0: 10, study.updates // 3: 25, study.updates * 3 // 4: 100}
+    fit(Stage("filter", loss, sample_windows, study.updates, lr=3e-3, lengths=lengths))
 
 
 # ----------------------------------------------------------------------------------------------------------- scores
@@ -147,66 +162,52 @@ def scores(arm: Arm, episodes: TensorDict, key) -> list[str]:
     """
     estimate, truth = (arm.split(episodes["next", name]) for name in (key, "state"))
     errors = wrap(estimate[0] - truth[0]) * 57.2958, estimate[1] - truth[1]
-    distance = 100 * (arm.tip(episodes["goal"]) - arm.tip(truth[0])).norm(dim=-1)[:, -(episodes.shape[1] // 4) :].mean(
-        -1
+    distance = 100 * (arm.tip(episodes["goal"]) - arm.tip(truth[0])).norm(dim=-1)
+    rows = (
+        distance[:, -(episodes.shape[1] // 4) :].mean(-1),
+        episodes["next", "reward"].sum((1, 2)),
+        episodes["action"].square().mean((1, 2)),
     )
-    rows = distance, episodes["next", "reward"].sum((1, 2)), episodes["action"].square().mean((1, 2))
     return [f"{error.square().mean().sqrt():.2f}" for error in errors] + [
         f"{row.mean():.2f} ± {row.std() / len(row) ** 0.5:.2f}" for row in rows
     ]
 
 
-def compare(arm: Arm, denkf: DEnKF, pixels: bool, missing: float, args: argparse.Namespace) -> list[str]:
+def compare(arm: Arm, denkf: DEnKF, missing: float, study: Study) -> list[str]:
     """One controller on three estimates, in the same episodes."""
-    env, reading = make_env(arm, pixels, args.episodes, missing), denkf["analysis"].in_keys[2]
-    env.append_transform(DEnKFTransform(denkf, diagnostics=[reading] if pixels else []))
+    env, reading = make_env(arm, study.pixels, study.episodes, missing), denkf["analysis"].in_keys[2]
+    env.append_transform(DEnKFTransform(denkf, diagnostics=[reading] if study.pixels else []))
     env.append_transform(HoldReading(arm, reading))
     lines = []
     for name, key in (("reading", "held"), ("**belief**", ("belief", "mean")), ("truth", "state")):
         policy = TensorDictModule(arm.control, in_keys=[key, "goal"], out_keys=["action"])
-        episodes = run(env, policy, args.steps, args.seed + 1000)
-        lines.append("| " + " | ".join([f"{missing:.0%}", name, *scores(arm, episodes, key)]) + " |")
+        episodes = run(env, policy, study.steps, study.seed + 1000)
+        lines.append(line(f"{missing:.0%}", name, *scores(arm, episodes, key)))
     env.close()
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=sorted(ARMS), default="reacher")
-    parser.add_argument("--from", dest="source", choices=["proprioception", "pixels"], default="proprioception")
-    parser.add_argument("--demos", type=int, help="episodes to train on; by default 100, from pixels 240")
-    parser.add_argument("--episodes", type=int, default=20, help="episodes to test on")
-    parser.add_argument("--steps", type=int, help="of an episode; by default 200, from pixels 120")
-    parser.add_argument("--sensor-updates", type=int, default=1500)
-    parser.add_argument("--updates", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("runs/dm_control_arms"))
-    parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
-    args = parser.parse_args()
-    if args.smoke:
-        args.demos, args.episodes, args.steps, args.sensor_updates, args.updates = 4, 2, 24, 3, 4
-    arm, pixels, start = ARMS[args.task], args.source == "pixels", time.perf_counter()
-    args.demos, args.steps = args.demos or (240 if pixels else 100), args.steps or (120 if pixels else 200)
-    args.out = args.out / "smoke" if args.smoke else args.out / f"{args.task}_{args.source}"
-    torch.set_num_threads(1)
-    torch.manual_seed(args.seed)
+def run_task(study: Study) -> None:
+    """Collects, trains and compares; leaves ``table.md`` in the study's folder.
+
+    Raises:
+        SystemExit: if dm_control cannot show the arm.
+    """
+    arm, start = ARMS[study.task], time.perf_counter()
+    torch.manual_seed(study.seed)
     try:
-        make_one(arm, pixels).reset()
+        make_one(arm, study.pixels).reset()
     except Exception as error:  # each OpenGL library has its own
-        where = "libegl1 and libgl1-mesa-dri (Debian)" if pixels else "dm-control and mujoco<4"
-        sys.exit(f"dm_control cannot show {args.task}: {type(error).__name__}: {error}. Install {where}.")
-
-    data = collect(arm, pixels, args)
-    denkf = make_filter(arm, data, pixels)
-    train(denkf, data, args)
-    lines = ["| missing | policy reads | angles, deg | velocities, rad/s | tip to goal, cm | return | effort |"]
-    lines += ["|---" * 7 + "|"]
+        where = "libegl1 and libgl1-mesa-dri (Debian)" if study.pixels else "dm-control and mujoco<4"
+        raise SystemExit(
+            f"dm_control cannot show {study.task}: {type(error).__name__}: {error}. Install {where}."
+        ) from error
+    data = collect(arm, study)
+    denkf = make_filter(arm, data, study.pixels)
+    train(denkf, data, study)
+    lines = head("missing", "policy reads", "angles, deg", "velocities, rad/s", "tip to goal, cm", "return", "effort")
     for missing in (0.0, 0.3):
-        lines += compare(arm, denkf, pixels, missing, args)
-    (args.out / "table.md").write_text("\n".join(lines) + "\n")
-    print(f"\n{args.task} from {args.source}, {args.episodes} episodes:\n", *lines, sep="\n")
+        lines += compare(arm, denkf, missing, study)
+    (study.out / "table.md").write_text("\n".join(lines) + "\n")
+    print(f"\n{study.task} from {study.source}, {study.episodes} episodes:\n", *lines, sep="\n")
     print(f"\n{time.perf_counter() - start:.0f} s")
-
-
-if __name__ == "__main__":
-    main()

@@ -33,10 +33,9 @@ def coverage(out: TensorDict, dims: Sequence[int], floor: float, level: float = 
     return interval_coverage(mean, variance, truth, level=level)
 
 
-def belief_crps(runs: Sequence[TensorDict], dims: Sequence[int], unit: Tensor, floor: float) -> float:
-    """CRPS of beliefs ``[K, T]`` taken for Gaussians, in units: the mean over all sequences, which weigh the same."""
-    scores = [(crps_gaussian(*counted(out, dims, floor)) / unit).mean((1, 2)) for out in runs]
-    return float(torch.cat(scores).mean())
+def belief_crps(out: TensorDict, dims: Sequence[int], unit: Tensor, floor: float) -> Tensor:
+    """CRPS of beliefs taken for Gaussians, in units, ``[*K, T - 1, D]``."""
+    return crps_gaussian(*counted(out, dims, floor)) / unit
 
 
 @torch.no_grad()

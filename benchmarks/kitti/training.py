@@ -56,7 +56,8 @@ def run_all(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) 
 
 def filter_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
     """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
-    return {"crps": belief_crps(run_all(recipe, model, readings), VELOCITIES, recipe.unit, FLOOR)}
+    scores = [belief_crps(out, VELOCITIES, recipe.unit, FLOOR).mean((1, 2)) for out in run_all(recipe, model, readings)]
+    return {"crps": float(torch.cat(scores).mean())}
 
 
 def gain_error(fold: Fold, base: SensorOfFold) -> float:

@@ -57,7 +57,7 @@ def filter_error(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict
     mean, _, truth = counted(out, recipe.dims, 0.0)
     error = (mean - truth).abs().flatten(0, 1).mean(0)
     return {
-        "crps": belief_crps([out], recipe.dims, recipe.unit, 1e-10),
+        "crps": float(belief_crps(out, recipe.dims, recipe.unit, 1e-10).mean()),
         "joint_mae_deg": float(error[:JOINTS].mean().rad2deg()),
         "ee_mae_cm": 100 * float(error[JOINTS:].mean()),
     }
