@@ -56,8 +56,15 @@ def head(*titles: object) -> list[str]:
     return [line(*titles), "|" + "---|" * len(titles)]
 
 
+def write_page(page: str, file: Path | None) -> None:
+    """Prints a page, and leaves it in a file if one is given."""
+    print("\n" + page)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(page)
+
+
 def report(folder: Path, columns: Columns, rows: Sequence[dict], page: str) -> None:
     """Leaves the rows as table.csv and a page as table.md, and prints the page."""
     columns.write(rows, folder / "table.csv")
-    (folder / "table.md").write_text(page)
-    print(page)
+    write_page(page, folder / "table.md")

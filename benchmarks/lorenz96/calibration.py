@@ -5,19 +5,21 @@ push it. Four noisy instruments read it through a saturating curve; one half of 
 larger, and a bias). Everything is learned: transition, observation model, noise model, sensor. Every loss trains the
 same networks (the paper's Table I) on the same runs for the same number of updates.
 
-    python benchmarks/calibration.py            # the table of benchmarks/results/calibration.md
+    python -m benchmarks.lorenz96 calibration   # the table of benchmarks/lorenz96/results/calibration.md
 """
 
 from __future__ import annotations
 
-import argparse
 import platform
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.arguments import command
+from benchmarks.common.tables import head, line, write_page
 from torch_denkf.filters import DEnKF
 from torch_denkf.metrics import spread_skill_ratio
 from torch_denkf.modules import (
@@ -32,6 +34,7 @@ from torch_denkf.modules import (
 from torch_denkf.objectives import DEnKFLoss
 
 DT, ENSEMBLE = 0.1, 32
+TITLES = ("loss", "steps", "seed", "sensor RMSE", "filter RMSE", "spread/skill", "worst dimensions", "coverage of 90 %")
 
 
 def simulate(runs: int, steps: int, rng: torch.Generator) -> TensorDict:
@@ -100,41 +103,43 @@ def evaluate(denkf: DEnKF, data: TensorDict, seed: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--updates", type=int, default=1000)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/calibration.md"))
-    parser.add_argument("--smoke", action="store_true", help="a few updates, nothing written")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    updates, seeds = (20, 1) if args.smoke else (args.updates, args.seeds)
-    rng = torch.Generator().manual_seed(0)
-    training, unseen = simulate(400, 100, rng), simulate(100, 100, rng)
-    lines = [
-        "| loss | steps | seed | sensor RMSE | filter RMSE | spread/skill | worst dimensions | coverage of 90 % |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    began = time.perf_counter()
-    for loss_name, length in (("crps", 16), ("energy", 16), ("mse", 16), ("crps", 2), ("mse", 2)):
-        for seed in range(seeds):
-            scores = evaluate(train(loss_name, training, updates, length, seed), unseen, seed)
-            name = "mse (the paper's)" if loss_name == "mse" else loss_name
-            lines.append(
-                f"| {name} | {length - 1} | {seed} | {scores['sensor']:.3f} | {scores['filter']:.3f} | "
-                f"{scores['spread/skill']:.2f} | {scores['lowest']:.2f} to {scores['highest']:.2f} | "
-                f"{100 * scores['coverage90']:.0f} % |"
-            )
-            print(lines[-1], flush=True)
-    header = (
-        f"`python benchmarks/calibration.py --updates {updates} --seeds {seeds}`: {time.perf_counter() - began:.0f} s "
-        f"on one core ({platform.machine()}). 400 runs of 100 steps to train on, 100 unseen runs to test on; E = "
-        f"{ENSEMBLE}, batch 64. 'steps' is the number of filter steps back-propagated through. RMSE over the four "
-        "state dimensions, first 10 steps of a run left out.\n\n"
-    )
-    if not args.smoke:
-        args.out.write_text("# Calibration on a simulated system\n\n" + header + "\n".join(lines) + "\n")
+@dataclass
+class Calibration:
+    """A biased, heteroscedastic sensor: is the trained filter better than its sensor, and honest?"""
 
+    updates: int = 1000
+    seeds: int = 3
+    out: Path = Path("benchmarks/lorenz96/results/calibration.md")
+    smoke: bool = False  # a few updates, nothing written
 
-if __name__ == "__main__":
-    main()
+    def __call__(self) -> None:
+        """Trains with each loss and writes the table."""
+        if self.smoke:
+            self.updates, self.seeds = 20, 1
+        began, rng = time.perf_counter(), torch.Generator().manual_seed(0)
+        training, unseen = simulate(400, 100, rng), simulate(100, 100, rng)
+        lines = head(*TITLES)
+        for loss, length in (("crps", 16), ("energy", 16), ("mse", 16), ("crps", 2), ("mse", 2)):
+            for seed in range(self.seeds):
+                scores = evaluate(train(loss, training, self.updates, length, seed), unseen, seed)
+                lines.append(
+                    line(
+                        "mse (the paper's)" if loss == "mse" else loss,
+                        length - 1,
+                        seed,
+                        f"{scores['sensor']:.3f}",
+                        f"{scores['filter']:.3f}",
+                        f"{scores['spread/skill']:.2f}",
+                        f"{scores['lowest']:.2f} to {scores['highest']:.2f}",
+                        f"{100 * scores['coverage90']:.0f} %",
+                    )
+                )
+                print(lines[-1], flush=True)
+        header = (
+            f"`{command('lorenz96')}`: {time.perf_counter() - began:.0f} s on one core ({platform.machine()}). 400 "
+            "runs of 100 steps to train on, 100 unseen runs to test on; E = "
+            f"{ENSEMBLE}, batch 64. 'steps' is the number of filter steps back-propagated through. RMSE over the four "
+            "state dimensions, first 10 steps of a run left out."
+        )
+        page = "\n".join(["# Calibration on a simulated system", "", header, "", *lines]) + "\n"
+        write_page(page, None if self.smoke else self.out)

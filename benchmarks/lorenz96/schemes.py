@@ -5,15 +5,11 @@ observed every 0.05 time units with unit noise variance, no model noise; only th
 Gaspari-Cohn taper of radius 4. The score is the time mean of the root mean square error of the analysis mean, after a
 burn-in.
 
-    python benchmarks/lorenz96.py --out benchmarks/results/lorenz96.md
+    python -m benchmarks.lorenz96 schemes --out benchmarks/lorenz96/results/schemes.md
 """
 
 from __future__ import annotations
 
-import argparse
-import platform
-import shlex
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +18,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.arguments import command, processor
+from benchmarks.common.tables import head, line, write_page
 from torch_denkf.data.lorenz96 import lorenz96_step
 from torch_denkf.functional import analyse, inflate, random_rotation
 from torch_denkf.modules import LocalEnsembleAnalysis
@@ -53,6 +51,7 @@ CASES = [
     Case("etkf", 24, 1.013, published=0.18, target=0.21, rotate=True),
     Case("letkf", 7, 1.04, published=0.22, target=0.25, rotate=True),
 ]
+TITLES = ("scheme", "E", "inflation", "RMSE", "each seed", "spread", "published", "target", "met", "ms a cycle")
 RADIUS = 4.0  # of the localisation, in variables
 
 
@@ -121,13 +120,6 @@ def assimilate(case: Case, truth: Tensor, observations: Tensor) -> tuple[Tensor,
     return torch.stack(errors), torch.stack(spreads)
 
 
-def processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.processor() or platform.machine()
-
-
 def report(seeds: int, cycles: int, burn_in: int) -> str:
     """Run every case; the Markdown table with what is needed to repeat it."""
     start = time.perf_counter()
@@ -140,8 +132,7 @@ def report(seeds: int, cycles: int, burn_in: int) -> str:
         f"mean over {seeds} seeds, then each seed. Spread: the same of the ensemble's standard deviation.",
         "Published: DAPPER's table, which reproduces the papers. Met: the mean does not exceed the target.",
         "",
-        "| scheme | E | inflation | RMSE | each seed | spread | published | target | met | ms a cycle |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        *head(*TITLES),
     ]
     for case in CASES:
         began = time.perf_counter()
@@ -160,12 +151,11 @@ def report(seeds: int, cycles: int, burn_in: int) -> str:
             "yes" if scores.mean() <= case.target else "no",
             f"{elapsed:.2f}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(line(*cells))
         print(lines[-1], flush=True)
-    command = shlex.join(["python", "benchmarks/lorenz96.py", *sys.argv[1:]])
     lines += [
         "",
-        f"* Command: `{command}`",
+        f"* Command: `{command('lorenz96')}`",
         f"* Seeds: 0 to {seeds - 1}, all run as one batch, none left out; double precision.",
         f"* Hardware: {processor()}, {torch.get_num_threads()} thread(s); torch {torch.__version__}; "
         f"{time.perf_counter() - start:.0f} s in all. A cycle: {seeds} filters' forecast, analysis, score.",
@@ -173,23 +163,17 @@ def report(seeds: int, cycles: int, burn_in: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=4, help="independent runs, one batch (default: 4)")
-    parser.add_argument("--cycles", type=int, default=10_000, help="cycles averaged (default: 10000)")
-    parser.add_argument("--burn-in", type=int, default=400, help="cycles before those (default: 400)")
-    parser.add_argument("--smoke", action="store_true", help="a few cycles: does it run?")
-    parser.add_argument("--out", type=Path, help="also write the table to this Markdown file")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)  # on tensors this small more threads only wait for each other
-    if arguments.smoke:
-        arguments.cycles, arguments.burn_in = 20, 20
-    table = report(arguments.seeds, arguments.cycles, arguments.burn_in)
-    print("\n" + table)
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(table)
+@dataclass
+class Schemes:
+    """The analysis schemes on Lorenz-96 against published scores."""
 
+    seeds: int = 4  # independent runs, one batch
+    cycles: int = 10_000  # cycles averaged
+    burn_in: int = 400  # cycles before those
+    out: Path | None = None  # also write the table to this Markdown file
+    smoke: bool = False  # a few cycles: does it run?
 
-if __name__ == "__main__":
-    main()
+    def __call__(self) -> None:
+        """Prints the table."""
+        cycles, burn_in = (20, 20) if self.smoke else (self.cycles, self.burn_in)
+        write_page(report(self.seeds, cycles, burn_in), self.out)

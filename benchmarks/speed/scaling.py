@@ -1,6 +1,6 @@
 """The analysis for S = O = 10 to a million: time, memory and digits; 32 members, diagonal R, one thread.
 
-    python benchmarks/scaling.py --out benchmarks/results/scaling.md --plot docs/scaling.png
+    python -m benchmarks.speed.scaling --out benchmarks/speed/results/scaling.md --plot docs/scaling.png
 
 Time: processor time of a call, median of rounds that go through all sizes in turn. Memory: what torch's allocator
 holds at most during a call (torch.profiler, every allocation and release), plus the call's arguments; for the largest
@@ -9,17 +9,17 @@ size also the resident peak (VmHWM) of a child process. Digits: the increment in
 
 from __future__ import annotations
 
-import argparse
-import shlex
-import subprocess
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 import torch
 from torch import Tensor
 
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import write_page
+from benchmarks.speed.machine import in_child
 from torch_denkf.functional import analyse
 
 MEMBERS = 32
@@ -80,9 +80,8 @@ def copies(size: int, scheme: str) -> float:
 
 
 CHILD = """
-import sys
-sys.path[:0] = [{root!r}, {here!r}]
-import torch, scaling
+import torch
+from benchmarks.speed import scaling
 torch.set_num_threads(1)
 def kib(name):
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
@@ -97,10 +96,7 @@ print(1024 * (kib("VmHWM") - before) / arguments["forecast"].nbytes)
 
 def resident_copies(size: int, scheme: str) -> float:
     """The same from the resident peak of a child process; its libraries and what they keep do not count."""
-    here = Path(__file__).parent
-    script = CHILD.format(root=str(here.parent), here=str(here), size=size, scheme=scheme)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600, check=True)
-    return float(done.stdout)
+    return in_child(CHILD.format(size=size, scheme=scheme))
 
 
 def times(scheme: str, rounds: int, sizes: tuple[int, ...]) -> list[float]:
@@ -199,10 +195,7 @@ def table(found: dict[str, dict], command: str, seconds: float) -> str:
 
 def draw(found: dict[str, dict], path: Path) -> None:
     """Time, memory and error over the size."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from benchmarks.common.plots import plt, save
 
     figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     for scheme, values in found.items():
@@ -221,29 +214,26 @@ def draw(found: dict[str, dict], path: Path) -> None:
         axis.set(xlabel="S = O", title=title)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save(figure, path, dpi=110)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9, help="measurements of each time (default: 9)")
-    parser.add_argument("--smoke", action="store_true", help="small sizes, one round: does it run?")
-    parser.add_argument("--out", type=Path, help="write the tables to this Markdown file")
-    parser.add_argument("--plot", type=Path, help="write the picture to this file")
-    arguments = parser.parse_args()
-    began = time.perf_counter()
-    sizes = (10, 100, 10_000, 20_000) if arguments.smoke else SIZES
-    found = measure(1 if arguments.smoke else arguments.rounds, sizes)
-    command = shlex.join(["python", "benchmarks/scaling.py", *sys.argv[1:]])
-    page = table(found, command, time.perf_counter() - began)
-    print(page)
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(page)
-    if arguments.plot:
-        draw(found, arguments.plot)
+@dataclass
+class Scaling:
+    """The analysis for S = O = 10 to a million: time, memory and digits."""
+
+    rounds: int = 9  # measurements of each time
+    out: Path | None = None  # write the tables to this Markdown file
+    plot: Path | None = None  # write the picture to this file
+    smoke: bool = False  # small sizes, one round: does it run?
+
+    def __call__(self) -> None:
+        """Measures, prints and draws."""
+        began = time.perf_counter()
+        found = measure(1 if self.smoke else self.rounds, (10, 100, 10_000, 20_000) if self.smoke else SIZES)
+        write_page(table(found, command("speed.scaling"), time.perf_counter() - began), self.out)
+        if self.plot:
+            draw(found, self.plot)
 
 
 if __name__ == "__main__":
-    main()
+    parse(Scaling)()

@@ -1,6 +1,6 @@
 """A training step of the README's KITTI filter with Table I's image sensor: what it costs beyond the image trunk.
 
-    python benchmarks/training_step.py --out benchmarks/results/training_step.md
+    python -m benchmarks.speed.training_step --out benchmarks/speed/results/training_step.md
 
 64 sequences of 20 frames, 150x50x6, in single precision: filter, fair CRPS, backward, clipping, AdamW. Beside it, in
 the same rounds and on the same frames, the trunk's own forward and backward, once on all 1,280 frames in one call, as
@@ -10,17 +10,17 @@ a child process for each option.
 
 from __future__ import annotations
 
-import argparse
-import shlex
-import subprocess
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import write_page
+from benchmarks.speed.machine import in_child
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import (
     AroundState,
@@ -134,9 +134,8 @@ def ratios(seconds: dict[str, list[float]] | None = None) -> list[dict]:
 
 
 CHILD = """
-import sys
-sys.path[:0] = [{root!r}, {here!r}]
-import torch, training_step as bench
+import torch
+from benchmarks.speed import training_step as bench
 torch.set_num_threads(1)
 def kib(name):
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
@@ -152,10 +151,7 @@ print((kib("VmHWM") - before) / 1024)
 
 def resident_mib(name: str, batch: int, steps: int) -> float:
     """What a training step takes beyond model and batch, in MiB, in a process of its own."""
-    here = Path(__file__).parent
-    script = CHILD.format(root=str(here.parent), here=str(here), name=name, batch=batch, steps=steps)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600, check=True)
-    return float(done.stdout)
+    return in_child(CHILD.format(name=name, batch=batch, steps=steps))
 
 
 def table(seconds: dict[str, list[float]], memory: dict[str, float], command: str, elapsed: float) -> str:
@@ -188,23 +184,22 @@ def table(seconds: dict[str, list[float]], memory: dict[str, float], command: st
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=7, help="measurements of each time (default: 7)")
-    parser.add_argument("--smoke", action="store_true", help="a small batch, one round: does it run?")
-    parser.add_argument("--out", type=Path, help="write the table to this Markdown file")
-    arguments = parser.parse_args()
-    began = time.perf_counter()
-    batch, steps = (2, 3) if arguments.smoke else (BATCH, STEPS)
-    seconds = measure(1 if arguments.smoke else arguments.rounds, batch, steps)
-    memory = {name: resident_mib(name, batch, steps) for name in OPTIONS}
-    command = shlex.join(["python", "benchmarks/training_step.py", *sys.argv[1:]])
-    page = table(seconds, memory, command, time.perf_counter() - began)
-    print(page)
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(page)
+@dataclass
+class TrainingStep:
+    """A training step of the README's KITTI filter with Table I's image sensor."""
+
+    rounds: int = 7  # measurements of each time
+    out: Path | None = None  # write the table to this Markdown file
+    smoke: bool = False  # a small batch, one round: does it run?
+
+    def __call__(self) -> None:
+        """Measures and prints."""
+        began = time.perf_counter()
+        batch, steps = (2, 3) if self.smoke else (BATCH, STEPS)
+        seconds = measure(1 if self.smoke else self.rounds, batch, steps)
+        memory = {name: resident_mib(name, batch, steps) for name in OPTIONS}
+        write_page(table(seconds, memory, command("speed.training_step"), time.perf_counter() - began), self.out)
 
 
 if __name__ == "__main__":
-    main()
+    parse(TrainingStep)()

@@ -1,33 +1,33 @@
 """What DEnKFTransform adds to an environment's step at B = 1: a replay of KITTI's layout, and dm_control's reacher.
 
-    python benchmarks/transform_cost.py --out benchmarks/results/transform_cost.md
+    python -m benchmarks.speed.transform_cost --out benchmarks/speed/results/transform_cost.md
 
 Steps are taken as a collector takes them, with random actions, ``env.step_and_maybe_reset``. Without the transform,
 with it, and with it and a packaged step (``DEnKFTransform(filter, packaged=load_step(path))``) in turn, processor time
 of one thread; the cost is the difference of neighbouring rounds, its median is reported. No filter here reads images:
-the KITTI filter is Table I's on noisy velocities (the convolutions are in benchmarks/training_step.py), the reacher's
+the KITTI filter is Table I's on noisy velocities (the convolutions are in training_step.py), the reacher's
 that of examples/append_to_env.py.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
-import shlex
-import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control is imported: nothing is rendered here
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 import torch
 from tensordict import TensorDict
 from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import write_page
+from examples.append_to_env import NOISE, NoisyEncoders, make_filter
 from torch_denkf.data import render_drives
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.envs import KITTIReplayEnv
@@ -84,8 +84,6 @@ def kitti_env(folder: str) -> EnvBase:
 
 def reacher_env() -> EnvBase:
     """The arm with noisy encoders of examples/append_to_env.py."""
-    from append_to_env import NOISE, NoisyEncoders
-
     return TransformedEnv(
         DMControlEnv("reacher", "easy"),
         Compose(
@@ -98,8 +96,6 @@ def reacher_env() -> EnvBase:
 
 def cases(folder: str) -> dict[str, tuple]:
     """Makers of the environment and of its filter."""
-    from append_to_env import make_filter
-
     states = torch.tensor([[0.0, 0.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])  # scales of the transition, rad and rad/s
     return {
         "KITTIReplayEnv, Table I's head": (lambda: kitti_env(folder), kitti_filter),
@@ -215,21 +211,20 @@ def table(found: dict[str, dict[str, list[float]]], command: str, elapsed: float
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=41, help="measurements of each (default: 41)")
-    parser.add_argument("--smoke", action="store_true", help="one round of few steps: does it run?")
-    parser.add_argument("--out", type=Path, help="write the table to this Markdown file")
-    arguments = parser.parse_args()
-    began = time.perf_counter()
-    found = measure(1, 5) if arguments.smoke else measure(arguments.rounds)
-    command = shlex.join(["python", "benchmarks/transform_cost.py", *sys.argv[1:]])
-    page = table(found, command, time.perf_counter() - began)
-    print(page)
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(page)
+@dataclass
+class TransformCost:
+    """What DEnKFTransform adds to an environment's step at B = 1."""
+
+    rounds: int = 41  # measurements of each
+    out: Path | None = None  # write the table to this Markdown file
+    smoke: bool = False  # one round of few steps: does it run?
+
+    def __call__(self) -> None:
+        """Measures and prints."""
+        began = time.perf_counter()
+        found = measure(1, 5) if self.smoke else measure(self.rounds)
+        write_page(table(found, command("speed.transform_cost"), time.perf_counter() - began), self.out)
 
 
 if __name__ == "__main__":
-    main()
+    parse(TransformCost)()

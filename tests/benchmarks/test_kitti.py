@@ -20,7 +20,6 @@ from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from benchmarks.kitti.study import make_fold, read_rows
 from benchmarks.kitti.tables import by_drive, markdown, read_csv, write_csv
 from benchmarks.kitti.training import gain_error, run_filter
-
 from torch_denkf.metrics import dead_reckoning
 
 

@@ -19,7 +19,16 @@ from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, AtRest, Biase
 from benchmarks.ur5.readings import BLACK, Windows, blackouts, fail, read_head
 from benchmarks.ur5.recipes import FILTERS
 from benchmarks.ur5.recipes.denkf import localisation
-from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, BlackIsMissing, NearForecast, Statistics, TurnedWrist, wrist_of
+from benchmarks.ur5.sensors import (
+    MEMBERS,
+    NEAR,
+    SENSORS,
+    BlackIsMissing,
+    NearForecast,
+    Statistics,
+    TurnedWrist,
+    wrist_of,
+)
 from benchmarks.ur5.tables import markdown, read_csv, write_csv
 from benchmarks.ur5.training import run_filter
 

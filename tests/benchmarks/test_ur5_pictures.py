@@ -14,7 +14,6 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip insta
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from benchmarks.ur5 import pictures
-
 from torch_denkf.envs import UR5Expert, UR5TableEnv
 
 STEPS, SIDE, MEMBERS = 24, 48, 6
