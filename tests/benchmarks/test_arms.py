@@ -1,10 +1,5 @@
 """Oracles: MuJoCo's own positions of finger, hand and target, and readings held by hand."""
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,18 +1,14 @@
-"""The parts of examples/ur5_manipulation.py that a wrong table could come from."""
+"""The parts of the UR5 study that a wrong table could come from."""
 
 import copy
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-
 from benchmarks.ur5.demos import Roles
-from benchmarks.ur5.evaluation import COLUMNS, blackout, errors, hold_last, sensor_rows
+from benchmarks.ur5.evaluation import blackout, errors, sensor_rows
 from benchmarks.ur5.gallery import draw_all
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
 from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, AtRest, BiasedReading, WithBias, with_rates
@@ -29,7 +25,7 @@ from benchmarks.ur5.sensors import (
     TurnedWrist,
     wrist_of,
 )
-from benchmarks.ur5.tables import markdown, read_csv, write_csv
+from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import run_filter
 
 FACTS = Statistics(
@@ -200,12 +196,6 @@ def test_errors_are_means_of_absolute_ones_with_wrapped_angles_and_without_the_f
     assert scores["ee_mae_cm"] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_what_is_not_seen_holds_the_last_reading():
-    values = torch.tensor([[[1.0], [2.0], [3.0], [4.0]]])
-    seen = torch.tensor([[[False], [True], [False], [True]]])
-    assert hold_last(values, seen, torch.tensor([[9.0]])).flatten().tolist() == [9.0, 2.0, 2.0, 4.0]
-
-
 def test_a_blackout_is_scored_in_its_own_rows():
     truth, begin = torch.zeros(1, 80, 10), torch.tensor([30])
     mean, var = truth.clone(), torch.full((1, 80, 17), math.radians(1.0) ** 2)
@@ -356,13 +346,13 @@ def test_the_table_keeps_what_it_was_given(tmp_path):
     rows[1] |= {"blackout_joint_mae_deg": 2.0, "std_before_deg": 1.0, "std_blind_deg": 3.0, "std_after_deg": 1.1}
     rows.append({**names, **scores, "condition": "clean", "ensemble_size": 8, "joint_mae_deg": 4.5})
     rows[-1]["validation_crps"] = 1.5
-    write_csv(rows, tmp_path / "table.csv")
+    COLUMNS.write(rows, tmp_path / "table.csv")
 
     def place(row):
         return row["condition"], row["ensemble_size"]
 
-    assert sorted(read_csv(tmp_path / "table.csv"), key=place) == sorted(rows, key=place)
-    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS)
+    assert sorted(COLUMNS.read(tmp_path / "table.csv"), key=place) == sorted(rows, key=place)
+    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS.names)
     text = markdown(rows, "header")
     assert "| sim | glimpse | denkf | 1.25 / 0.25 / 90 % |" in text
     assert "| 8 | 1.500 | 4.50 | 0.250 | 90 % | 2.00 |" in text

@@ -1,7 +1,6 @@
 """Oracles: the saved camera pixels, the simulator's picture of the true state, the numbers behind the lines."""
 
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from tests.envs.opengl import needs_opengl
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'torch_denkf[examples]'")
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from benchmarks.ur5 import pictures
 from torch_denkf.envs import UR5Expert, UR5TableEnv
@@ -153,8 +151,8 @@ def invented(folder, steps=30, unseen=(), name="demo"):
 def figures(monkeypatch):
     """The figures, as they are when they have been written."""
     kept = []
-    save = pictures._save
-    monkeypatch.setattr(pictures, "_save", lambda figure, path: (save(figure, path), kept.append(figure)))
+    save = pictures.save
+    monkeypatch.setattr(pictures, "save", lambda figure, path: (save(figure, path), kept.append(figure)))
     return kept
 
 
