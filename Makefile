@@ -57,6 +57,8 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 
 smoke: $(STAMP)
 	for example in examples/*.py; do echo "== $$example --smoke" && $(BIN)/python $$example --smoke || exit 1; done
+	for study in kitti ur5 arms lorenz96; do \
+		echo "== $$study --smoke" && OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.$$study --smoke || exit 1; done
 
 # Ratios hold on a busy machine, absolute times do not.
 bench: $(VENV)/.bench
