@@ -105,10 +105,7 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
     }
     try:
         devkit = kitti_devkit_error(states[:, :3], truth[:, :3])
-        whole |= {
-            "devkit_t_rel_percent": float(devkit.translation),
-            "devkit_r_rel_deg_per_m": float(devkit.rotation),
-        }
+        whole |= {"devkit_t_rel_percent": float(devkit.translation), "devkit_r_rel_deg_per_m": float(devkit.rotation)}
     except ValueError:  # shorter than 100 m
         pass
     table = []

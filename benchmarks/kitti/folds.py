@@ -53,7 +53,7 @@ class Fold:
     """One drive is left out for the test; it may not be in the other lists.
 
     The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones;
-    see ``unseen_readings`` for drives that are in both lists.
+    see ``SensorTraining.unseen_readings`` for drives that are in both lists.
     """
 
     name: str
@@ -104,8 +104,8 @@ def with_spans(parts: Sequence[Part]) -> list[Part]:
 def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
     """The fold that leaves ``test`` out.
 
-    All others train both sensor and filter, see ``unseen_readings``; rendered drives validate, or, without them, the
-    drive that follows the test drive.
+    All others train both sensor and filter, see ``SensorTraining.unseen_readings``; rendered drives validate, or,
+    without them, the drive that follows the test drive.
     """
     drives = list(dict.fromkeys(stream.drive for stream in streams))
     of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}

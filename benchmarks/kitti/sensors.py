@@ -50,94 +50,87 @@ def sensor_loss(sensor: SubModel, unit: Tensor) -> SensorLoss:
     return SensorLoss(sensor, lambda frames: frames["target_observation"], unit, terms)
 
 
-def sensor_error(sensor: SubModel, parts: Sequence[Part], cache: Path, kind: str, unit: Tensor) -> dict[str, float]:
-    """CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
-    scores = []
-    for part in parts:
-        read = read_sensor(sensor, part.read(cache), kind)
-        score = (crps_ensemble(read["sensor", "ensemble"], read["target_observation"]) / unit).mean(-1)
-        scores.append(score[read["observed"].squeeze(-1)].mean())
-    return {"crps": float(torch.stack(scores).mean())}
+@dataclass(frozen=True)
+class SensorTraining:
+    """How the sensors of a study are trained: alone, and as stand-ins.
 
-
-def train_sensor(
-    sensor: SubModel,
-    parts: Sequence[Part],
-    held_out: Sequence[Part],
-    *,
-    kind: str,
-    facts: Statistics,
-    out: Path,
-    cache: Path,
-    seed: int,
-    updates: int,
-    lr: float = 2e-3,
-    keep: str = "best",
-) -> SubModel:
-    """Trains a sensor alone, or reads it where that was done before."""
-    sampler = FrameSampler(parts, cache, kind)
-    loss = sensor_loss(sensor, facts.unit)
-    return train_part(
-        sensor,
-        Stage("sensor", loss, lambda generator, _: sampler.frames(generator), updates, lr=lr, weight_decay=0.02),
-        out=out,
-        validate=lambda: sensor_error(sensor, held_out, cache, kind, facts.unit),
-        validate_every=max(updates // 4, 1),
-        save_every=200,
-        seed=seed,
-        keep=keep,
-    )
-
-
-def unseen_readings(
-    sensor: SubModel,
-    fold: Fold,
-    *,
-    kind: str,
-    facts: Statistics,
-    out: Path,
-    cache: Path,
-    seed: int,
-    updates: int,
-    lr: float = 1e-3,
-) -> list[tuple[TensorDict, TensorDict, float]]:
-    """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
-
-    A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives that
-    are in both lists are read by one of two sensors that stand in: each is trained on one half of those drives, and
-    reads the other.
-
-    Returns:
-        for each part of the tuning drives, and mirrored: readings to tune with, readings to validate with, the weight.
+    Args:
+        kind: name of the sensor.
+        facts: statistics of the training drives.
+        cache: of the streams.
+        seed: of all random numbers.
     """
-    shared = list(dict.fromkeys(p.stream.drive for p in fold.tune if p.stream.drive in fold.trained))
-    readers = {}
-    for half in (shared[0::2], shared[1::2]) if shared else ():
-        stand_in = deepcopy(sensor)
-        parts = [part for part in fold.train if part.stream.drive not in half]
-        folder = out / ("without-" + "-".join(half))
-        held_out = [part for part in fold.tune if part.stream.drive in half]
-        settings = {"kind": kind, "facts": facts, "out": folder, "cache": cache, "seed": seed, "updates": updates}
-        train_sensor(stand_in, parts, held_out, lr=lr, keep="last", **settings)
-        readers |= dict.fromkeys(half, stand_in)
-    result = []
-    for part in fold.tune:
-        reader = readers.get(part.stream.drive, sensor)
-        for mirrored in (False, True):
-            reading = read_spans(reader, part, cache, kind, mirrored)
-            split = int(0.7 * len(reading))
-            result.append((reading[:split], reading[split:], part.weight))
-    return result
+
+    kind: str
+    facts: Statistics
+    cache: Path
+    seed: int
+
+    def error(self, sensor: SubModel, parts: Sequence[Part]) -> dict[str, float]:
+        """CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
+        scores = []
+        for part in parts:
+            read = read_sensor(sensor, part.read(self.cache), self.kind)
+            score = (crps_ensemble(read["sensor", "ensemble"], read["target_observation"]) / self.facts.unit).mean(-1)
+            scores.append(score[read["observed"].squeeze(-1)].mean())
+        return {"crps": float(torch.stack(scores).mean())}
+
+    def train(
+        self, sensor: SubModel, parts: Sequence[Part], held_out: Sequence[Part], out: Path, updates: int, **settings
+    ) -> SubModel:
+        """Trains a sensor alone, or reads it where that was done before; settings are ``lr`` and ``keep``."""
+        sampler, loss = FrameSampler(parts, self.cache, self.kind), sensor_loss(sensor, self.facts.unit)
+        rates = {"lr": settings.pop("lr", 2e-3), "weight_decay": 0.02}
+        return train_part(
+            sensor,
+            Stage("sensor", loss, lambda generator, _: sampler.frames(generator), updates, **rates),
+            out=out,
+            validate=lambda: self.error(sensor, held_out),
+            validate_every=max(updates // 4, 1),
+            save_every=200,
+            seed=self.seed,
+            **settings,
+        )
+
+    def unseen_readings(
+        self, sensor: SubModel, fold: Fold, out: Path, updates: int, lr: float
+    ) -> list[tuple[TensorDict, TensorDict, float]]:
+        """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+
+        A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives
+        that are in both lists are read by one of two sensors that stand in: each is trained on one half of those
+        drives, and reads the other.
+
+        Returns:
+            for each part of the tuning drives, and mirrored: readings to tune with, readings to validate with, the
+            weight.
+        """
+        shared = list(dict.fromkeys(p.stream.drive for p in fold.tune if p.stream.drive in fold.trained))
+        readers = {}
+        for half in (shared[0::2], shared[1::2]) if shared else ():
+            parts = [part for part in fold.train if part.stream.drive not in half]
+            held_out = [part for part in fold.tune if part.stream.drive in half]
+            folder = out / ("without-" + "-".join(half))
+            stand_in = self.train(deepcopy(sensor), parts, held_out, folder, updates, lr=lr, keep="last")
+            readers |= dict.fromkeys(half, stand_in)
+        result = []
+        for part in fold.tune:
+            for mirrored in (False, True):
+                reader = readers.get(part.stream.drive, sensor)
+                reading = read_spans(reader, part, self.cache, self.kind, mirrored)
+                split = int(0.7 * len(reading))
+                result.append((reading[:split], reading[split:], part.weight))
+        return result
 
 
 @dataclass
 class SensorOfFold:
-    """What all filters of a fold have in common: the trained sensor and its readings of drives that it has not seen."""
+    """What all filters of a fold share: the trained sensor and its readings of drives that it has not seen."""
 
     kind: str
     sensor: SubModel
     facts: Statistics
-    readings: list[tuple[TensorDict, TensorDict, float]]  # see unseen_readings
+    readings: list[tuple[TensorDict, TensorDict, float]]  # see SensorTraining.unseen_readings
 
     @property
     def validation(self) -> list[TensorDict]:
@@ -170,12 +163,12 @@ def sensor_of_fold(
     """
     torch.manual_seed(seed)
     facts = statistics(fold.train, cache)
-    sensor = SENSORS[kind](facts)
-    common = {"kind": kind, "facts": facts, "cache": cache, "seed": seed}
-    rates, lr = {"updates": updates}, 2e-3
+    sensor, training = SENSORS[kind](facts), SensorTraining(kind, facts, cache, seed)
+    settings, lr = {}, 2e-3
     if pretrained is not None:
         sensor.load_state_dict(pretrained.state_dict())
-        rates, lr = {"updates": fine_tuning, "lr": 1e-3, "keep": "last"}, 1e-3
-    read = unseen_readings(sensor, fold, out=out, lr=lr, updates=rates["updates"], **common) if fold.shared else []
-    train_sensor(sensor, fold.train, fold.validation, out=out / "sensor", **common, **rates)
-    return SensorOfFold(kind, sensor, facts, read or unseen_readings(sensor, fold, out=out, updates=0, **common))
+        settings, lr, updates = {"lr": 1e-3, "keep": "last"}, 1e-3, fine_tuning
+    # Stand-ins begin where the sensor does, so they are trained before it.
+    read = training.unseen_readings(sensor, fold, out, updates, lr) if fold.shared else []
+    training.train(sensor, fold.train, fold.validation, out / "sensor", updates, **settings)
+    return SensorOfFold(kind, sensor, facts, read or training.unseen_readings(sensor, fold, out, 0, lr))

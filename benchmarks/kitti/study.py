@@ -16,7 +16,7 @@ from benchmarks.kitti.evaluation import evaluate
 from benchmarks.kitti.folds import Fold, Part, make_fold, statistics, with_disturbances, with_spans
 from benchmarks.kitti.plots import draw_drive
 from benchmarks.kitti.recipes import FILTERS
-from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_of_fold, train_sensor
+from benchmarks.kitti.sensors import SENSORS, SensorOfFold, SensorTraining, sensor_of_fold
 from benchmarks.kitti.streams import Stream, find_streams, prepare, spans
 from benchmarks.kitti.tables import IDENTITY
 from benchmarks.kitti.training import Budget, train_filter
@@ -128,17 +128,9 @@ class Job:
         study, parts = self.study, with_spans(with_disturbances(self.rendered[0]))
         torch.manual_seed(self.seed)
         facts = statistics(parts, study.cache)
-        return train_sensor(
-            SENSORS[self.sensor](facts),
-            parts,
-            with_disturbances(self.rendered[1]),
-            kind=self.sensor,
-            facts=facts,
-            out=study.out / "pretrained" / f"{self.sensor}-{self.seed}",
-            cache=study.cache,
-            seed=self.seed,
-            updates=study.budget.sensor,
-        )
+        training = SensorTraining(self.sensor, facts, study.cache, self.seed)
+        out, held_out = study.out / "pretrained" / f"{self.sensor}-{self.seed}", with_disturbances(self.rendered[1])
+        return training.train(SENSORS[self.sensor](facts), parts, held_out, out, study.budget.sensor)
 
     def prepare_sensor(self) -> None:
         """Does :meth:`pretrain` ahead of all folds, so that no two do it at once."""

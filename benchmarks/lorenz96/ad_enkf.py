@@ -58,13 +58,7 @@ class Case:
         return f"{observed} | {self.radius or 'none'} | {'F, Q' if self.learn_noise else 'F'}"
 
 
-CASES = [
-    Case(1, None, False),
-    Case(1, 5.0, False),
-    Case(1, 5.0, True),
-    Case(2, 5.0, False),
-    Case(2, 5.0, True),
-]
+CASES = [Case(1, None, False), Case(1, 5.0, False), Case(1, 5.0, True), Case(2, 5.0, False), Case(2, 5.0, True)]
 
 
 def run(case: Case, seed: int, variables: int, steps: int, updates: int, ensemble_size: int) -> tuple[str, str, float]:

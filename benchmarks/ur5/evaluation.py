@@ -103,13 +103,7 @@ def costs(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict[str, f
 
 
 def size_rows(
-    make,
-    sensor: ImageSensor,
-    codes: TensorDict,
-    sizes: Sequence[int],
-    saved: dict,
-    names: dict,
-    validation: TensorDict,
+    make, sensor: ImageSensor, codes: TensorDict, sizes: Sequence[int], saved: dict, names: dict, validation: TensorDict
 ) -> list[dict]:
     """A trained ensemble filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
@@ -52,11 +53,11 @@ def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
     return part
 
 
-def parameters_without(model: nn.Module, names: Iterable[str]) -> list[nn.Parameter]:
+def parameters_without(model: TensorDictSequential, names: Iterable[str]) -> list[nn.Parameter]:
     """Parameters of a filter without those of some of its modules: what a stage trains while these stay as they are.
 
     Args:
-        model: a filter, or another ``TensorDictSequential`` with named modules.
+        model: a filter, or another one with named modules.
         names: of the modules to leave out, as in ``model[name]``.
 
     Returns:

@@ -9,14 +9,7 @@ from tensordict.nn import TensorDictSequential
 
 from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
 from benchmarks.kitti.sensors import SAMPLES
-from torch_denkf.modules import (
-    AroundState,
-    EnsembleAnalysis,
-    MemberGain,
-    StochasticMLP,
-    UnicycleMotion,
-    WithHistory,
-)
+from torch_denkf.modules import AroundState, EnsembleAnalysis, MemberGain, StochasticMLP, UnicycleMotion, WithHistory
 
 LAGS = 4  # past steps that an innovation may still correct
 

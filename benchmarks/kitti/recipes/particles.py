@@ -7,14 +7,7 @@ import torch
 from benchmarks.common.recipes import Particles
 from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
-from torch_denkf.modules import (
-    AroundState,
-    ClonedPrior,
-    ClonedTransition,
-    DiagonalNoise,
-    NoisyTransition,
-    WithWeights,
-)
+from torch_denkf.modules import AroundState, ClonedPrior, ClonedTransition, DiagonalNoise, NoisyTransition, WithWeights
 
 
 class _Particles(Particles, KITTIRecipe):
