@@ -39,9 +39,11 @@ def fit_filter(
     if file.exists():
         read_filter(recipe, model, read_checkpoint(file))
         return
-    FilterTrainer(model, stages(), out=out, **settings).fit()
+    trainer = FilterTrainer(model, stages(), out=out, **settings)
+    trainer.fit()
     inflation = choose_for_coverage(inflations, lambda factor: recipe.set_inflation(model, factor), coverage)
-    write_checkpoint(file, {"model": model.state_dict(), "inflation": inflation, **(notes or {})})
+    if trainer.processes.is_main:
+        write_checkpoint(file, {"model": model.state_dict(), "inflation": inflation, **(notes or {})})
 
 
 def read_filter(recipe: Recipe, model: Filter, saved: dict) -> Filter:

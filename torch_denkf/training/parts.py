@@ -48,8 +48,10 @@ def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
     if file.exists():
         part.load_state_dict(read_checkpoint(file)[stage.name])
         return part
-    FilterTrainer(nn.ModuleDict({stage.name: part}), [stage], out=out, **settings).fit()
-    write_checkpoint(file, {stage.name: part.state_dict()})
+    trainer = FilterTrainer(nn.ModuleDict({stage.name: part}), [stage], out=out, **settings)
+    trainer.fit()
+    if trainer.processes.is_main:
+        write_checkpoint(file, {stage.name: part.state_dict()})
     return part
 
 
