@@ -16,7 +16,7 @@ _SCORES = ("joint_mae_deg", "ee_mae_cm", "coverage90", *ANGLES, *BLACKOUT, "vali
 COLUMNS = Columns(
     (*NAMES, *_SCORES, "parameters", "ms_per_step", "demos"),
     text=NAMES[:5],
-    whole=("ensemble_size", "seed", "demos"),
+    whole=("ensemble_size", "seed", "demos", "parameters"),
     order=lambda row: (
         *(row[key] for key in ("domain", "sensor", "training", "filter")),
         *(CONDITIONS.index(row["condition"]), row["ensemble_size"], row["seed"]),
