@@ -39,9 +39,10 @@ setup(
         "examples": ["matplotlib", "tensorboard"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],
-        # The peers of `make bench`, in the versions that benchmarks/results/speed.md was made with.
+        # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
+            "tyro",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",
@@ -50,6 +51,7 @@ setup(
         ],
         "test": [
             "evo",
+            "tyro",
             "pyarrow>=15",
             "av>=14",
             "pytest",
