@@ -15,7 +15,7 @@ from torch_denkf.functional._checks import check_ensemble, check_shape
 
 
 def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
-    """Continuous ranked probability score of each component: E|x − y| − 1/2 E|x − x'|.
+    """Continuous ranked probability score of each component: ``E|x − y| − 1/2 E|x − x'|``.
 
     Sorting makes the double sum over pairs a single one: O(E log E) time, O(E) memory.
 
