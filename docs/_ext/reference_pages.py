@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch_denkf
 
-ROLE = {
+OWN_METHODS = {
     "DEnKFTransform": """
-        ``DEnKFTransform`` inherits about eighty methods from torchrl's ``Transform``. Its own ones:
+        ``DEnKFTransform`` inherits about seventy public methods of torchrl's ``Transform``. Its own methods are:
 
         =================================  =============================================================================
         method                             what it does, and who calls it
@@ -77,8 +77,8 @@ def page(name, package):
     ]
     for public in names:
         parts += ["", public, "-" * len(public), "", directive(package, public), ""]
-        if public in ROLE:
-            parts += [inspect.cleandoc(ROLE[public]), ""]
+        if public in OWN_METHODS:
+            parts += [inspect.cleandoc(OWN_METHODS[public]), ""]
     return "\n".join(parts)
 
 
@@ -91,12 +91,30 @@ def write(app):
 
 
 def skip(app, what, name, obj, would_skip, options):
-    """Leaves out the fields of named tuples, which their class describes."""
-    return True if type(obj).__name__ == "_tuplegetter" else None
+    """Leaves out the fields of named tuples, which their class describes, and the losses' alias of their keys."""
+    return True if type(obj).__name__ == "_tuplegetter" or name == "default_keys" else None
+
+
+def describe_constant(app, what, name, obj, options, lines):
+    """Shows the source's comment in the place of what the constant's type says about itself."""
+    if what == "data":
+        package, _, constant = name.rpartition(".")
+        lines[:] = [comment(importlib.import_module(package), constant)]
+
+
+def own_signature(app, what, name, obj, options, signature, annotation):
+    """Shows the arguments of ``__init__`` where a metaclass hides them."""
+    if what == "class" and signature == "(*args, **kwargs)":
+        parameters = list(inspect.signature(inspect.unwrap(obj.__init__)).parameters.values())[1:]
+        bare = [parameter.replace(annotation=parameter.empty) for parameter in parameters]
+        return str(inspect.Signature(bare)), annotation
+    return None
 
 
 def setup(app):
     """Registers the extension."""
     app.connect("builder-inited", write)
     app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", describe_constant)
+    app.connect("autodoc-process-signature", own_signature)
     return {"parallel_read_safe": True}

@@ -2,21 +2,22 @@ r"""
 A first filter, on data of your own
 ===================================
 
-A camera films a pendulum from the side. It measures how far the bob is to the left or right, with noise. Nobody measures
-the speed of the pendulum, and nobody knows its equation of motion. There are recordings of 300 swings with the true angle
-and speed, and a new swing is to be tracked.
+A camera films a pendulum from the side. It measures how far the bob is to the left or right, with noise. Nobody
+measures the speed of the pendulum, and nobody knows its equation of motion. There are recordings of 300 swings with
+the true angle and speed, and a new swing is to be tracked.
 
 This page trains a *differentiable ensemble Kalman filter* (DEnKF) on the recordings. The filter's *belief* is an
-*ensemble*: 32 guesses of the state, whose mean is the estimate and whose spread says how sure the filter is. In each time
-step a network moves every guess (the *forecast*), and the reading pulls the guesses towards itself (the *analysis*).
+*ensemble*: 32 guesses of the state, whose mean is the estimate and whose spread says how sure the filter is. In each
+time step a network moves every guess (the *forecast*), and the reading pulls the guesses towards itself (the
+*analysis*).
 """
 
 # %%
 # The data
 # --------
 # Any arrays will do, as long as time is the last batch dimension. Here a simulation stands in for the laboratory. The
-# state is [angle in rad, angular speed in rad/s], the reading is the sine of the angle, with noise of standard deviation
-# 0.1.
+# state is [angle in rad, angular speed in rad/s], the reading is the sine of the angle, with noise of standard
+# deviation 0.1.
 
 import matplotlib.pyplot as plt
 import torch
@@ -30,7 +31,7 @@ DT, NOISE = 0.1, 0.1  # s; the standard deviation of a reading
 
 
 def record(swings: int, steps: int) -> TensorDict:
-    """Swings of a damped pendulum that the wind pushes: ``"state"`` [swings, steps, 2], ``"reading"`` [swings, steps, 1]."""
+    """Swings of a damped pendulum that the wind pushes."""
     angle, speed = 1.2 * torch.randn(swings), 1.0 * torch.randn(swings)
     states = []
     for _ in range(steps):
@@ -61,6 +62,7 @@ class BobPosition(torch.nn.Module):
     """What the camera reads of a state: [..., 2] to [..., 1]."""
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
+        """The sine of the angle."""
         return state[..., :1].sin()
 
 
@@ -78,9 +80,9 @@ print(denkf.carry_keys, "goes on from step to step;", sum(p.numel() for p in den
 # %%
 # The training
 # ------------
-# ``DEnKFLoss`` runs the filter over windows of the recordings and compares its ensembles with the true states. The score
-# is the *continuous ranked probability score* (CRPS): it is small where the ensemble is near the truth and as wide as it
-# is wrong.
+# ``DEnKFLoss`` runs the filter over windows of the recordings and compares its ensembles with the true states. The
+# score is the *continuous ranked probability score* (CRPS): it is small where the ensemble is near the truth and as
+# wide as it is wrong.
 
 loss = DEnKFLoss(denkf, state_scale=scale)
 optimiser = torch.optim.Adam(denkf.parameters())
@@ -102,8 +104,8 @@ print(f"CRPS of belief and forecast, summed: {history[0]:.3f} before, {sum(histo
 # %%
 # The result
 # ----------
-# ``sequence`` filters whole recordings. On 50 unseen swings we compare the mean of the belief with the true state, from the
-# second second on. The speed, which nobody measures, is compared with differences of the readings.
+# ``sequence`` filters whole recordings. On 50 unseen swings we compare the mean of the belief with the true state,
+# from the second second on. The speed, which nobody measures, is compared with differences of the readings.
 
 with torch.no_grad():
     tracked = denkf.sequence(unseen.clone())

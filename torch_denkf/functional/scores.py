@@ -22,7 +22,7 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Ten
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
         target: the truth y, ``[*B, S]``, in the state's units.
-        fair: average |x − x'| over the E (E − 1) pairs of different members, which makes the score an
+        fair: average ``|x − x'|`` over the E (E − 1) pairs of different members, which makes the score an
             unbiased estimate of that of the distribution they come from; otherwise over all E², which is
             the score of the empirical distribution.
 
