@@ -80,7 +80,7 @@ print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib'}} & (set(sys.modules
 
 
 def test_every_public_name_is_there():
-    for name in ("functional", "metrics", "modules", "filters", "transforms", "objectives", "data", "envs"):
+    for name in ("functional", "metrics", "modules", "filters", "transforms", "objectives", "data", "envs", "plots"):
         package = __import__(f"torch_denkf.{name}", fromlist=["*"])
         for public in getattr(package, "__all__", ()):
             assert hasattr(package, public), f"torch_denkf.{name}.{public}"
