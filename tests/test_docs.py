@@ -12,7 +12,6 @@ import pytest
 from torch_denkf.transforms import DEnKFTransform
 
 ROOT = Path(__file__).parents[1]
-#: Pages whose blocks are not run yet.
 WITHOUT = ("README.md",)
 PAGES = sorted(path for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")] if "_build" not in path.parts)
 BLOCK = re.compile(r"(?:^<!-- not run: (?P<why>.+?) -->\n+)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
