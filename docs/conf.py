@@ -49,6 +49,5 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = f"torch_denkf {version}"
 html_copy_source = False
-mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@4/tex-mml-chtml.js"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
