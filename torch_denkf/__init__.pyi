@@ -1,9 +1,12 @@
 from .data.kitti.replay import KITTIOdometryExperienceReplay
-from .data.lerobot.replay import LeRobotExperienceReplay
+from .data.lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
+from .data.recordings.replay import RecordingReplay
+from .data.recordings.streams import Images, Recording, Table, Video
 from .data.ur5.replay import UR5ExperienceReplay
 from .deployment import PackagedStep, export_step, load_step
 from .envs.kitti import KITTIReplayEnv
 from .envs.linear import LinearGaussianEnv
+from .envs.replay import ReplayEnv
 from .envs.ur5.expert import UR5Expert
 from .envs.ur5.table import UR5TableEnv
 from .filters import DPF, EKF, PFM, UKF, BackpropKF, DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter
@@ -36,12 +39,14 @@ __all__ = [
     "Filter",
     "FilterTrainer",
     "GaussianLoss",
+    "Images",
     "KITTIOdometryExperienceReplay",
     "KITTIReplayEnv",
     "KalmanFilter",
     "LSTMFilter",
     "LastAction",
     "LeRobotExperienceReplay",
+    "LeRobotReplay",
     "LinearGaussianEnv",
     "MissingFrames",
     "MixtureLoss",
@@ -51,14 +56,19 @@ __all__ = [
     "PFM",
     "PackagedStep",
     "ParticleFilter",
+    "Recording",
+    "RecordingReplay",
+    "ReplayEnv",
     "SaltAndPepper",
     "SensorLoss",
     "Stage",
+    "Table",
     "TransitionLoss",
     "UKF",
     "UR5ExperienceReplay",
     "UR5Expert",
     "UR5TableEnv",
+    "Video",
     "export_step",
     "load_step",
 ]

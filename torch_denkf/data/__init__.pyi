@@ -1,3 +1,4 @@
+from .episodes import Episode
 from .kitti.drive import list_kitti_drives, read_kitti_drive
 from .kitti.frames import drive_frames, frames_at, sample_windows
 from .kitti.gaps import bridge_gaps, steps_between
@@ -5,15 +6,27 @@ from .kitti.mirror import mirror_drive
 from .kitti.motion import with_motion
 from .kitti.render import random_drive, render_drives, roadside_scene, write_drives
 from .kitti.replay import KITTIOdometryExperienceReplay
-from .lerobot.replay import LeRobotExperienceReplay
+from .lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
 from .lerobot.rows import recording_from_rows
+from .recordings.replay import RecordingReplay
+from .recordings.streams import Images, Recording, Table, Video
+from .replay import EpisodeReplay, ReplayOptions
 from .systems import lorenz96_step, lorenz96_tendency
 from .ur5.replay import UR5ExperienceReplay
 
 __all__ = [
+    "Episode",
+    "EpisodeReplay",
+    "Images",
     "KITTIOdometryExperienceReplay",
     "LeRobotExperienceReplay",
+    "LeRobotReplay",
+    "Recording",
+    "RecordingReplay",
+    "ReplayOptions",
+    "Table",
     "UR5ExperienceReplay",
+    "Video",
     "bridge_gaps",
     "drive_frames",
     "frames_at",

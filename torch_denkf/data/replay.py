@@ -1,11 +1,12 @@
-"""What the data sets share: episodes one behind the other, cut into slices, with pixels that are made when sampled."""
+"""The base of all data sets: episodes one behind the other, cut into slices, with pixels that are made when sampled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,116 +17,248 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
+from torch_denkf.data.episodes import Episode, Split, episode_flags, roles_of
+from torch_denkf.data.slices import choose_sampler, refuse_short_episodes, slices_of
+from torch_denkf.data.statistics import mean_and_std
 
-def choose_sampler(
-    sampler: Sampler | None, num_slices: int | None, slice_len: int | None, strict_length: bool
-) -> Sampler | None:
-    """A sampler of slices of episodes, if they are asked for, or else the one that was passed.
+__all__ = ["EpisodeReplay", "ReplayOptions", "check_options"]
+
+Pictures = Callable[[Tensor], Mapping[str, Tensor]]
+_ROW = "_row"  # where a row is in the whole data set, for its picture
+
+
+class ReplayOptions(TypedDict, total=False):
+    """What every data set's constructor takes beside its source; see :class:`EpisodeReplay`."""
+
+    split: Split
+    validation_share: float
+    batch_size: int | None
+    num_slices: int | None
+    slice_len: int | None
+    strict_length: bool
+    sampler: Sampler | None
+    writer: Writer | None
+    collate_fn: Callable | None
+    pin_memory: bool
+    prefetch: int | None
+    transform: Transform | Callable | None
+    cache: str | Path | bool | None
+    progress: bool
+
+
+def check_options(options: Mapping[str, Any]) -> None:
+    """Refuses options that are wrong whatever the data are: reading these may take long.
 
     Raises:
-        ValueError: if more than one of ``sampler``, ``num_slices`` and ``slice_len`` is passed.
+        TypeError: for an option that there is not.
+        ValueError: for a split that there is not, a share out of range, and options that contradict each other.
     """
-    if num_slices is None and slice_len is None:
-        return sampler
-    if sampler is not None or (num_slices is not None and slice_len is not None):
-        raise ValueError("pass one of num_slices, slice_len and sampler; the sampler may cut slices itself")
-    return SliceSampler(
-        num_slices=num_slices, slice_len=slice_len, traj_key="episode", cache_values=True, strict_length=strict_length
-    )
+    unknown = sorted(set(options) - set(ReplayOptions.__annotations__))
+    if unknown:
+        raise TypeError(
+            f"data sets have no option {', '.join(unknown)}; there are {list(ReplayOptions.__annotations__)}"
+        )
+    split, share = options.get("split", "train"), options.get("validation_share", 0.0)
+    if split not in ("train", "validation", "test", "all"):
+        raise ValueError(f"split is 'train', 'validation', 'test' or 'all', got {split!r}")
+    if not 0 <= share < 1:
+        raise ValueError(f"validation_share is a share of the training episodes, in [0, 1), got {share}")
+    if split == "validation" and not share:
+        raise ValueError(
+            "split='validation' is empty without a validation_share; pass validation_share=0.1, and the same to the "
+            "data set with split='train', which then leaves these episodes out"
+        )
+    _sampler(options)
 
 
-def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
-    """Flags of rows: ``is_init`` where ``first``, truncated and done where ``last``, never terminated; no done at root.
-
-    Args:
-        first: bool ``[n, 1]``: the row begins an episode.
-        last: bool ``[n, 1]``: it ends one.
-
-    Examples:
-        >>> row = torch.arange(3).unsqueeze(-1)
-        >>> flags = episode_flags(row == 0, row == 2)
-        >>> flags["is_init"].flatten(), flags["next"]["truncated"].flatten(), flags["done"].any()
-        (tensor([ True, False, False]), tensor([False, False,  True]), tensor(False))
-    """
-    never = torch.zeros_like(first)
-    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
-    return {"is_init": first, **{key: never.clone() for key in done}, "next": TensorDict(done, first.shape[:1])}
-
-
-def whole_episode(count: int) -> dict[str, Any]:
-    """Flags of the rows of one episode, see :func:`episode_flags`."""
-    row = torch.arange(count).unsqueeze(-1)
-    return episode_flags(row == 0, row == count - 1)
+def _sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
+    named = ("sampler", "num_slices", "slice_len", "batch_size")
+    return choose_sampler(*(options.get(name) for name in named), options.get("strict_length", True))
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
-    """A read-only replay buffer of episodes that lie one behind the other.
+    """A read-only replay buffer of episodes: the base of all data sets, which share keys, splits and options.
 
-    A subclass sets ``root`` before it calls the constructor, and writes ``_is_downloaded``, ``_say_short`` and
-    ``_not_ours``.
+    ===================== ============ ===========================================================================
+    key                   shape        content
+    ===================== ============ ===========================================================================
+    ``episode``           [n]          int64, a number in ``episodes``
+    ``step``              [n,1]        int64, the row within its episode, from 0
+    ``time``              [n,1]        float64, s since the episode's begin
+    ``state``             [n,S]        float32, the truth, where it is known
+    readings              [n,...]      such as ``pixels`` [n,C,H,W] float32, ``action`` [n,A], ``flow``, ``road``; an
+                                       action is that which was sent in this row and leads to the next
+    ``observed``          [n,1]        bool: the row has a picture; what is missing is zero in ``pixels``
+    ``is_init``           [n,1]        bool: the first row of an episode, or of a slice
+    ``next``: ``done``,   [n,1]        bool: ``truncated`` and ``done`` in the last row of an episode, or of a slice;
+    ``truncated``,                     never ``terminated``. The three at the root are False.
+    ``terminated``
+    ===================== ============ ===========================================================================
+
+    The next observation is the next row's. The buffer stores numbers alone; pixels become float32 when rows are
+    sampled.
+
+    **Samples.** With slices of equal length, ``sample()`` is ``[B, T]``: B slices of T rows, as filters and losses take
+    them. Single rows are ``[n]``. With ``strict_length=False``, where slices may differ in length, they come one behind
+    the other in a flat ``[n]``, and ``is_init`` marks where each begins. ``data[index]`` has the index's shape.
+
+    **Splits** are by episode. A hash of its number or name decides what an episode is for, so that those added later
+    move none. ``"train"`` holds all episodes that are not for tests; with a ``validation_share`` it leaves this share
+    of them out, and ``"validation"`` holds them. Pass the same share to both.
+
+    A subclass sets ``root`` and calls the constructor. ``ReplayEnv(data)`` replays any data set as an environment.
 
     Args:
-        rows: what is stored, ``[n]``, with ``"episode"``.
-        episodes: what these rows are, each with a ``length``.
-        frames: adds to sampled rows what is not stored in them.
-        sampler: see :func:`choose_sampler`.
-        batch_size: rows of a sample.
-        writer: by default one that refuses to write.
-        transform: applied to each sample after ``frames``.
-        **kwargs: of torchrl's buffers.
+        rows: numbers of the whole data set, ``[N]``, with ``step`` and ``time``; the rows of an episode follow each
+            other.
+        episodes: all of it, in the order of the rows.
+        for_tests: whether an episode is for tests.
+        pictures: maps numbers of ``rows``, int64 ``[m]``, to what is not stored in them, ``[m, ...]`` each.
+        single: bool ``[N]``: only these rows are offered, each on its own (``is_init`` and done in all).
+        **options:
+            split: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
+            validation_share: of the episodes that are not for tests, in [0, 1); none by default.
+            batch_size: rows of a sample, over all slices.
+            num_slices: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence.
+            slice_len: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
+            strict_length: False lets episodes that are shorter than a slice come as short slices.
+            sampler: by default slices if they are asked for, else single rows at random.
+            writer: by default one that refuses to write.
+            collate_fn: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
+            pin_memory: whether samples are pinned.
+            prefetch: samples to prepare in advance, by threads.
+            transform: applied to each sample after the pixels are made, in the sample's shape. A slice's own begin
+                and end are marked after it.
+            cache: folder of decoded pictures; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``; None
+                or False for none: all pictures are then in memory. Entries may be deleted at any time.
+            progress: whether a bar shows what is decoded.
+
+    Attributes:
+        episodes: what each ``"episode"`` is: an :class:`~torch_denkf.data.Episode` with its name, first row and length.
+        root: the folder that was read; None for data that came from elsewhere.
+        sequential: False where ``single`` rows are offered, which do not follow each other.
 
     Raises:
-        ValueError: if episodes are shorter than the sampler's slices.
+        TypeError: for an option that there is not.
+        ValueError: for options out of range or that contradict each other, a split without episodes, and episodes that
+            are shorter than the sampler's slices.
+
+    Examples:
+        >>> step = torch.arange(10).repeat(3).unsqueeze(-1)
+        >>> rows = TensorDict({"step": step, "time": step * 0.1, "state": torch.rand(30, 2)}, [30])
+        >>> episodes = [Episode(name, 10 * k, 10) for k, name in enumerate("abc")]
+        >>> data = EpisodeReplay(rows, episodes, for_tests=lambda episode: episode.name == "b", slice_len=5, num_slices=4)
+        >>> [(episode.name, episode.start) for episode in data.episodes]
+        [('a', 0), ('c', 10)]
+        >>> data.sample()["state"].shape, data.statistics["state", "mean"].shape
+        (torch.Size([4, 5, 2]), torch.Size([2]))
     """
+
+    #: Readings whose statistics are numbers of the rows.
+    _numbers: Sequence[str] = ("state", "action")
 
     def __init__(
         self,
         rows: TensorDictBase,
-        episodes: Sequence[Any],
-        frames: Transform,
+        episodes: Sequence[Episode],
         *,
-        sampler: Sampler | None,
-        batch_size: int | None,
-        writer: Writer | None,
-        transform: Transform | Callable | None,
-        **kwargs,
+        for_tests: Callable[[Any], bool],
+        pictures: Pictures | None = None,
+        single: Tensor | None = None,
+        **options: Unpack[ReplayOptions],
     ):
-        self.episodes = tuple(episodes)
-        self._check_lengths(sampler, batch_size)
-        self._frames = frames
+        check_options(options)
+        sampler, batch_size = _sampler(options)
+        self.sequential = single is None
+        if not self.sequential and isinstance(sampler, SliceSampler):
+            raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")
+        if not hasattr(self, "_root"):
+            self.root = None
+        self._all_rows, self._all_episodes = rows, tuple(episodes)
+        self._roles = roles_of(self._all_episodes, for_tests, options.get("validation_share", 0.0))
+        split = options.get("split", "train")
+        chosen = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if split in ("all", role)]
+        if not chosen:
+            raise ValueError(
+                f"none of the {len(self._all_episodes)} episodes {self._source} is in the split {split!r}, as a hash "
+                "of their names has it; pass split='all', or add episodes"
+            )
+        stored, self.episodes = _select(rows, chosen, single)
+        refuse_short_episodes(self.episodes, sampler, batch_size)
+        self._add_pictures = _AddPictures(pictures)
+        writer, transform = options.get("writer"), options.get("transform")
         super().__init__(
-            storage=TensorStorage(rows),
+            storage=TensorStorage(stored),
             sampler=sampler,
+            sample_unit=slices_of(sampler),
             writer=ImmutableDatasetWriter() if writer is None else writer,
             batch_size=batch_size,
-            transform=frames,
-            **kwargs,
+            transform=self._add_pictures,
+            collate_fn=options.get("collate_fn"),
+            pin_memory=options.get("pin_memory", False),
+            prefetch=options.get("prefetch"),
         )
         if transform is not None:
             self.append_transform(transform)
 
-    def _check_lengths(self, sampler: Sampler | None, batch_size: int | None) -> None:
-        """TorchRL's samplers leave short episodes out without a word; here, that is a mistake."""
-        if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
-            return
-        length = sampler.slice_len
-        if length is None:
-            length = None if batch_size is None else batch_size // sampler.num_slices
-        short = [episode for episode in self.episodes if length is not None and episode.length < length]
-        if short:
-            raise ValueError(
-                f"slices have {length} rows, but {self._say_short(short)} pass shorter slices, or strict_length=False "
-                "for slices that may be shorter"
-            )
-
-    def _say_short(self, short: Sequence[Any]) -> str:
-        """Which episodes are shorter than a slice, for a message, up to what to do about it."""
-        raise NotImplementedError
+    @property
+    def _source(self) -> str:
+        return "in memory" if self.root is None else f"in {self.root}"
 
     @property
-    def _not_ours(self) -> str:
-        """Why the data set does not delete its files, for a message."""
-        raise NotImplementedError
+    def _training_index(self) -> Tensor:
+        """Rows of the training episodes, numbered in the whole data set, ``[n]``."""
+        training = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if role == "train"]
+        if not training:
+            raise ValueError(f"none of the episodes {self._source} is in the training split; add episodes")
+        return _rows_of(training)
+
+    @cached_property
+    def statistics(self) -> TensorDict:
+        """Means and standard deviations over the **training** episodes, whichever split and rows this data set has.
+
+        They standardise what a network reads and predicts, and tell it nothing about other episodes.
+
+        ========================== ============ ======================================================================
+        key                        shape        of
+        ========================== ============ ======================================================================
+        ``("state", "mean")``      [S]          all rows, likewise ``std``; a joint that never moves has a ``std`` of 0
+        ``("action", "mean")``     [A]          where there are actions, likewise ``std``
+        ``("pixels", "mean")``     [C,1,1]      each channel, over rows whose picture is there, likewise ``std``
+        ========================== ============ ======================================================================
+
+        Standard deviations divide by the number of values. Readings that come with a mask, ``NAME_observed``, count
+        where it is True. The pixels' are computed once, by a pass over all pictures.
+
+        Raises:
+            ValueError: if no episode is in the training split.
+        """
+        index = self._training_index
+        statistics = self._number_statistics(self._all_rows.select(*self._numbers_with_masks, strict=False)[index])
+        pixels = self._picture_statistics(index)
+        if pixels is not None:
+            statistics["pixels"] = pixels
+        return TensorDict(statistics).float()
+
+    @property
+    def _numbers_with_masks(self) -> list[str]:
+        return [key for name in self._numbers for key in (name, f"{name}_observed")]
+
+    def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
+        """Statistics of numbers of the training rows."""
+        statistics = {}
+        for key in self._numbers:
+            if key in rows:
+                mask = rows.get(f"{key}_observed", None)
+                statistics[key] = mean_and_std(rows[key] if mask is None else rows[key][mask.squeeze(-1)])
+        return statistics
+
+    def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
+        """Statistics of the pixels of some rows of the whole data set; None without pictures."""
+        return None
+
+    def _is_downloaded(self) -> bool:
+        return self.root is None or self.root.is_dir()
 
     @property
     def data_path(self) -> Path | None:
@@ -143,12 +276,56 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         Raises:
             RuntimeError: always.
         """
-        raise RuntimeError(self._not_ours)
+        raise RuntimeError(f"the recordings {self._source} were not written by this data set; delete them by hand")
 
     def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
         """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
-        return super().preprocess(partial(_then, self._frames, fn), *args, **kwargs)
+        return super().preprocess(partial(_then, self._add_pictures, fn), *args, **kwargs)
 
 
 def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBase:
     return fn(first(rows))
+
+
+def _rows_of(episodes: Sequence[Episode]) -> Tensor:
+    return torch.cat([torch.arange(episode.start, episode.start + episode.length) for episode in episodes])
+
+
+def _select(
+    rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
+) -> tuple[TensorDict, tuple[Episode, ...]]:
+    """Rows of the chosen episodes with their flags and numbers, and these episodes with their new places."""
+    index = _rows_of(chosen)
+    number = torch.arange(len(chosen)).repeat_interleave(torch.tensor([episode.length for episode in chosen]))
+    first = torch.cat([torch.arange(episode.length) for episode in chosen]).unsqueeze(-1) == 0
+    last = first.roll(-1, 0)
+    if single is not None:
+        keep = single[index]
+        index, number = index[keep], number[keep]
+        first = last = torch.ones(len(index), 1, dtype=torch.bool)
+    stored = cast(TensorDict, rows[index])
+    stored.update({"episode": number, _ROW: index.unsqueeze(-1), **episode_flags(first, last)})
+    lengths = torch.bincount(number, minlength=len(chosen))
+    places = zip(chosen, (lengths.cumsum(0) - lengths).tolist(), lengths.tolist(), strict=True)
+    return stored, tuple(replace(episode, start=start, length=length) for episode, start, length in places)
+
+
+class _AddPictures(Transform):
+    """Adds to rows of the buffer what is not stored in them.
+
+    Args:
+        pictures: see :class:`EpisodeReplay`.
+    """
+
+    def __init__(self, pictures: Pictures | None):
+        super().__init__()
+        self.pictures = pictures
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The same rows, with pictures."""
+        tensordict = tensordict.copy()  # data[:] hands out the storage itself
+        row = tensordict.pop(_ROW)
+        if self.pictures is not None:
+            for key, value in self.pictures(row.reshape(-1)).items():
+                tensordict.set(key, value.reshape(*tensordict.batch_size, *value.shape[1:]))
+        return tensordict

@@ -30,7 +30,7 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
         ValueError: if no frame of the file can be decoded.
     """
     if not file.is_file():
-        raise FileNotFoundError(f"no video {file}; download the data set completely, or pass another camera")
+        raise FileNotFoundError(f"no video {file}; download or copy it completely, or pass another camera")
     order = np.argsort(times, kind="stable")
     ordered, off = times[order], np.full(len(times), np.inf)
     any_decoded = False
@@ -46,7 +46,7 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
             yield near, frame
     if not any_decoded:
         raise ValueError(
-            f"no frame of {file} can be decoded: it is damaged (download it anew), or in a codec that OpenCV here "
+            f"no frame of {file} can be decoded: it is damaged (download or copy it anew), or in a codec that OpenCV here "
             f"lacks, such as AV1 ({EXTRA} brings PyAV, which has it)"
         )
 

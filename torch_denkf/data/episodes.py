@@ -1,0 +1,87 @@
+"""Episodes of a data set: what they are called, where they lie, and what each is for."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+__all__ = ["Episode", "Split", "episode_flags", "hashed_share", "roles_of"]
+
+Split = Literal["train", "validation", "test", "all"]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Rows of a data set that follow each other in time.
+
+    Attributes:
+        name: of the episode, unique in the data set.
+        start: its first row in the data set.
+        length: its rows.
+    """
+
+    name: str
+    start: int
+    length: int
+
+    @property
+    def split_name(self) -> str:
+        """What the hashes of splits are made of: episodes that share it are on the same side."""
+        return self.name
+
+
+def hashed_share(name: str, purpose: str) -> float:
+    """A number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
+
+    Args:
+        name: of an episode.
+        purpose: of the number: two purposes give independent numbers.
+
+    Examples:
+        >>> share = [hashed_share(str(k), "test") < 0.2 for k in range(1000)]
+        >>> 160 < sum(share) < 240
+        True
+    """
+    digest = hashlib.sha256(f"torch_denkf {purpose} {name}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
+
+
+def roles_of(
+    episodes: Sequence[Any], for_tests: Callable[[Any], bool], validation_share: float
+) -> list[Literal["train", "validation", "test"]]:
+    """What each episode is for; no other episode has a say in it, so that those added later move none.
+
+    Args:
+        episodes: of the whole data set.
+        for_tests: whether an episode is for tests.
+        validation_share: of the others, this share is for validation, by :func:`hashed_share`.
+    """
+    held = [hashed_share(episode.split_name, "validation") < validation_share for episode in episodes]
+    return [
+        "test" if for_tests(episode) else "validation" if out else "train"
+        for episode, out in zip(episodes, held, strict=True)
+    ]
+
+
+def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
+    """Flags of rows: ``is_init`` where ``first``, truncated and done where ``last``, never terminated; no done at root.
+
+    Args:
+        first: bool ``[n, 1]``: the row begins an episode.
+        last: bool ``[n, 1]``: it ends one.
+
+    Examples:
+        >>> row = torch.arange(3).unsqueeze(-1)
+        >>> flags = episode_flags(row == 0, row == 2)
+        >>> flags["is_init"].flatten(), flags["next"]["truncated"].flatten(), flags["done"].any()
+        (tensor([ True, False, False]), tensor([False, False,  True]), tensor(False))
+    """
+    never = torch.zeros_like(first)
+    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
+    return {"is_init": first, **{key: never.clone() for key in done}, "next": TensorDict(done, first.shape[:1])}
