@@ -1,7 +1,8 @@
 from .data.kitti.replay import KITTIOdometryExperienceReplay
 from .data.lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
-from .data.recordings.replay import RecordingReplay
-from .data.recordings.streams import Images, Recording, Table, Video
+from .data.recordings.frames import Images, Video
+from .data.recordings.replay import Recording, RecordingReplay
+from .data.recordings.tables import Table
 from .data.ur5.replay import UR5ExperienceReplay
 from .deployment import PackagedStep, export_step, load_step
 from .envs.kitti import KITTIReplayEnv

@@ -5,13 +5,23 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["check_size", "decode_picture", "float_pictures", "image_store", "scaled", "text_of_size"]
+__all__ = [
+    "JoinedPictures",
+    "check_size",
+    "decode_picture",
+    "float_pictures",
+    "image_store",
+    "scaled",
+    "text_of_size",
+    "unnamed_file",
+]
 
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
@@ -57,15 +67,56 @@ def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.nda
     """
     if folder is None:
         return np.zeros((rows, 3, *size), np.uint8)
+    with unnamed_file(folder) as file:
+        return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+
+
+def unnamed_file(folder: Path) -> IO[bytes]:
+    """A file in ``folder`` that goes when it is let go.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as file:
-            return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+        return tempfile.TemporaryFile(dir=folder)
     except OSError as error:
         raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
 
 
-def float_pictures(pictures: Tensor, index: Tensor) -> dict[str, Tensor]:
+class JoinedPictures:
+    """Pictures of several memory-mapped stores one behind the other, none of them copied.
+
+    Args:
+        stores: uint8 ``[N_k, C, H, W]`` each.
+
+    Examples:
+        >>> joined = JoinedPictures([torch.zeros(2, 1, 1, 1), torch.ones(3, 1, 1, 1)])
+        >>> joined.shape, joined[torch.tensor([4, 0])].flatten()
+        (torch.Size([5, 1, 1, 1]), tensor([1., 0.]))
+    """
+
+    def __init__(self, stores: Sequence[Tensor]):
+        self.stores = list(stores)
+        lengths = torch.tensor([len(store) for store in self.stores], dtype=torch.int64)
+        self._ends = lengths.cumsum(0)
+
+    @property
+    def shape(self) -> torch.Size:
+        """Of all of them together."""
+        return torch.Size([int(self._ends[-1]), *self.stores[0].shape[1:]])
+
+    def __getitem__(self, index: Tensor) -> Tensor:
+        """Pictures by number, int64 ``[m]``."""
+        which = torch.searchsorted(self._ends, index, right=True)
+        out = self.stores[0].new_empty(len(index), *self.stores[0].shape[1:])
+        for number in which.unique().tolist():
+            at, store = which == number, self.stores[number]
+            out[at] = store[index[at] - int(self._ends[number]) + len(store)]
+        return out
+
+
+def float_pictures(pictures: Tensor | JoinedPictures, index: Tensor) -> dict[str, Tensor]:
     """``"pixels"`` of some pictures, float32 in [0, 1]; zeros where the index is negative.
 
     Args:

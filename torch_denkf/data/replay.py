@@ -72,8 +72,13 @@ def check_options(options: Mapping[str, Any]) -> None:
 
 
 def _sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    named = ("sampler", "num_slices", "slice_len", "batch_size")
-    return choose_sampler(*(options.get(name) for name in named), options.get("strict_length", True))
+    return choose_sampler(
+        options.get("sampler"),
+        options.get("num_slices"),
+        options.get("slice_len"),
+        options.get("batch_size"),
+        options.get("strict_length", True),
+    )
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
@@ -106,7 +111,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
     move none. ``"train"`` holds all episodes that are not for tests; with a ``validation_share`` it leaves this share
     of them out, and ``"validation"`` holds them. Pass the same share to both.
 
-    A subclass sets ``root`` and calls the constructor. ``ReplayEnv(data)`` replays any data set as an environment.
+    :class:`~torch_denkf.envs.ReplayEnv` replays any data set as an environment.
 
     Args:
         rows: numbers of the whole data set, ``[N]``, with ``step`` and ``time``; the rows of an episode follow each
@@ -115,6 +120,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         for_tests: whether an episode is for tests.
         pictures: maps numbers of ``rows``, int64 ``[m]``, to what is not stored in them, ``[m, ...]`` each.
         single: bool ``[N]``: only these rows are offered, each on its own (``is_init`` and done in all).
+        root: the folder that was read; None for data that came from elsewhere.
         **options:
             split: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
             validation_share: of the episodes that are not for tests, in [0, 1); none by default.
@@ -135,7 +141,6 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     Attributes:
         episodes: what each ``"episode"`` is: an :class:`~torch_denkf.data.Episode` with its name, first row and length.
-        root: the folder that was read; None for data that came from elsewhere.
         sequential: False where ``single`` rows are offered, which do not follow each other.
 
     Raises:
@@ -147,7 +152,8 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         >>> step = torch.arange(10).repeat(3).unsqueeze(-1)
         >>> rows = TensorDict({"step": step, "time": step * 0.1, "state": torch.rand(30, 2)}, [30])
         >>> episodes = [Episode(name, 10 * k, 10) for k, name in enumerate("abc")]
-        >>> data = EpisodeReplay(rows, episodes, for_tests=lambda episode: episode.name == "b", slice_len=5, num_slices=4)
+        >>> for_tests = lambda episode: episode.name == "b"
+        >>> data = EpisodeReplay(rows, episodes, for_tests=for_tests, num_slices=4, slice_len=5)
         >>> [(episode.name, episode.start) for episode in data.episodes]
         [('a', 0), ('c', 10)]
         >>> data.sample()["state"].shape, data.statistics["state", "mean"].shape
@@ -165,6 +171,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         for_tests: Callable[[Any], bool],
         pictures: Pictures | None = None,
         single: Tensor | None = None,
+        root: Path | None = None,
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
@@ -172,8 +179,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         self.sequential = single is None
         if not self.sequential and isinstance(sampler, SliceSampler):
             raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")
-        if not hasattr(self, "_root"):
-            self.root = None
+        self.root: Path | None = root
         self._all_rows, self._all_episodes = rows, tuple(episodes)
         self._roles = roles_of(self._all_episodes, for_tests, options.get("validation_share", 0.0))
         split = options.get("split", "train")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf.data.pictures import JoinedPictures
+
 __all__ = ["mean_and_std", "picture_statistics"]
 
 
@@ -19,7 +21,7 @@ def mean_and_std(values: Tensor) -> dict[str, Tensor]:
     return {"mean": values.mean(0), "std": values.std(0, correction=0)}
 
 
-def picture_statistics(pictures: Tensor, index: Tensor, chunk: int = 256) -> dict[str, Tensor]:
+def picture_statistics(pictures: Tensor | JoinedPictures, index: Tensor, chunk: int = 256) -> dict[str, Tensor]:
     """Mean and standard deviation of each channel, ``[C, 1, 1]``, of values in [0, 1].
 
     Args:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -28,8 +28,8 @@ class RecordedPolicy(TensorDictModuleBase):
         torch.Size([3, 2])
     """
 
-    in_keys = [_RECORDED]
-    out_keys = ["action"]
+    in_keys: ClassVar[list[NestedKey]] = [_RECORDED]
+    out_keys: ClassVar[list[NestedKey]] = ["action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The same tensordict, with ``"action"``."""
@@ -124,25 +124,23 @@ class ReplayEnv(RowsEnv):
         short = {e.name: e.length for e in chosen if begin + (2 if length is None else length) > e.length}
         if begin < 0 or (length is not None and length < 2) or short:
             raise ValueError(
-                f"replays of length={length} from start={start!r} do not fit in {len(short)} of {len(chosen)} episodes: "
-                f"{dict(list(short.items())[:8])}; they need at least 2 rows and must end within the episode. Pass "
-                "episodes= to choose longer ones"
+                f"replays of length={length} from start={start!r} do not fit in {len(short)} of {len(chosen)} "
+                f"episodes: {dict(list(short.items())[:8])}; they need at least 2 rows and must end within the "
+                "episode. Pass episodes= to choose longer ones"
             )
         where = self.device
         starts = torch.tensor([episode.start for episode in chosen], device=where)
         ends = starts + torch.tensor([episode.length for episode in chosen], device=where) - 1
         self._starts = starts + begin
         self._ends = ends if length is None else self._starts + length - 1
-        if self._random:  # stretches of all episodes one behind the other
-            self._length, self._stretches = length, (ends - starts + 2 - length).cumsum(0)
+        self._stretches = (ends - self._ends + 1).cumsum(0)  # where random starts may be, one episode behind the other
 
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
         if self._random:
             drawn = self._draw(self._stretches[-1].expand(self.batch_size))
             which = torch.searchsorted(self._stretches, drawn, right=True)
-            before = torch.where(which > 0, self._stretches[(which - 1).clamp_min(0)], 0)
-            first = self._starts[which] + drawn - before
-            return first, first + self._length - 1
+            shift = drawn - torch.where(which > 0, self._stretches[which - 1], 0)
+            return self._starts[which] + shift, self._ends[which] + shift
         turn = self._turn + starts.reshape(-1).cumsum(0).reshape(self.batch_size) - 1
         self._turn += int(starts.sum())
         which = turn.clamp_min(0) % len(self._starts)

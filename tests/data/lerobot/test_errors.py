@@ -21,9 +21,9 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_3,
     write_video,
 )
-from torch_denkf.data import LeRobotExperienceReplay
+from torch_denkf.data import LeRobotReplay
 
-open_all = partial(LeRobotExperienceReplay, size=SIZE, cache=None, split="all")
+open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 CAMERA = "observation.images.top"
 
 

@@ -24,10 +24,10 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_3,
 )
 from tests.data.replay_for_tests import counting_bars
-from torch_denkf.data import LeRobotExperienceReplay
+from torch_denkf.data import LeRobotReplay
 
 LENGTHS = [9, 6, 12, 7, 8]
-open_all = partial(LeRobotExperienceReplay, size=SIZE, cache=None, split="all")
+open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 
 
 @pytest.fixture(scope="module")
@@ -178,14 +178,14 @@ def test_slices_are_contiguous_and_in_one_episode(root, options):
 
 
 def test_each_row_once(root):
-    data = LeRobotExperienceReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
+    data = LeRobotReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
     seen = torch.cat([batch["index"].flatten() for batch in data])
     assert sorted(seen.tolist()) == list(range(len(data)))
     assert len(data) < sum(LENGTHS)
 
 
 def test_statistics_by_numpy(root):
-    data = LeRobotExperienceReplay(root, size=SIZE, cache=None)  # the training split
+    data = LeRobotReplay(root, size=SIZE, cache=None)  # the training split
     which = [e.number for e in data.episodes]
     assert len(which) == 4
     parts = {
@@ -230,20 +230,20 @@ def test_it_deletes_and_writes_nothing(root):
 
 
 def test_the_second_open_reads_the_cache(root, tmp_path, monkeypatch):
-    first = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
+    first = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
     assert len(list(tmp_path.iterdir())) == 1  # no temporary file stays
     with monkeypatch.context() as patch:
         patch.setattr(recording_module, "frames_at_times", None)
         patch.setattr(recording_module, "read_table", None)
-        again = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
-        parts = [LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
+        again = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
+        parts = [LeRobotReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
     assert isinstance(again._recording["image"], MemoryMappedTensor)
     assert again._recording["image"].dtype == torch.uint8
     assert "pixels" not in again._storage[:]
     assert (again[:] == first[:]).all()
     check_rows(again, LENGTHS)
     assert sum(len(part) for part in parts) == sum(LENGTHS)
-    LeRobotExperienceReplay(root, size=(24, 32), cache=tmp_path)
+    LeRobotReplay(root, size=(24, 32), cache=tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
 
 

@@ -15,7 +15,7 @@ from tests.data.ur5.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.data.ur5 import cache
 from torch_denkf.data.ur5.files import read_demo
-from torch_denkf.data.ur5.rows import split_of
+from torch_denkf.data.ur5.rows import is_for_tests
 from torch_denkf.simulation.ur5.names import TASKS
 
 open_dataset = partial(UR5ExperienceReplay, cache=None)
@@ -81,7 +81,7 @@ def test_splits_are_by_demo(root, tmp_path):
     assert demos["test"]
     assert not demos["train"] & demos["test"]
     # A fifth of 2,000 is 400; the standard deviation of a binomial draw is 18.
-    tests = [number for number in range(2000) if split_of(number) == "test"]
+    tests = [number for number in range(2000) if is_for_tests(number)]
     assert abs(len(tests) - 400) < 54
     # These must never move: networks were trained on the others.
     assert tests[:6] == [9, 12, 15, 19, 26, 31]

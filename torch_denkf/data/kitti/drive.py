@@ -213,8 +213,8 @@ def _read(
                     native, first_file = shape, files[number]
                 elif shape != native:
                     raise ValueError(
-                        f"{files[number]} is {text_of_size(shape)}, but {first_file} is {text_of_size(native)}; the images of a "
-                        "drive have one size, that of its calibration: scale this one or take it away"
+                        f"{files[number]} is {text_of_size(shape)}, but {first_file} is {text_of_size(native)}; the "
+                        "images of a drive have one size, that of its calibration: scale this one or take it away"
                     )
                 image[number - first], valid[number - first] = pixels, True
         except BaseException:

@@ -103,15 +103,13 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
-        self.root = Path(root).expanduser().resolve()
+        folder = Path(root).expanduser().resolve()
         sources = []
-        for name in find_drives(self.root, drives):
-            for camera in find_cameras(self.root, name, cameras):
-                sources.append((name, _choose_camera(self.root / "sequences" / name, camera)))
+        for name in find_drives(folder, drives):
+            for camera in find_cameras(folder, name, cameras):
+                sources.append((name, _choose_camera(folder / "sequences" / name, camera)))
         cache, progress = options.get("cache", True), options.get("progress", True)
-        self._drives = read_drives(
-            self.root, sources, size=size, colour=colour, cache=cache, flow=flow, progress=progress
-        )
+        self._drives = read_drives(folder, sources, size=size, colour=colour, cache=cache, flow=flow, progress=progress)
         episodes: list[KITTIEpisode] = []
         rows = []
         for (name, camera), drive in zip(sources, self._drives, strict=True):
@@ -125,6 +123,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
             episodes,
             for_tests=lambda episode: hashed_share(episode.split_name, "test") < test_share,
             pictures=_Frames(self._drives, episodes),
+            root=folder,
             **options,
         )
 

@@ -136,7 +136,7 @@ class LeRobotReplay(EpisodeReplay):
                 cache=options.get("cache", True),
                 progress=options.get("progress", True),
             )
-        self.root, self.fps, self.names = recording.source, recording.fps, recording.names
+        self.fps, self.names = recording.fps, recording.names
         self._images = recording.rows["image"]
         numbers, lengths = torch.unique_consecutive(recording.rows["episode"], return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
@@ -148,6 +148,7 @@ class LeRobotReplay(EpisodeReplay):
             ],
             for_tests=lambda episode: is_for_tests(episode.number),
             pictures=partial(float_pictures, self._images),
+            root=recording.source,
             **options,
         )
 

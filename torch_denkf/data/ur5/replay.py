@@ -82,19 +82,20 @@ class UR5ExperienceReplay(EpisodeReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
-        self.root = Path(root).expanduser().resolve()
-        entries = read_entries(self.root)
+        folder = Path(root).expanduser().resolve()
+        entries = read_entries(folder)
         with progress_bar("reading demos", len(entries), unit=" demos", shown=options.get("progress", True)) as bar:
-            demos = read_demos(self.root, entries, size, options.get("cache", True), bar.update)
+            demos = read_demos(folder, entries, size, options.get("cache", True), bar.update)
         self._frames, self._frame = demos.get("frames", None), demos["rows", "frame"].squeeze(-1)
         if frames_only and self._frames is None:
-            raise ValueError(f"the demos in {self.root} have no pictures; collect them without --no-pixels")
+            raise ValueError(f"the demos in {folder} have no pictures; collect them without --no-pixels")
         super().__init__(
             demo_rows(demos["rows"]),
             demo_episodes(demos["rows"], entries),
             for_tests=lambda episode: is_for_tests(episode.demo),
             pictures=None if self._frames is None else partial(_pixels, self._frames["pixels"], self._frame),
             single=self._frame >= 0 if frames_only else None,
+            root=folder,
             **options,
         )
 
