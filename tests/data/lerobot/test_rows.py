@@ -59,7 +59,7 @@ def check(data, stored, images):
     parts = [stored[key].reshape(TOTAL, -1) for key in ACTIONS]
     torch.testing.assert_close(rows["action"], torch.cat(parts, -1), rtol=0, atol=0)
     frames = torch.cat([torch.arange(length) for length in LENGTHS])
-    assert rows["frame"].flatten().equal(frames)
+    assert rows["step"].flatten().equal(frames)
     torch.testing.assert_close(rows["time"].flatten(), frames / 5.0, check_dtype=False)
     assert rows["episode"].equal(stored["episode"].long())
     assert rows["observed"].all()
@@ -80,10 +80,11 @@ def test_open_x_as_torchrl_opens_it(stored, tmp_path, monkeypatch):
     check(data, stored, stored["observation", "image"])
     assert (data.fps, data.names, data.data_path) == (5.0, tuple("abc"), None)
     assert not list((tmp_path / "frames").iterdir())  # the file has no name, so that nothing has to remove it
-    batch = data.sample().reshape(3, 4)
+    batch = data.sample()
+    assert batch.shape == (3, 4)
     assert (batch["episode"] == batch["episode"][:, :1]).all()
-    assert (batch["frame"].diff(dim=1) == 1).all()
-    with pytest.raises(RuntimeError, match="recording in memory is not this data set's"):
+    assert (batch["step"].diff(dim=1) == 1).all()
+    with pytest.raises(RuntimeError, match="recordings in memory were not written"):
         data.delete()
 
 
@@ -102,9 +103,7 @@ def test_channels_behind_sizes_and_floats(stored):
     check(LeRobotReplay(recording, split="all"), stored, channels_first)
     recording = recording_from_rows(stored, pixels_key=hand, size=(6, 8), **OPTIONS)
     scaled = [cv2.resize(frame, (8, 6), interpolation=cv2.INTER_AREA) for frame in stored[hand].numpy()]
-    check(
-        LeRobotReplay(recording, split="all"), stored, torch.from_numpy(np.stack(scaled)).permute(0, 3, 1, 2)
-    )
+    check(LeRobotReplay(recording, split="all"), stored, torch.from_numpy(np.stack(scaled)).permute(0, 3, 1, 2))
     rows = stored.clone()
     rows[hand] = stored[hand].float() / 255
     recording = recording_from_rows(rows, pixels_key=hand, **OPTIONS)
