@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -283,6 +284,18 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             RuntimeError: always.
         """
         raise RuntimeError(f"the recordings {self._source} were not written by this data set; delete them by hand")
+
+    def __getstate__(self) -> dict[str, Any]:
+        # TorchRL shares a storage's counters with processes that it spawns, which fails inside of what it pickles for
+        # workers of environments. Nothing is written here, so that each process may have a storage of its own.
+        writer = copy(self._writer)
+        writer.register_storage(None)
+        return {**super().__getstate__(), "_storage": self._storage.get(slice(None)), "_writer": writer}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        storage = TensorStorage(state["_storage"])
+        state["_writer"].register_storage(storage)
+        super().__setstate__({**state, "_storage": storage})
 
     def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
         """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""

@@ -67,7 +67,9 @@ class Slices(SampleUnit):
         """The same rows, and what the sampler says about each of them, in the shape of slices."""
         first = index[0] if isinstance(index, tuple) else index
         rows = len(first)
-        shape = (self._sampler.num_slices or rows // self._sampler.slice_len, -1)
+        ends = info.get(self._sampler.truncated_key)  # without replacement, the last sample may have fewer slices
+        count = self._sampler.num_slices or rows // self._sampler.slice_len
+        shape = (count if ends is None else int(ends.sum()), -1)
 
         def shaped(value: Any) -> Any:
             # Weights of prioritised samplers may be arrays; what is not a row's stays as it is.
