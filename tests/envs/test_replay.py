@@ -149,7 +149,11 @@ def test_random_stretches_are_uniform_and_follow_the_seed():
 
 @pytest.mark.parametrize(
     ("data", "kind"),
-    [*((name, SerialEnv) for name in SETS), ("own", ParallelEnv), ("kitti", ParallelEnv)],  # processes take 10 s to start
+    [
+        *((name, SerialEnv) for name in SETS),
+        ("own", ParallelEnv),
+        ("kitti", ParallelEnv),
+    ],  # processes take 10 s to start
     indirect=["data"],
 )
 def test_batched_environments(data, kind):
