@@ -146,6 +146,8 @@ def test_options_that_are_wrong():
     fails(TypeError, "no option slice_length; there are .*'slice_len'", slice_length=3)
     fails(ValueError, r"in \[0, 1\), got 1.5", validation_share=1.5)
     fails(ValueError, "pass validation_share=0.1", split="validation")
+    with pytest.raises(ValueError, match="test_share is a share of all episodes"):
+        torch_denkf.data.KITTIOdometryExperienceReplay("nowhere", test_share=1.5)
     fails(
         ValueError,
         "num_slices=2 times slice_len=3 is 6 rows, but batch_size=7",
@@ -162,6 +164,7 @@ def test_options_that_are_wrong():
 
 def test_the_old_name_of_lerobots_replay_warns():
     for package in (torch_denkf, torch_denkf.data):
+        vars(package).pop("LeRobotExperienceReplay", None)  # once in a process is enough
         with pytest.warns(DeprecationWarning, match="now called LeRobotReplay"):
             assert package.LeRobotExperienceReplay is LeRobotReplay
     with warnings.catch_warnings():

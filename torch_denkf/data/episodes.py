@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-__all__ = ["Episode", "Split", "episode_flags", "hashed_share", "roles_of"]
+__all__ = ["Episode", "Split", "episode_flags", "hashed_share", "hashed_tests", "roles_of"]
 
 Split = Literal["train", "validation", "test", "all"]
 
@@ -50,6 +50,17 @@ def hashed_share(name: str, purpose: str) -> float:
     """
     digest = hashlib.sha256(f"torch_denkf {purpose} {name}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
+
+
+def hashed_tests(share: float) -> Callable[[Episode], bool]:
+    """Whether an episode is among the share of all that is for tests, by :func:`hashed_share`.
+
+    Raises:
+        ValueError: if the share is out of range.
+    """
+    if not 0 <= share < 1:
+        raise ValueError(f"test_share is a share of all episodes, in [0, 1), got {share}")
+    return lambda episode: hashed_share(episode.split_name, "test") < share
 
 
 def roles_of(

@@ -12,16 +12,7 @@ from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.data.kitti.drive as kitti_module
-from tests.data.replay_for_tests import (
-    check_contract,
-    check_indices,
-    check_nothing_is_deleted,
-    check_preprocess,
-    check_slices,
-    check_statistics,
-    counting_bars,
-    ways_to_slice,
-)
+from tests.data import replay_for_tests as shared
 from torch_denkf.data import (
     KITTIOdometryExperienceReplay,
     drive_frames,
@@ -84,14 +75,14 @@ def test_all_rows(root):
         if episode.mirrored:
             calibration[:, 2] = 35 - calibration[:, 2]
         assert (mine["calibration"] == calibration).all()
-    check_contract(data)
-    check_indices(data)
+    shared.check_contract(data)
+    shared.check_indices(data)
 
 
-@pytest.mark.parametrize("options", ways_to_slice())
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_episode(root, options):
     # 18 + 8 + 36 windows fit in the drives and as many in their mirror images.
-    check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
+    shared.check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
 
 
 def test_single_rows(root):
@@ -129,7 +120,7 @@ def test_statistics_by_hand(root):
     for name, function in (("mean", np.mean), ("std", np.std)):
         expected = np.concatenate([function(part, axis=(0, 1, 2)) for part in both])
         np.testing.assert_allclose(statistics["pixels", name].flatten(), expected, atol=2e-6)
-    check_statistics(statistics, velocity=states[:, 3:], state=states)
+    shared.check_statistics(statistics, velocity=states[:, 3:], state=states)
     assert statistics["pixels", "mean"].shape == (6, 1, 1)
     others = open_dataset(root).statistics
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
@@ -207,7 +198,7 @@ def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypa
 
 
 def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
-    bars = counting_bars(monkeypatch)
+    bars = shared.counting_bars(monkeypatch)
     open_dataset(root, "hill", cache=tmp_path)
     assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
     open_dataset(root, "hill", cache=tmp_path)  # from the cache: no bar
@@ -224,10 +215,10 @@ def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
 
 def test_it_deletes_nothing_of_the_users(root):
     data = open_dataset(root, "lane")
-    check_nothing_is_deleted(data)
+    shared.check_nothing_is_deleted(data)
     assert data.root == root
     assert (root / "sequences/lane/image_2/000000.png").is_file()
 
 
 def test_preprocess_sees_pixels(root, tmp_path):
-    check_preprocess(open_dataset(root, "lane", mirrored=True), tmp_path)
+    shared.check_preprocess(open_dataset(root, "lane", mirrored=True), tmp_path)

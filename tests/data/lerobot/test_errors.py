@@ -41,20 +41,28 @@ def edit_table(file, **columns):
 
 
 def test_folders_that_lack_something(tmp_path):
+    info, episodes = tmp_path / "meta/info.json", tmp_path / "meta/episodes.jsonl"
     fails(FileNotFoundError, r"no .*meta/info.json; pass the folder of a LeRobot data set", tmp_path)
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta/info.json").write_text('{"fps": 10')
-    fails(ValueError, r"meta/info.json is malformed", tmp_path)
-    (tmp_path / "meta/info.json").write_text('{"fps": 10, "codebase_version": "v2.1"}')
-    fails(ValueError, r"meta/info.json is malformed \(KeyError: 'features'\)", tmp_path)
+    info.parent.mkdir()
+    for text, match in (
+        ('{"fps": 10', r"meta/info.json is malformed"),
+        ('{"fps": 10, "codebase_version": "v2.1"}', r"meta/info.json is malformed \(KeyError: 'features'\)"),
+    ):
+        info.write_text(text)
+        fails(ValueError, match, tmp_path)
     write_info(tmp_path, "v2.1", True)
     fails(FileNotFoundError, r"no .*meta/episodes.jsonl, which lists the episodes", tmp_path)
-    (tmp_path / "meta/episodes.jsonl").write_text("\n")
-    fails(ValueError, r"has no episodes; download", tmp_path)
-    (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0}\n')
-    fails(ValueError, r"episodes.jsonl has a malformed line '\{\"episode_index\": 0\}'", tmp_path)
-    (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 3, "length": 4}\n')
-    fails(FileNotFoundError, r"no .*data/chunk-001/episode_000003.parquet, which the data set's metadata", tmp_path)
+    for text, error, match in (
+        ("\n", ValueError, r"has no episodes; download"),
+        ('{"episode_index": 0}\n', ValueError, r"episodes.jsonl has a malformed line '\{\"episode_index\": 0\}'"),
+        (
+            '{"episode_index": 3, "length": 4}\n',
+            FileNotFoundError,
+            r"no .*data/chunk-001/episode_000003.parquet, which the data set's metadata",
+        ),
+    ):
+        episodes.write_text(text)
+        fails(error, match, tmp_path)
     write_info(tmp_path, "v3.0", True)
     fails(FileNotFoundError, r"no .*meta/episodes/\*/\*.parquet", tmp_path)
     for version in ("v1.6", "v4.0"):

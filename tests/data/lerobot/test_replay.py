@@ -13,6 +13,7 @@ from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
 import torch_denkf.data.lerobot.recording as recording_module
+from tests.data import replay_for_tests as shared
 from tests.data.lerobot.lerobot_folder import (
     NAMES,
     SIZE,
@@ -23,19 +24,10 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_2,
     write_version_3,
 )
-from tests.data.replay_for_tests import (
-    check_contract,
-    check_indices,
-    check_nothing_is_deleted,
-    check_preprocess,
-    check_slices,
-    check_statistics,
-    counting_bars,
-    ways_to_slice,
-)
 from torch_denkf.data import LeRobotReplay
 
 LENGTHS = [9, 6, 12, 7, 8]
+TESTS = {4, 8, 11, 19, 24}  # of 25 episodes
 open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 
 
@@ -64,7 +56,7 @@ def check_rows(data, lengths, tolerance=0.0):
         assert (mine["action"].numpy() == actions(episode.number, length)).all()
         np.testing.assert_allclose(mine["time"].flatten(), np.arange(length) / 10, atol=1e-7)  # float32 in the file
         assert mine["observed"].all()
-    check_contract(data)
+    shared.check_contract(data)
 
 
 # What is read ---------------------------------------------------------------------------------------------------------
@@ -76,7 +68,7 @@ def test_version_2_with_lossless_video(root):
     check_rows(data, LENGTHS)
     assert data.fps == 10
     assert data.names == tuple(NAMES)
-    check_indices(data)
+    shared.check_indices(data)
 
 
 # Neighbouring frames differ by 14/255 in red. Lossy codecs keep flat colours and soft ramps to within 6/255 (measured:
@@ -138,6 +130,7 @@ def test_splits_are_by_episode_and_stay(tmp_path):
     assert len(sets["test"]) == 5
     assert not sets["train"] & sets["test"]
     assert sets["train"] | sets["test"] == sets["all"] == set(range(25))
+    assert sets["test"] == TESTS  # these must never move: networks were trained on the others
     assert len({number % 5 for number in sets["test"]}) > 1  # not each fifth: recordings often go round objects
     test = open_all(tmp_path, split="test")
     for episode in test.episodes:
@@ -153,9 +146,9 @@ def test_splits_are_by_episode_and_stay(tmp_path):
         open_all(tmp_path, split="test")
 
 
-@pytest.mark.parametrize("options", ways_to_slice())
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_episode(root, options):
-    check_slices(
+    shared.check_slices(
         open_all(root, **{"batch_size": 24, **options}), options, "step", ("pixels", "state", "action", "time")
     )
 
@@ -171,7 +164,7 @@ def test_statistics_by_numpy(root):
     data = LeRobotReplay(root, size=SIZE, cache=None)  # the training split
     which = [e.number for e in data.episodes]
     assert len(which) == 4
-    check_statistics(
+    shared.check_statistics(
         data.statistics,
         state=np.concatenate([joints(e, LENGTHS[e]) for e in which]),
         action=np.concatenate([actions(e, LENGTHS[e]) for e in which]),
@@ -188,12 +181,12 @@ def test_transforms_and_preprocess_see_the_pixels(root, tmp_path):
     data = open_all(root, transform=lambda rows: rows.set("half", rows["pixels"] / 2), batch_size=4)
     sample = data.sample()
     assert sample["half"].equal(sample["pixels"] / 2)
-    check_preprocess(open_all(root), tmp_path)
+    shared.check_preprocess(open_all(root), tmp_path)
 
 
 def test_it_deletes_and_writes_nothing(root):
     data = open_all(root)
-    check_nothing_is_deleted(data)
+    shared.check_nothing_is_deleted(data)
     assert data.root == root.resolve()
 
 
@@ -229,7 +222,7 @@ def test_changed_files_are_read_anew(tmp_path):
 
 
 def test_a_bar_counts_frames(root, tmp_path, monkeypatch):
-    bars = counting_bars(monkeypatch)
+    bars = shared.counting_bars(monkeypatch)
     open_all(root, cache=tmp_path)
     open_all(root, cache=tmp_path)  # from the cache: no bar
     open_all(root, progress=False)

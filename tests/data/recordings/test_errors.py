@@ -83,7 +83,7 @@ def test_videos(tmp_path):
 def test_images(tmp_path):
     fails(FileNotFoundError, r"no folder .*run; check", camera=Images(tmp_path / "run"))
     write_images(tmp_path / "run", ["a.png", "b.png"])
-    fails(ValueError, r"nothing says when the images in .*run were taken: .*'a'.*pass times= or rate=",
+    fails(ValueError, r"nothing says when the images in .*run were taken: .*'a.png'.*pass times= or rate=",
           camera=Images(tmp_path / "run"))  # fmt: skip
     fails(ValueError, r"rate is .* positive, got 0", camera=Images(tmp_path / "run", rate=0.0))
     cv2.imwrite(str(tmp_path / "run/c.png"), np.zeros((5, 7, 3), np.uint8))

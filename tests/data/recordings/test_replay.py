@@ -12,8 +12,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import torch_denkf.data.recordings.frames as frames_module
+from tests.data import replay_for_tests as shared
 from tests.data.recordings.own_files import SIZE, pixels, write_csv, write_images, write_video
-from tests.data.replay_for_tests import check_contract, check_indices, check_preprocess, check_slices, check_statistics
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.envs import ReplayEnv
@@ -50,8 +50,8 @@ def streams(folder, **options):
 
 def test_a_video_at_10_hz_and_a_table_at_100_hz(run):
     data = open_runs(Recording(**streams(run)))
-    check_contract(data)
-    check_indices(data)
+    shared.check_contract(data)
+    shared.check_indices(data)
     rows = data[:]
     # From frame 2, at 0.2 s, the first after the table's begin at 0.155 s; to 1.7 s, before its end at 1.745 s.
     time = np.arange(2, 18) / 10
@@ -143,6 +143,14 @@ def test_images_and_parquet(tmp_path):
         assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(12)])).all()
 
 
+def test_images_are_in_the_order_of_their_numbers(tmp_path):
+    names = ["9.5", "9.75", "10", "10.125"]
+    write_images(tmp_path / "run", [f"{name}.png" for name in names])
+    data = open_runs(Recording(eye=Images(tmp_path / "run")))
+    assert data[:]["time"].flatten().tolist() == [0, 0.25, 0.5, 0.625]
+    assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
+
+
 def test_a_damaged_image_blinds_its_row_alone(tmp_path):
     write_images(tmp_path / "run", [f"{k}.png" for k in range(5)])
     (tmp_path / "run/2.png").write_bytes((tmp_path / "run/2.png").read_bytes()[:60])
@@ -172,10 +180,10 @@ def runs(tmp_path_factory):
 
 def test_recordings_are_episodes(runs, tmp_path):
     data = open_runs(runs, batch_size=24, slice_len=6)
-    check_contract(data)
+    shared.check_contract(data)
     assert [(e.name, e.length) for e in data.episodes] == [("run0", 9), ("run1", 14), ("run2", 11), ("run3", 12)]
-    check_slices(data, {}, "step", ("pixels", "state", "observed"))
-    check_preprocess(open_runs(runs), tmp_path)
+    shared.check_slices(data, {}, "step", ("pixels", "state", "observed"))
+    shared.check_preprocess(open_runs(runs), tmp_path)
     share = sum(sorted(hashed_share(e.name, "test") for e in data.episodes)[1:3]) / 2  # two of the four
     test = open_runs(runs, test_share=share, split="test")
     train = open_runs(runs, test_share=share)
@@ -184,7 +192,7 @@ def test_recordings_are_episodes(runs, tmp_path):
     which = [int(e.name[3:]) for e in train.episodes]
     lengths = {e.name: e.length for e in data.episodes}
     steps = [(k, np.arange(lengths[f"run{k}"])) for k in which]
-    check_statistics(
+    shared.check_statistics(
         test.statistics,
         state=np.concatenate([np.stack([k + step / 100, np.ones(len(step))], -1) for k, step in steps]),
         pixels=np.concatenate([np.stack([pixels(n)[:, 0, 0] for n in step]) for _, step in steps]),

@@ -10,15 +10,7 @@ from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
-from tests.data.replay_for_tests import (
-    check_contract,
-    check_indices,
-    check_nothing_is_deleted,
-    check_preprocess,
-    check_slices,
-    check_statistics,
-    ways_to_slice,
-)
+from tests.data import replay_for_tests as shared
 from tests.data.ur5.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.data.ur5 import cache
@@ -55,8 +47,8 @@ def test_all_rows(root):
         pixels = np.zeros((episode.length, 3, *SIZE), np.float32)
         pixels[demo.steps] = demo.pixels.astype(np.float32) / 255
         assert (mine["pixels"].numpy() == pixels).all()
-    check_contract(data)
-    check_indices(data)
+    shared.check_contract(data)
+    shared.check_indices(data)
 
 
 def test_frames_only(root):
@@ -91,10 +83,10 @@ def test_splits_are_by_demo(root, tmp_path):
     assert {e.demo for e in open_dataset(fewer, split="test").episodes} == set(tests[:3])
 
 
-@pytest.mark.parametrize("options", ways_to_slice())
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_demo(root, options):
     data = open_dataset(root, split="all", **{"batch_size": 24, **options})
-    check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
+    shared.check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
 
 
 def test_statistics_are_of_the_training_demos_alone(root):
@@ -104,7 +96,7 @@ def test_statistics_are_of_the_training_demos_alone(root):
     pixels = np.concatenate([demo.pixels for demo in demos]).transpose(0, 2, 3, 1).reshape(-1, 3) / 255
     for split, frames_only in [("train", False), ("test", False), ("all", True)]:
         statistics = open_dataset(root, split=split, frames_only=frames_only).statistics
-        check_statistics(statistics, state=state, action=action, pixels=pixels)
+        shared.check_statistics(statistics, state=state, action=action, pixels=pixels)
     shape = tuple(statistics["pixels", "std"].shape)
     assert shape == (3, 1, 1)
 
@@ -171,8 +163,8 @@ def test_transforms_and_preprocess(root, tmp_path):
     scale = ObservationNorm(loc=-1.0, scale=2.0, in_keys=["pixels"])
     plain, scaled = open_dataset(root, split="all"), open_dataset(root, split="all", transform=scale)
     torch.testing.assert_close(scaled[:9]["pixels"], 2 * plain[:9]["pixels"] - 1)
-    check_preprocess(plain, tmp_path / "means")
-    check_nothing_is_deleted(plain)
+    shared.check_preprocess(plain, tmp_path / "means")
+    shared.check_nothing_is_deleted(plain)
 
 
 def test_demos_without_pictures(tmp_path):

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.data.episodes import hashed_share
+from torch_denkf.data.episodes import hashed_tests
 from torch_denkf.data.kitti.drive import _choose_camera
 from torch_denkf.data.kitti.episodes import KITTIEpisode, find_cameras, find_drives, read_drives
 from torch_denkf.data.kitti.frames import MOTION_KEYS, frames_at
@@ -103,6 +103,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
+        for_tests = hashed_tests(test_share)
         folder = Path(root).expanduser().resolve()
         sources = []
         for name in find_drives(folder, drives):
@@ -121,7 +122,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         super().__init__(
             torch.cat(rows),
             episodes,
-            for_tests=lambda episode: hashed_share(episode.split_name, "test") < test_share,
+            for_tests=for_tests,
             pictures=_Frames(self._drives, episodes),
             root=folder,
             **options,

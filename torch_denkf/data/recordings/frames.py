@@ -180,8 +180,7 @@ class Images(Frames):
         files = [file for file in source.iterdir() if file.suffix.lower() in _SUFFIXES]
         if not files:
             raise ValueError(f"no images in {source}; expected names that end in {', '.join(_SUFFIXES)}")
-        numbers = [re.findall(r"\d+", file.stem) for file in files]  # img_9 comes before img_10
-        return [file for _, file in sorted(zip(numbers, files, strict=True), key=_in_order)]
+        return sorted(files, key=_in_order)
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
         for file in files:
@@ -193,19 +192,28 @@ class Images(Frames):
             if not self.rate > 0:
                 raise ValueError(f"rate is the number of pictures a second and must be positive, got {self.rate}")
             return place / self.rate
-        names = [file.stem for file in self._files(source)]
-        try:
-            times = np.array([float(name) for name in names])
-        except ValueError as error:
+        times = [_number(file) for file in self._files(source)]
+        if None in times:
+            name = self._files(source)[times.index(None)].name
             raise ValueError(
-                f"nothing says when the images in {source} were taken: their names, such as {names[0]!r}, are no "
-                "times; pass times= or rate="
-            ) from error
-        return times[place] * SECONDS[self.unit]
+                f"nothing says when the images in {source} were taken: their names, such as {name!r}, are no times; "
+                "pass times= or rate="
+            )
+        return np.array(times)[place] * SECONDS[self.unit]
 
 
-def _in_order(numbered: tuple[list[str], Path]) -> tuple[list[int], str]:
-    return [int(number) for number in numbered[0]], numbered[1].name
+def _number(file: Path) -> float | None:
+    """The number that a file is called."""
+    try:
+        return float(file.stem)
+    except ValueError:
+        return None
+
+
+def _in_order(file: Path) -> tuple[list[float], str]:
+    """By number, or by the numbers in the name: img_9 comes before img_10."""
+    number = _number(file)
+    return [float(part) for part in re.findall(r"\d+", file.stem)] if number is None else [number], file.name
 
 
 class _Store:

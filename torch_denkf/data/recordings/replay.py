@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data.episodes import Episode, hashed_share
+from torch_denkf.data.episodes import Episode, hashed_tests
 from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
 from torch_denkf.data.recordings.clock import interpolate, last_reading, nearest_reading, row_times
 from torch_denkf.data.recordings.frames import Frames
@@ -158,6 +158,7 @@ class RecordingReplay(EpisodeReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
+        for_tests = hashed_tests(test_share)
         recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
         size = check_size(size)
         clock = _check(recordings, clock)
@@ -185,7 +186,7 @@ class RecordingReplay(EpisodeReplay):
         super().__init__(
             together,
             episodes,
-            for_tests=lambda episode: hashed_share(episode.split_name, "test") < test_share,
+            for_tests=for_tests,
             pictures=None if self._picture is None else partial(_pixels, self._pictures, self._picture),
             **options,
         )
