@@ -181,7 +181,11 @@ def test_transforms_of_the_data_set_are_seen():
     data = make(transform=doubled)
     env = ReplayEnv(data, batch_size=[3])
     check_env_specs(env)
-    now = env.reset()
+    assert env.device is None
+    on_device = ReplayEnv(data, batch_size=[3], device="cpu")
+    check_env_specs(on_device)
+    now = on_device.reset()
+    assert now.device == now["double"].device == torch.device("cpu")
     assert now["double"].equal(2 * now["state"])
     assert now["deep", "wheel"].equal(-now["wheel"])
 

@@ -8,10 +8,11 @@ from .kitti.render import random_drive, render_drives, roadside_scene, write_dri
 from .kitti.replay import KITTIOdometryExperienceReplay
 from .lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
 from .lerobot.rows import recording_from_rows
+from .options import ReplayOptions
 from .recordings.frames import Images, Video
 from .recordings.replay import Recording, RecordingReplay
 from .recordings.tables import Table
-from .replay import EpisodeReplay, ReplayOptions
+from .replay import EpisodeReplay
 from .systems import lorenz96_step, lorenz96_tendency
 from .ur5.replay import UR5ExperienceReplay
 

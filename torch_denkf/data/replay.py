@@ -7,79 +7,24 @@ from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypedDict, Unpack, cast
+from typing import Any, Unpack, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
-from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
-from torch_denkf.data.episodes import Episode, Split, episode_flags, roles_of
-from torch_denkf.data.slices import choose_sampler, refuse_short_episodes, slices_of
+from torch_denkf.data.episodes import Episode, episode_flags, roles_of
+from torch_denkf.data.options import ReplayOptions, check_options, sampler_of
+from torch_denkf.data.slices import refuse_short_episodes, slices_of
 from torch_denkf.data.statistics import mean_and_std
 
-__all__ = ["EpisodeReplay", "ReplayOptions", "check_options"]
+__all__ = ["EpisodeReplay"]
 
 Pictures = Callable[[Tensor], Mapping[str, Tensor]]
 _ROW = "_row"  # where a row is in the whole data set, for its picture
-
-
-class ReplayOptions(TypedDict, total=False):
-    """What every data set's constructor takes beside its source; see :class:`EpisodeReplay`."""
-
-    split: Split
-    validation_share: float
-    batch_size: int | None
-    num_slices: int | None
-    slice_len: int | None
-    strict_length: bool
-    sampler: Sampler | None
-    writer: Writer | None
-    collate_fn: Callable | None
-    pin_memory: bool
-    prefetch: int | None
-    transform: Transform | Callable | None
-    cache: str | Path | bool | None
-    progress: bool
-
-
-def check_options(options: Mapping[str, Any]) -> None:
-    """Refuses options that are wrong whatever the data are: reading these may take long.
-
-    Raises:
-        TypeError: for an option that there is not.
-        ValueError: for a split that there is not, a share out of range, and options that contradict each other.
-    """
-    unknown = sorted(set(options) - set(ReplayOptions.__annotations__))
-    if unknown:
-        raise TypeError(
-            f"data sets have no option {', '.join(unknown)}; there are {list(ReplayOptions.__annotations__)}"
-        )
-    split, share = options.get("split", "train"), options.get("validation_share", 0.0)
-    if split not in ("train", "validation", "test", "all"):
-        raise ValueError(f"split is 'train', 'validation', 'test' or 'all', got {split!r}")
-    if not 0 <= share < 1:
-        raise ValueError(f"validation_share is a share of the training episodes, in [0, 1), got {share}")
-    if split == "validation" and not share:
-        raise ValueError(
-            "split='validation' is empty without a validation_share; pass validation_share=0.1, and the same to the "
-            "data set with split='train', which then leaves these episodes out"
-        )
-    _sampler(options)
-
-
-def _sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    return choose_sampler(
-        options.get("sampler"),
-        options.get("num_slices"),
-        options.get("slice_len"),
-        options.get("batch_size"),
-        options.get("strict_length", True),
-    )
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
@@ -176,7 +121,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
-        sampler, batch_size = _sampler(options)
+        sampler, batch_size = sampler_of(options)
         self.sequential = single is None
         if not self.sequential and isinstance(sampler, SliceSampler):
             raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")

@@ -16,7 +16,8 @@ from torch_denkf.data.kitti.episodes import KITTIEpisode, find_cameras, find_dri
 from torch_denkf.data.kitti.frames import MOTION_KEYS, frames_at
 from torch_denkf.data.kitti.gaps import steps_at
 from torch_denkf.data.kitti.mirror import mirror_drive
-from torch_denkf.data.replay import EpisodeReplay, ReplayOptions, check_options
+from torch_denkf.data.options import ReplayOptions, check_options
+from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import mean_and_std
 
 __all__ = ["KITTIOdometryExperienceReplay"]

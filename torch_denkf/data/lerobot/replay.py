@@ -14,8 +14,9 @@ from torch import Tensor
 
 from torch_denkf.data.episodes import Episode
 from torch_denkf.data.lerobot.recording import DecodedRecording, read_recording
+from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import check_size, float_pictures
-from torch_denkf.data.replay import EpisodeReplay, ReplayOptions, check_options
+from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
 
 __all__ = ["LeRobotReplay"]

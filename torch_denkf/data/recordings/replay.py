@@ -14,11 +14,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.data.episodes import Episode, hashed_tests
+from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
 from torch_denkf.data.recordings.clock import interpolate, last_reading, nearest_reading, row_times
 from torch_denkf.data.recordings.frames import Frames
 from torch_denkf.data.recordings.tables import Readings, Table
-from torch_denkf.data.replay import EpisodeReplay, ReplayOptions, check_options
+from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
 
 __all__ = ["Recording", "RecordingReplay"]

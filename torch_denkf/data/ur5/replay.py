@@ -9,8 +9,9 @@ from typing import Unpack
 from torch import Tensor
 
 from torch_denkf._progress import progress_bar
+from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import float_pictures
-from torch_denkf.data.replay import EpisodeReplay, ReplayOptions, check_options
+from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.ur5.cache import read_demos, read_entries
 from torch_denkf.data.ur5.rows import UR5Episode, demo_episodes, demo_rows, is_for_tests
 
