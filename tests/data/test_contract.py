@@ -162,6 +162,26 @@ def test_options_that_are_wrong():
         LeRobotReplay("nowhere", shuffle=True)
 
 
+def test_episodes_that_do_not_fit_their_rows():
+    step = torch.arange(6).unsqueeze(-1)
+    rows = TensorDict({"step": step, "time": step.double()}, [6])
+
+    def fails(error, match, rows, *episodes):
+        with pytest.raises(error, match=match):
+            EpisodeReplay(rows, episodes, for_tests=lambda episode: False)
+
+    fails(KeyError, r"these lack \['time'\]", rows.exclude("time"), Episode("a", 0, 6))
+    fails(ValueError, "the episodes have 5 rows, but there are 6", rows, Episode("a", 0, 5))
+    fails(
+        ValueError,
+        r"Episode\(name='b', start=4, length=2\) comes at row 3",
+        rows,
+        Episode("a", 0, 3),
+        Episode("b", 4, 2),
+    )
+    fails(ValueError, "each of at least a row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
+
+
 def test_the_old_name_of_lerobots_replay_warns():
     for package in (torch_denkf, torch_denkf.data):
         vars(package).pop("LeRobotExperienceReplay", None)  # once in a process is enough

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["Episode", "Split", "episode_flags", "hashed_share", "hashed_tests", "roles_of"]
+__all__ = [
+    "ROW",
+    "Episode",
+    "Split",
+    "check_rows",
+    "episode_flags",
+    "hashed_share",
+    "hashed_tests",
+    "roles_of",
+    "rows_of",
+    "select_episodes",
+]
 
+ROW = "_row"  # entry of what is stored: where the row is in the whole data set, for its picture
 Split = Literal["train", "validation", "test", "all"]
 
 
@@ -96,3 +108,52 @@ def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
     never = torch.zeros_like(first)
     done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
     return {"is_init": first, **{key: never.clone() for key in done}, "next": TensorDict(done, first.shape[:1])}
+
+
+def check_rows(rows: TensorDictBase, episodes: Sequence[Episode]) -> None:
+    """Refuses rows that are no data set's.
+
+    Raises:
+        KeyError: if they lack ``step`` or ``time``.
+        ValueError: if the episodes are not those of the rows.
+    """
+    missing = sorted({"step", "time"} - set(rows.keys()))
+    if missing:
+        raise KeyError(f"the rows of a data set have 'step' and 'time' [n, 1]; these lack {missing}")
+    end = 0
+    for episode in episodes:
+        if episode.start != end or episode.length < 1:
+            raise ValueError(f"episodes lie one behind the other, each of at least a row; {episode} comes at row {end}")
+        end += episode.length
+    if end != len(rows):
+        raise ValueError(f"the episodes have {end} rows, but there are {len(rows)}")
+
+
+def rows_of(episodes: Sequence[Episode]) -> Tensor:
+    """Numbers of all rows of some episodes, ``[n]``."""
+    return torch.cat([torch.arange(episode.start, episode.start + episode.length) for episode in episodes])
+
+
+def select_episodes(
+    rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
+) -> tuple[TensorDict, tuple[Episode, ...]]:
+    """Rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
+
+    Args:
+        rows: of the whole data set, ``[N]``.
+        chosen: some of its episodes.
+        single: bool ``[N]``: take only these rows, each on its own.
+    """
+    index = rows_of(chosen)
+    number = torch.arange(len(chosen)).repeat_interleave(torch.tensor([episode.length for episode in chosen]))
+    first = torch.cat([torch.arange(episode.length) for episode in chosen]).unsqueeze(-1) == 0
+    last = first.roll(-1, 0)
+    if single is not None:
+        keep = single[index]
+        index, number = index[keep], number[keep]
+        first = last = torch.ones(len(index), 1, dtype=torch.bool)
+    stored = cast(TensorDict, rows[index])
+    stored.update({"episode": number, ROW: index.unsqueeze(-1), **episode_flags(first, last)})
+    lengths = torch.bincount(number, minlength=len(chosen))
+    places = zip(chosen, (lengths.cumsum(0) - lengths).tolist(), lengths.tolist(), strict=True)
+    return stored, tuple(replace(episode, start=start, length=length) for episode, start, length in places)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Any, Unpack
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +15,7 @@ from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import Transform
 
-from torch_denkf.data.episodes import Episode, episode_flags, roles_of
+from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
 from torch_denkf.data.options import ReplayOptions, check_options, sampler_of
 from torch_denkf.data.slices import refuse_short_episodes, slices_of
 from torch_denkf.data.statistics import mean_and_std
@@ -24,7 +23,6 @@ from torch_denkf.data.statistics import mean_and_std
 __all__ = ["EpisodeReplay"]
 
 Pictures = Callable[[Tensor], Mapping[str, Tensor]]
-_ROW = "_row"  # where a row is in the whole data set, for its picture
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
@@ -52,6 +50,9 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
     **Samples.** With slices of equal length, ``sample()`` is ``[B, T]``: B slices of T rows, as filters and losses take
     them. Single rows are ``[n]``. With ``strict_length=False``, where slices may differ in length, they come one behind
     the other in a flat ``[n]``, and ``is_init`` marks where each begins. ``data[index]`` has the index's shape.
+
+    A stage of :class:`~torch_denkf.training.FilterTrainer` takes ``sample=lambda generator, length: data.sample()``:
+    the trainer seeds what the sampler draws. Leave ``prefetch`` out where a training is to be resumed exactly.
 
     **Splits** are by episode. A hash of its number or name decides what an episode is for, so that those added later
     move none. ``"train"`` holds all episodes that are not for tests; with a ``validation_share`` it leaves this share
@@ -91,8 +92,9 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     Raises:
         TypeError: for an option that there is not.
-        ValueError: for options out of range or that contradict each other, a split without episodes, and episodes that
-            are shorter than the sampler's slices.
+        KeyError: for rows without ``step`` or ``time``.
+        ValueError: for options out of range or that contradict each other, episodes that do not fit the rows, a split
+            without episodes, and episodes that are shorter than the sampler's slices.
 
     Examples:
         >>> step = torch.arange(10).repeat(3).unsqueeze(-1)
@@ -126,6 +128,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         if not self.sequential and isinstance(sampler, SliceSampler):
             raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")
         self.root: Path | None = root
+        check_rows(rows, episodes)
         self._all_rows, self._all_episodes = rows, tuple(episodes)
         self._roles = roles_of(self._all_episodes, for_tests, options.get("validation_share", 0.0))
         split = options.get("split", "train")
@@ -135,7 +138,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
                 f"none of the {len(self._all_episodes)} episodes {self._source} is in the split {split!r}, as a hash "
                 "of their names has it; pass split='all', or add episodes"
             )
-        stored, self.episodes = _select(rows, chosen, single)
+        stored, self.episodes = select_episodes(rows, chosen, single)
         refuse_short_episodes(self.episodes, sampler, batch_size)
         self._add_pictures = _AddPictures(pictures)
         writer, transform = options.get("writer"), options.get("transform")
@@ -163,7 +166,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         training = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if role == "train"]
         if not training:
             raise ValueError(f"none of the episodes {self._source} is in the training split; add episodes")
-        return _rows_of(training)
+        return rows_of(training)
 
     @cached_property
     def statistics(self) -> TensorDict:
@@ -251,29 +254,6 @@ def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBas
     return fn(first(rows))
 
 
-def _rows_of(episodes: Sequence[Episode]) -> Tensor:
-    return torch.cat([torch.arange(episode.start, episode.start + episode.length) for episode in episodes])
-
-
-def _select(
-    rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
-) -> tuple[TensorDict, tuple[Episode, ...]]:
-    """Rows of the chosen episodes with their flags and numbers, and these episodes with their new places."""
-    index = _rows_of(chosen)
-    number = torch.arange(len(chosen)).repeat_interleave(torch.tensor([episode.length for episode in chosen]))
-    first = torch.cat([torch.arange(episode.length) for episode in chosen]).unsqueeze(-1) == 0
-    last = first.roll(-1, 0)
-    if single is not None:
-        keep = single[index]
-        index, number = index[keep], number[keep]
-        first = last = torch.ones(len(index), 1, dtype=torch.bool)
-    stored = cast(TensorDict, rows[index])
-    stored.update({"episode": number, _ROW: index.unsqueeze(-1), **episode_flags(first, last)})
-    lengths = torch.bincount(number, minlength=len(chosen))
-    places = zip(chosen, (lengths.cumsum(0) - lengths).tolist(), lengths.tolist(), strict=True)
-    return stored, tuple(replace(episode, start=start, length=length) for episode, start, length in places)
-
-
 class _AddPictures(Transform):
     """Adds to rows of the buffer what is not stored in them.
 
@@ -288,7 +268,7 @@ class _AddPictures(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The same rows, with pictures."""
         tensordict = tensordict.copy()  # data[:] hands out the storage itself
-        row = tensordict.pop(_ROW)
+        row = tensordict.pop(ROW)
         if self.pictures is not None:
             for key, value in self.pictures(row.reshape(-1)).items():
                 tensordict.set(key, value.reshape(*tensordict.batch_size, *value.shape[1:]))
