@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Unpack
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
@@ -97,6 +96,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             without episodes, and episodes that are shorter than the sampler's slices.
 
     Examples:
+        >>> import torch
         >>> step = torch.arange(10).repeat(3).unsqueeze(-1)
         >>> rows = TensorDict({"step": step, "time": step * 0.1, "state": torch.rand(30, 2)}, [30])
         >>> episodes = [Episode(name, 10 * k, 10) for k, name in enumerate("abc")]
