@@ -133,6 +133,9 @@ def test_cameras_and_mirror_images_of_a_drive_stay_together(tmp_path):
     everything = kitti(tmp_path, **options)
     assert len(everything.episodes) == 6
     assert (everything.statistics["velocity"] != test.statistics["velocity"]).any()
+    named = kitti(tmp_path, sorted({e.drive for e in train.episodes}), **options)
+    torch.testing.assert_close(named.statistics, test.statistics)
+    assert (everything.statistics["pixels"] != test.statistics["pixels"]).any()
 
 
 # Options --------------------------------------------------------------------------------------------------------------
