@@ -30,7 +30,7 @@ setup(
         "tqdm>=4.60",
     ],
     extras_require={
-        # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotReplay, RecordingReplay.
+        # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobot and own recordings.
         "lerobot": ["pyarrow>=15", "av>=14"],
         "examples": ["matplotlib", "tensorboard"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
