@@ -58,7 +58,8 @@ def write_out_products(graph: Graph) -> None:
             left, right = node.args
             *batch, rows, inner = left.meta["val"].shape
             multiplications = rows * inner * right.meta["val"].shape[-1]
-            if multiplications <= SMALL or (rows <= FEW_ROWS and multiplications <= SMALL_OF_ROWS):
+            limit = SMALL if batch or rows > FEW_ROWS else SMALL_OF_ROWS
+            if multiplications <= limit:
                 with graph.inserting_before(node):
                     left = insert_call(graph, aten.unsqueeze.default, left, len(batch) + 2)
                     right = insert_call(graph, aten.unsqueeze.default, right, len(batch))
