@@ -46,6 +46,7 @@ class CarSettings:
         reach: largest distance between the two frames of a pair that the sensor can read, in m.
         features: of the sensor's code of the flow.
         num_cells: hidden layers of the sensor's head.
+        size: (H, W) that drives are scaled to.
         focal: focal length of the training images, in pixels; larger images are reduced to it. ``None`` for any.
         inflation: factor on the belief's spread in each step, chosen on validation drives.
     """
@@ -59,6 +60,7 @@ class CarSettings:
     reach: float = 3.1
     features: int = 32
     num_cells: tuple[int, ...] = (32, 32)
+    size: tuple[int, int] = (100, 300)
     focal: float | None = None
     inflation: float = 1.0
 

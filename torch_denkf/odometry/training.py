@@ -139,7 +139,7 @@ def train_car_filter(
         0.103
     """
     out, updates, longest = Path(out).expanduser(), updates or Updates(), CarSettings.longest
-    common: dict[str, Any] = {"size": tuple(size), "cache": out / "cache"}
+    common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache"}
     recorded = (
         [Drive(Path(root), name, height=height, **common) for name in _names(root, drives, leave_out)] if root else []
     )
@@ -162,7 +162,6 @@ def train_car_filter(
         "command": command,
         "seed": seed,
         "updates": asdict(updates),
-        "size": list(size),
         "roles": {role: [f"{drive.root.name}/{drive.name}" for drive in parts] for role, parts in roles.items()},
         "validation_crps": value,
         "sensor_gain_error": gain,
@@ -247,6 +246,7 @@ def _settings(drives: Sequence[Drive], data: dict[Drive, TensorDict]) -> CarSett
         dt=round(float(clean[0]["dt"][0, 0]), 6),
         velocity_mean=(float(v.mean()), 0.0),
         velocity_std=(float(v.std()), float(theta_dot.square().mean().sqrt())),
+        size=drives[0].size,
         focal=focal,
     )
 
