@@ -24,7 +24,7 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescription
     """Shows defaults, but not those that say nothing."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
-        if action.default in (None, False, argparse.SUPPRESS) or action.required:
+        if any(action.default is silent for silent in (None, False, argparse.SUPPRESS)) or action.default == []:
             return action.help
         return super()._get_help_string(action)
 
@@ -63,7 +63,7 @@ class Command:
         mistakes: tuple[type[Exception], ...] = (),
     ):
         self.name, self.run, self.resumable = name, run, resumable
-        self.mistakes = (ImportError, OSError, ValueError, *mistakes)
+        self.mistakes: tuple[type[Exception], ...] = (ImportError, OSError, ValueError, *mistakes)
         self.parser = _Parser(
             prog=f"denkf {name}", description=summary, epilog=f"example:\n  {example}", formatter_class=_Formatter
         )

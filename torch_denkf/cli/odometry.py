@@ -67,20 +67,20 @@ def _run(args: argparse.Namespace) -> None:
         pitch=args.pitch,
         seed=args.seed,
     )
-    means, seconds, blind, last = [], [], 0, None
-    for last in write_path(beliefs, args.out / "path.csv"):
-        means.append(last.mean)
-        seconds.append(last.time)
-        blind += not last.observed
+    means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading
+    for belief in write_path(beliefs, args.out / "path.csv"):
+        means.append(belief.mean)
+        seconds.append(belief.time)
+        blind += not belief.observed
+        doubt = float(belief.var[:2].sum().sqrt())
     states = torch.stack(means)
     write_trajectory(args.out / "path_kitti.txt", states, layout="kitti")
     write_trajectory(args.out / "path_tum.txt", states, torch.tensor(seconds, dtype=torch.float64), layout="tum")
     way = float(states[1:, :2].sub(states[:-1, :2]).norm(dim=-1).sum())
-    doubt = float(last.var[:2].sum().sqrt())
     say(
-        f"{way:.1f} m in {seconds[-1] - seconds[0]:.1f} s, {len(states)} steps, {max(blind - 1, 0)} without a reading; "
-        f"at the end x {float(last.mean[0]):.1f} m, y {float(last.mean[1]):.1f} m, heading "
-        f"{math.degrees(float(last.mean[2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
+        f"{way:.1f} m in {seconds[-1] - seconds[0]:.1f} s, {len(states)} steps, {blind} without a reading; "
+        f"at the end x {float(states[-1, 0]):.1f} m, y {float(states[-1, 1]):.1f} m, heading "
+        f"{math.degrees(float(states[-1, 2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
     )
     files = ["path.csv", "path_kitti.txt", "path_tum.txt"]
     if not args.no_pictures:

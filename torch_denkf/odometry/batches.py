@@ -51,25 +51,26 @@ class PairSampler:
 
     def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
         """Frames ``[batch]``, every second group of them mirrored."""
-        chosen = []
+        chosen: list[TensorDict] = []
         for number in torch.multinomial(self.weight, _GROUPS, replacement=True, generator=generator).tolist():
             data = self.data[number]
             index = torch.randint(1, len(data), (batch // _GROUPS,), generator=generator)
             frames = rows(data, index, self.longest)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return torch.cat(chosen)
+        return TensorDict.cat(chosen)
 
-    def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
+    def windows(self, generator: torch.Generator, length: int | None, start_std: Tensor) -> TensorDict:
         """Windows ``[8, length]`` that start from a wrong velocity."""
-        chosen, weight = [], self.weight * self.neighbours
+        weight = self.weight * self.neighbours
+        chosen: list[TensorDict] = []
         for number in torch.multinomial(weight, _GROUPS, replacement=True, generator=generator).tolist():
             data = self.data[number]
-            if len(data) <= length:
+            if length is None or len(data) <= length:
                 raise ValueError(f"windows of {length} frames do not fit in a drive of {len(data)}; pass longer drives")
             first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
             frames = rows(data, torch.arange(first, first + length), self.longest)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return _with_start(torch.stack(chosen), start_std, generator)
+        return _with_start(TensorDict.stack(chosen), start_std, generator)
 
 
 class ReadingSampler:
@@ -87,7 +88,7 @@ class ReadingSampler:
     """
 
     def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int, gain_error: float):
-        self.readings, self.length, self.gain_error = torch.cat(list(readings)), length, gain_error
+        self.readings, self.length, self.gain_error = TensorDict.cat(list(readings)), length, gain_error
         starts, weight, offset = [], [], 0
         for reading, share in zip(readings, weights, strict=True):
             count = len(reading) - length
@@ -204,7 +205,7 @@ def filter_readings(car: CarFilter, readings: Sequence[TensorDict], *, seed: int
         readings: each ``[N]``, see :func:`torch_denkf.odometry.streams.take_spans`.
         seed: of the filter's noise.
     """
-    batch = torch.stack([reading.copy() for reading in readings])
+    batch = TensorDict.stack([reading.copy() for reading in readings])
     batch["start"] = batch["state"].clone()
     batch["start"][:, 0] = torch.stack([first_state(reading) for reading in readings])
     with torch.random.fork_rng(devices=[]):
@@ -245,7 +246,7 @@ def calibrate(car: CarFilter, readings: Sequence[TensorDict], level: float = 0.9
 
 def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
     """Beliefs on each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
-    groups = defaultdict(list)
+    groups: dict[int, list[TensorDict]] = defaultdict(list)
     for seed, reading in enumerate(readings):
         groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
     return [filter_readings(car, group) for group in groups.values()]

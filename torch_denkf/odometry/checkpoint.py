@@ -99,9 +99,8 @@ def load_car_filter(folder: str | Path) -> CarFilter:
     if unknown := sorted(set(settings) - known):
         raise ValueError(f"{folder / CONFIG} has settings {unknown}, which this version does not know; update it")
     try:
-        car = CarFilter(
-            CarSettings(**{key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()})
-        )
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+        car = CarFilter(CarSettings(**values))
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder / CONFIG} does not make a filter: {error}") from error
     file = folder / WEIGHTS

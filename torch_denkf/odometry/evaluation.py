@@ -101,8 +101,15 @@ def evaluate_car_filter(
     longest, rows, beliefs = car.settings.longest, [], {}
     with progress_bar("evaluating", len(drives), unit=" drives", shown=progress) as bar:
         for name in drives:
-            common = {"camera": camera, "height": height, "pitch": pitch}
-            drive = Drive(Path(root), name, tuple(size or car.settings.size), cache, **common)
+            drive = Drive(
+                Path(root),
+                name,
+                car.settings.size if size is None else size,
+                cache,
+                camera=camera,
+                height=height,
+                pitch=pitch,
+            )
             data = [each.read() for each in drive.spans(longest if missing else 1)]
             dt = float(data[0]["dt"][0, 0])
             if abs(dt / car.settings.dt - 1) > 0.05:

@@ -32,11 +32,11 @@ __all__ = [
 MISSING = 0.3  # share of frames that are black, or do not arrive
 
 _DISTURBANCES = {
-    "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=["image"], generator=generator),
-    "blur": lambda generator: Blur(in_keys=["image"], generator=generator),
-    "brightness": lambda generator: Brightness(in_keys=["image"], generator=generator),
-    "black": lambda generator: BlackFrames(MISSING, in_keys=["image"], generator=generator),
-    "box": lambda generator: OccludingBox(in_keys=["image"], generator=generator),
+    "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=("image",), generator=generator),
+    "blur": lambda generator: Blur(in_keys=("image",), generator=generator),
+    "brightness": lambda generator: Brightness(in_keys=("image",), generator=generator),
+    "black": lambda generator: BlackFrames(MISSING, in_keys=("image",), generator=generator),
+    "box": lambda generator: OccludingBox(in_keys=("image",), generator=generator),
 }
 CONDITIONS = ("clean", *_DISTURBANCES)
 
@@ -49,7 +49,7 @@ class Drive:
         root: folder with ``sequences`` and ``poses``.
         name: of the drive.
         size: (H, W) that the images are scaled to.
-        cache: folder in which the flow is kept.
+        cache: folder in which the flow is kept; ``True`` for the library's.
         condition: ``"clean"``, or what happens to its images: one of ``CONDITIONS``.
         steps: between the two frames of a pair.
         pitch: rad; the camera is taken to look so far up, and the sensor has to find out that it does not.
@@ -61,7 +61,7 @@ class Drive:
     root: Path
     name: str
     size: tuple[int, int]
-    cache: Path
+    cache: Path | str | bool
     condition: str = "clean"
     steps: int = 1
     pitch: float = 0.0
@@ -131,7 +131,7 @@ def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored:
             frames = (mirror(frames) if mirrored else frames).to(device)
             readings.append(sensor(frames).exclude("flow", "road").cpu())
     sensor.train(was_training)
-    return torch.cat(readings)
+    return TensorDict.cat(readings)
 
 
 def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *, mirrored: bool = False) -> TensorDict:

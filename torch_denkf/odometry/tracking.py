@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +23,7 @@ from torch_denkf.vision import (
     ROAD_PITCHES,
     ROAD_SHAPE,
     ROAD_SHIFTS,
+    CanonicalCamera,
     focus_of_expansion,
     image_motion,
 )
@@ -31,8 +33,9 @@ __all__ = ["TrackedBelief", "track"]
 _LONGEST_GAP = 100  # steps without a frame that are bridged by prediction
 _EARLY = 0.25  # steps that a frame may come before its time
 _WATCHED = 40  # moving pairs on which camera and calibration are judged
-_MOVING = 0.3  # m a pair: a car that stands tells nothing
-_LEAST_CORRELATION = 0.95  # of the road; 0.98 and more on KITTI, 0.93 and less with a focal length 1.4 times too long
+_MOVING = 0.012  # mean flow, in tangents: a car that stands tells nothing
+_LEAST_CORRELATION = 0.95  # of the road, median; 0.97 to 0.99 on KITTI, 0.94 and less with images that do not fit
+_LEAST_VIEW = 0.85  # share of the field of view that the sensor was trained with
 _FASTEST = 3.0  # m a pair, where the sensor's range ends
 _PITCH_MARGIN = 0.01  # rad
 
@@ -76,8 +79,9 @@ def track(
     was there, at most three steps back, and the path between is corrected.
 
     **One camera cannot see how high it is mounted**: a height that is 10 % too large makes the path 10 % too long, and
-    nothing in the images contradicts it. Measure it. What can be seen is warned of: a focal length that is too long, a
-    camera that looks far up or down, speeds beyond the sensor's range.
+    nothing in the images contradicts it. Measure it. A focal length that is too short makes it too long likewise. What
+    can be seen is warned of: a focal length that is too long for the images, a camera that looks far up or down, a road
+    that is not one, speeds beyond the sensor's range.
 
     Args:
         car: the filter, see :func:`torch_denkf.odometry.load_car_filter`.
@@ -201,7 +205,8 @@ class _Clock:
                 f"frames are {period:.3g} s apart, but the filter moves in steps of {dt:.3g} s; pass at least "
                 f"{1 / (1.6 * dt):.0f} frames a second, and their right times"
             )
-        self.time, self._first, self._taken = 0.0, None, -1
+        self.time, self._taken = 0.0, -1
+        self._first: float | None = None
 
     def __call__(self, time: float) -> int | None:
         """The step of a frame."""
@@ -271,6 +276,17 @@ class _Camera:
         self.calibration = [fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5]
         self.calibration[3] += pitch * self.calibration[1]
         self.height, self.watch = height, _Watch(pitch)
+        # What the sensor looks at, against what the camera shows: to the sides and down to the near road.
+        canonical = CanonicalCamera(240.0)
+        wanted = [side / 2 / canonical.focal for side in (canonical.width, canonical.height)]
+        shown = [min(cx, columns - cx) / fx, (rows - cy) / fy]
+        if any(a < _LEAST_VIEW * b for a, b in zip(shown, wanted, strict=True)):
+            across, down = (math.degrees(math.atan(value)) for value in shown)
+            self.watch.say(
+                f"with these focal lengths the images show {across:.0f} degrees to the sides and {down:.0f} down, "
+                "where the sensor looks at 41 and 15: the focal lengths are too long for these images, or their field "
+                "of view is narrower than that of the training"
+            )
 
     def image(self, frame: np.ndarray, number: int) -> np.ndarray:
         """Grey, at the training's resolution."""
@@ -300,10 +316,9 @@ class _Watch:
         """Look at one pair."""
         if self.said:
             return
-        best = int(road.amax(0).argmax())
-        moved = _distance(best)
-        if moved < _MOVING:
+        if float(flow[:2].norm(dim=0).mean()) < _MOVING:
             return
+        moved = float(ROAD_SHIFTS[int(road.amax(0).argmax())])
         up = float(focus_of_expansion(flow.unsqueeze(0)).focus[0, 1])
         self.seen.append((float(road.max()), up, moved))
         if len(self.seen) < _WATCHED:
@@ -311,28 +326,24 @@ class _Watch:
         correlation, up, moved = (median(values) for values in zip(*self.seen, strict=True))
         low, high = float(ROAD_PITCHES[0]), float(ROAD_PITCHES[-1])
         if not low - _PITCH_MARGIN <= up <= high + _PITCH_MARGIN:
-            self._say(
+            self.say(
                 f"the camera looks {self.pitch + up:+.3f} rad up from the direction of travel; with pitch="
                 f"{self.pitch:g} the sensor reads {self.pitch + low:g} to {self.pitch + high:g}. Pass "
                 f"pitch={self.pitch + up:.3f}, or correct cy"
             )
         elif correlation < _LEAST_CORRELATION:
-            self._say(
+            self.say(
                 f"the road does not look like a plane under this camera (correlation {correlation:.2f}; "
-                f"{_LEAST_CORRELATION} or more is usual). Check the focal lengths, which are probably too long for "
-                "these images, that the images are rectified, and that they show the road"
+                f"{_LEAST_CORRELATION} or more is usual). Check the calibration, that the images are rectified, and "
+                "that they show the road below their middle"
             )
         elif moved >= _FASTEST:
-            self._say(
+            self.say(
                 f"the car seems to move {moved:.1f} m between two frames, where the sensor's range ends. Check the "
                 "camera's height, the focal lengths, and the times of the frames"
             )
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Warn, and then no more."""
         self.said = True
         warnings.warn(text, UserWarning, stacklevel=6)
-
-
-def _distance(shift: int) -> float:
-    """Metres of a column of the road's correlation."""
-    return float(ROAD_SHIFTS[shift])
