@@ -33,6 +33,10 @@ setup(
     extras_require={
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
         "lerobot": ["pyarrow>=15", "av>=14"],
+        # torch_denkf.plots, and the GIF files of its videos.
+        "plots": ["matplotlib", "pillow"],
+        # torch_denkf.plots.log_rollout alone: 500 MB.
+        "viewer": ["rerun-sdk>=0.23"],
         "examples": ["matplotlib", "tensorboard"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch_denkf.data.collect_ur5 import collect_ur5_demos
 
 from torch_denkf.data import UR5ExperienceReplay
-from torch_denkf.data.collect_ur5 import collect_ur5_demos
 
 STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
 JOINTS = 7

@@ -13,8 +13,12 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torch_denkf.cli._command import Command, say
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["draw", "main"]
 
@@ -41,12 +45,17 @@ def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
     path = read_path(file)
     out.mkdir(parents=True, exist_ok=True)
     files = [out / "path.png", out / "bands.png"]
-    path_axes = plot_path(path, spread="ellipses", forward_up=True, level=level)
-    path_axes.figure.savefig(files[0], dpi=120)
+    _save(plot_path(path, spread="ellipses", forward_up=True, level=level), files[0])
     names, factors = ["v, m/s", "theta_dot, deg/s"], [1.0, math.degrees(1)]
-    band_axes = plot_bands(path, dims=[3, 4], names=names, factors=factors, time=path["time"].squeeze(-1), level=level)
-    band_axes[0].figure.savefig(files[1], dpi=120)
+    time = path["time"].squeeze(-1)
+    _save(plot_bands(path, dims=[3, 4], names=names, factors=factors, time=time, level=level)[0], files[1])
     return files
+
+
+def _save(axes: Axes, file: Path) -> None:
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.savefig(file, dpi=120)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

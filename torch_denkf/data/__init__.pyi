@@ -8,6 +8,7 @@ from .kitti.replay import KITTIOdometryExperienceReplay
 from .lerobot.replay import LeRobotExperienceReplay
 from .lerobot.rows import recording_from_rows
 from .systems import lorenz96_step, lorenz96_tendency
+from .trajectories import write_trajectory
 from .ur5.replay import UR5ExperienceReplay
 
 __all__ = [
@@ -30,4 +31,5 @@ __all__ = [
     "steps_between",
     "with_motion",
     "write_drives",
+    "write_trajectory",
 ]

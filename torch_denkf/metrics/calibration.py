@@ -1,8 +1,12 @@
-"""Does the spread of a belief say how wrong its mean is? Spread over skill, and how often intervals hold the truth."""
+"""Does the spread of a belief say how wrong its mean is?
+
+Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,7 +14,29 @@ from torch import Tensor
 from torch_denkf.metrics._paths import wrap_angle
 from torch_denkf.metrics.state import state_difference
 
-__all__ = ["ensemble_interval_coverage", "interval_coverage", "spread_skill_ratio"]
+__all__ = [
+    "SpreadError",
+    "ensemble_interval",
+    "ensemble_interval_coverage",
+    "histogram_band",
+    "interval_coverage",
+    "pit",
+    "rank_histogram",
+    "spread_error",
+    "spread_skill_ratio",
+]
+
+
+class SpreadError(NamedTuple):
+    """What :func:`spread_error` returns.
+
+    Attributes:
+        spread: root mean square of the predicted standard deviation in each bin, ``[S, bins]``, ascending.
+        error: root mean square of the mean's error in the same bins, ``[S, bins]``.
+    """
+
+    spread: Tensor
+    error: Tensor
 
 
 def spread_skill_ratio(
@@ -77,10 +103,7 @@ def interval_coverage(
         tensor([0.7500])
     """
     error = state_difference(mean, truth, angles=angles)
-    if variance.shape != error.shape:
-        raise ValueError(f"variance must have the shape of the mean, {list(error.shape)}; got {list(variance.shape)}.")
-    if bool((variance < 0).any()):
-        raise ValueError(f"variances cannot be negative; the least is {variance.min().item():.3g}.")
+    _check_variance(variance, error)
     _check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
     return _share(error.abs() <= quantile * variance.sqrt())
@@ -116,10 +139,31 @@ def ensemble_interval_coverage(
         >>> ensemble_interval_coverage(members, torch.tensor([[0.5], [18.5]]), level=0.9)  # from 0 to 18
         tensor([0.5000])
     """
-    if ensemble.ndim != truth.ndim + 1 or (*ensemble.shape[:-2], ensemble.shape[-1]) != truth.shape:
-        raise ValueError(
-            f"ensemble must be [*B, E, S] and truth [*B, S]; got {list(ensemble.shape)} and {list(truth.shape)}."
-        )
+    members, offset = _around_mean(ensemble, truth, angles)
+    lower, upper = ensemble_interval(members, level=level)
+    return _share((lower <= offset) & (offset <= upper))
+
+
+def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
+    """Central interval of the members, which holds the truth of a calibrated ensemble with probability ``level``.
+
+    It ends at rank p (E+1) of the sorted members, p = (1 - level)/2, between two members where that is no whole number.
+
+    Args:
+        ensemble: ``[*B, E, S]``. Bring angles that straddle ±π to one side before.
+        level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
+
+    Returns:
+        The lower and the upper end, both ``[*B, S]``, in the members' units.
+
+    Raises:
+        ValueError: if ``level`` is not in (0, 1) or more than the members can tell.
+
+    Example:
+        >>> low, high = ensemble_interval(torch.arange(19.0).unsqueeze(-1), level=0.8)
+        >>> low.item(), high.item()
+        (1.0, 17.0)
+    """
     _check_level(level)
     size = ensemble.shape[-2]
     rank = (1 - level) / 2 * (size + 1) - 1  # from zero
@@ -128,6 +172,173 @@ def ensemble_interval_coverage(
             f"{size} members span {max(size - 1, 0)}/{size + 1} of their distribution; level {level} needs more "
             "members, or pass a smaller level."
         )
+    members = ensemble.sort(-2).values
+    whole = max(int(rank + 1e-9), 0)
+    part = max(rank - whole, 0.0)
+    beyond = min(whole + 1, size - 1)
+    lower = torch.lerp(members[..., whole, :], members[..., beyond, :], part)
+    upper = torch.lerp(members[..., size - 1 - whole, :], members[..., size - 1 - beyond, :], part)
+    return lower, upper
+
+
+def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+    r"""Probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
+
+    It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident one gathers it at both ends, a timid one
+    in the middle, and a biased one at one end.
+
+    Args:
+        mean: ``[*B, S]``.
+        variance: ``[*B, S]``.
+        truth: ``[*B, S]``, in the same units.
+        angles: dimensions that are angles in rad, whose errors are wrapped.
+
+    Returns:
+        ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean.
+
+    Raises:
+        ValueError: if the shapes differ, or if a variance is negative.
+
+    Reference:
+        Gneiting, Balabdaoui & Raftery 2007, "Probabilistic forecasts, calibration and sharpness", JRSS B 69.
+
+    Example:
+        >>> pit(torch.zeros(3, 1), torch.ones(3, 1), torch.tensor([[-1.2816], [0.0], [1.2816]])).flatten()
+        tensor([0.1000, 0.5000, 0.9000])
+    """
+    error = state_difference(truth, mean, angles=angles)
+    _check_variance(variance, error)
+    score = error / variance.sqrt()
+    return torch.special.ndtr(torch.where((error == 0) & (variance == 0), 0.0, score))
+
+
+def rank_histogram(ensemble: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+    """How often the truth falls into each of the E+1 gaps between and beyond the sorted members.
+
+    The histogram is flat, up to chance, for a calibrated ensemble, Gaussian or not. It is high at both ends for an
+    overconfident one. A truth that equals some members counts in equal parts in all the gaps that they separate.
+
+    Args:
+        ensemble: ``[*B, E, S]``, members of equal weight.
+        truth: ``[*B, S]``, in the same units.
+        angles: dimensions that are angles in rad; members are taken around their mean direction.
+
+    Returns:
+        Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if a value is not finite.
+        IndexError: if ``angles`` names no dimension.
+
+    Reference:
+        Hamill 2001, "Interpretation of rank histograms for verifying ensemble forecasts", Mon. Weather Rev. 129.
+
+    Example:
+        >>> members = torch.tensor([[1.0], [2.0], [3.0]]).expand(4, 3, 1)
+        >>> rank_histogram(members, torch.tensor([[0.0], [2.5], [2.6], [2.0]]))
+        tensor([[1.0000, 0.5000, 2.5000, 0.0000]], dtype=torch.float64)
+    """
+    members, offset = _around_mean(ensemble, truth, angles)
+    if not bool(members.isfinite().all() and offset.isfinite().all()):
+        raise ValueError("ensemble and truth must be finite; leave out the rows that are not")
+    offset = offset.unsqueeze(-2)
+    below = (members < offset).sum(-2).flatten(0, -2)  # [N, S]
+    ties = (members == offset).sum(-2).flatten(0, -2)
+    part = 1.0 / (ties + 1).double()
+    steps = torch.zeros(members.shape[-1], members.shape[-2] + 2, dtype=torch.float64, device=members.device)
+    steps.scatter_add_(1, below.T, part.T)
+    steps.scatter_add_(1, (below + ties + 1).T, -part.T)
+    return steps.cumsum(1)[:, :-1]
+
+
+def histogram_band(samples: int, bins: int, *, level: float = 0.99) -> tuple[int, int]:
+    """Counts between which all bars of a flat histogram stay together with at least probability ``level``.
+
+    Each bar is binomial; by Bonferroni's bound each is granted a share (1 - level) / bins of being outside.
+
+    Args:
+        samples: independent samples in the histogram. Errors of successive steps are not independent: use every n-th.
+        bins: of the histogram.
+        level: probability of the band.
+
+    Returns:
+        The least and the largest count.
+
+    Raises:
+        ValueError: if ``level`` is not in (0, 1), or without samples or bins.
+
+    Example:
+        >>> histogram_band(1000, 10)
+        (70, 132)
+    """
+    _check_level(level)
+    if samples < 1 or bins < 1:
+        raise ValueError(f"a histogram needs samples and bins; got {samples} samples and {bins} bins")
+    if bins == 1:
+        return samples, samples
+    counts = torch.arange(samples + 1, dtype=torch.float64)
+    ways = torch.lgamma(counts.max() + 1) - torch.lgamma(counts + 1) - torch.lgamma(samples - counts + 1)
+    share = torch.tensor(1 / bins, dtype=torch.float64)
+    mass = (ways + counts * share.log() + (samples - counts) * (1 - share).log()).exp()
+    tail = (1 - level) / bins / 2
+    low = int((mass.cumsum(0) <= tail).sum())
+    beyond = mass.flip(0).cumsum(0).flip(0) - mass  # P(count > k)
+    return low, int((beyond > tail).sum())
+
+
+def spread_error(
+    mean: Tensor,
+    variance: Tensor,
+    truth: Tensor,
+    *,
+    bins: int = 8,
+    ensemble_size: int | None = None,
+    angles: Sequence[int] = (),
+) -> SpreadError:
+    """Predicted spread and actual error, in bins of states with similar spread.
+
+    A filter that knows how wrong it is has spread = error in each bin.
+
+    Args:
+        mean: ``[*B, S]``.
+        variance: ``[*B, S]``; of an ensemble with divisor E-1.
+        truth: ``[*B, S]``, in the same units.
+        bins: of equal size up to one state, by the rank of the spread.
+        ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
+            distribution whose moments are exact.
+        angles: dimensions that are angles in rad, whose errors are wrapped.
+
+    Returns:
+        A :class:`SpreadError`, in the units of the state.
+
+    Raises:
+        ValueError: if the shapes differ, if a variance is negative, or if there are fewer states than bins.
+
+    Example:
+        >>> mean, truth = torch.zeros(4, 1), torch.tensor([[1.0], [-1.0], [3.0], [-3.0]])
+        >>> spread_error(mean, torch.tensor([[1.0], [1.0], [4.0], [4.0]]), truth, bins=2)
+        SpreadError(spread=tensor([[1., 2.]]), error=tensor([[1., 3.]]))
+    """
+    difference = state_difference(mean, truth, angles=angles)
+    _check_variance(variance, difference)
+    squared, variance = difference.square().flatten(0, -2), variance.flatten(0, -2)
+    if not 1 <= bins <= len(squared):
+        raise ValueError(f"{bins} bins need at least one state each; got {len(squared)} states")
+    factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
+    order = variance.argsort(0)
+    parts = [
+        torch.stack([part.mean(0).sqrt() for part in column.gather(0, order).tensor_split(bins)], -1)
+        for column in (factor * variance, squared)
+    ]
+    return SpreadError(*parts)
+
+
+def _around_mean(ensemble: Tensor, truth: Tensor, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Members and truth relative to the members' mean, in which angles are wrapped: ``[*B, E, S]`` and ``[*B, S]``."""
+    if ensemble.ndim != truth.ndim + 1 or (*ensemble.shape[:-2], ensemble.shape[-1]) != truth.shape:
+        raise ValueError(
+            f"ensemble must be [*B, E, S] and truth [*B, S]; got {list(ensemble.shape)} and {list(truth.shape)}."
+        )
     centre = ensemble.mean(-2)
     for dim in angles:
         centre[..., dim] = torch.atan2(ensemble[..., dim].sin().mean(-1), ensemble[..., dim].cos().mean(-1))
@@ -135,13 +346,14 @@ def ensemble_interval_coverage(
     members = ensemble - centre.unsqueeze(-2)
     for dim in angles:
         members[..., dim] = wrap_angle(members[..., dim].clone())
-    members = members.sort(-2).values
-    whole = max(int(rank + 1e-9), 0)
-    part = max(rank - whole, 0.0)
-    beyond = min(whole + 1, size - 1)
-    lower = torch.lerp(members[..., whole, :], members[..., beyond, :], part)
-    upper = torch.lerp(members[..., size - 1 - whole, :], members[..., size - 1 - beyond, :], part)
-    return _share((lower <= offset) & (offset <= upper))
+    return members, offset
+
+
+def _check_variance(variance: Tensor, error: Tensor) -> None:
+    if variance.shape != error.shape:
+        raise ValueError(f"variance must have the shape of the mean, {list(error.shape)}; got {list(variance.shape)}.")
+    if bool((variance < 0).any()):
+        raise ValueError(f"variances cannot be negative; the least is {variance.min().item():.3g}.")
 
 
 def _check_level(level: float) -> None:

@@ -1,0 +1,136 @@
+"""Oracles: uniform histograms under the right distribution, SciPy's normal and binomial, counts by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from torch_denkf.metrics import (
+    ensemble_interval,
+    histogram_band,
+    pareto_frontier,
+    pit,
+    rank_histogram,
+    spread_error,
+    spread_skill_ratio,
+)
+
+
+def rng(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_pit_is_the_normal_distribution_function():
+    error = torch.linspace(-4, 4, 41, dtype=torch.float64).unsqueeze(-1)
+    got = pit(torch.full_like(error, 2.0), torch.full_like(error, 9.0), 2 + 3 * error)
+    np.testing.assert_allclose(got.numpy(), stats.norm.cdf(error.numpy()), rtol=1e-12)
+
+
+def test_pit_is_uniform_under_the_right_distribution_and_known_under_a_wrong_one():
+    n, std = 100_000, 0.3
+    truth = 1 + std * torch.randn(n, 1, generator=rng(), dtype=torch.float64)
+    mean = torch.ones_like(truth)
+    assert stats.kstest(pit(mean, 0 * mean + std**2, truth).flatten().numpy(), "uniform").pvalue > 0.01
+    # A spread half as wide: P(pit <= u) = Phi(Phi^-1(u) / 2).
+    narrow = pit(mean, 0 * mean + (std / 2) ** 2, truth)
+    for u in (0.05, 0.3, 0.9):
+        expected = stats.norm.cdf(stats.norm.ppf(u) / 2)
+        assert float((narrow <= u).double().mean()) == pytest.approx(expected, abs=4 * 0.5 / n**0.5)
+
+
+def test_pit_of_angles_and_of_no_spread():
+    got = pit(torch.tensor([[3.1]]), torch.tensor([[1.0]]), torch.tensor([[-3.1]]), angles=(0,))
+    assert got.item() == pytest.approx(stats.norm.cdf(2 * math.pi - 6.2), abs=1e-6)
+    mean = torch.zeros(3, 1)
+    assert pit(mean, mean, torch.tensor([[-1.0], [0.0], [1.0]])).flatten().tolist() == [0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("members", [1, 9, 32])
+def test_ranks_are_uniform_for_a_skewed_calibrated_ensemble(members):
+    n = 40_000
+    draws = torch.empty(n, members + 1, 2, dtype=torch.float64).exponential_(generator=rng())
+    counts = rank_histogram(draws[:, :-1], draws[:, -1])
+    assert counts.shape == (2, members + 1)
+    assert counts.sum(1).tolist() == [n, n]
+    low, high = histogram_band(n, members + 1, level=0.9999)  # six histograms
+    assert bool(((low <= counts) & (counts <= high)).all())
+    assert stats.chisquare(counts[0].numpy()).pvalue > 0.001
+
+
+def test_ranks_by_hand_with_ties():
+    members = torch.tensor([[[2.0], [1.0], [2.0]]]).expand(3, 3, 1)
+    counts = rank_histogram(members, torch.tensor([[2.0], [0.0], [9.0]]))
+    # A truth between two equal members: a third in each of the three gaps that they bound.
+    np.testing.assert_allclose(counts.numpy(), [[1.0, 1 / 3, 1 / 3, 1 + 1 / 3]], atol=1e-12)
+
+
+def test_ranks_of_angles_on_both_sides_of_the_cut():
+    members = torch.tensor([[[3.0], [-3.0], [3.1]]])  # around 3.12
+    assert rank_histogram(members, torch.tensor([[-3.1]]), angles=(0,)).tolist() == [[0, 0, 1, 0]]
+    assert rank_histogram(members, torch.tensor([[-3.1]])).tolist() == [[1, 0, 0, 0]]
+
+
+@pytest.mark.parametrize(("samples", "bins"), [(30, 5), (1000, 20), (5000, 33), (200_000, 10)])
+def test_band_is_the_binomial_one(samples, bins):
+    low, high = histogram_band(samples, bins)
+    tail, law = 0.01 / bins / 2, stats.binom(samples, 1 / bins)
+    assert law.cdf(low - 1) <= tail < law.cdf(low)
+    assert law.sf(high) <= tail < law.sf(high - 1)
+
+
+def test_band_holds_all_bars_of_calibrated_histograms_together():
+    low, high = histogram_band(500, 20)
+    counts = np.random.default_rng(0).multinomial(500, [1 / 20] * 20, size=4000)
+    share = ((low <= counts) & (counts <= high)).all(1).mean()
+    assert 0.988 <= share <= 1
+    assert histogram_band(7, 1) == (7, 7)
+
+
+def test_spread_error_by_hand_and_beside_the_ratio():
+    error = torch.randn(600, 2, generator=rng(), dtype=torch.float64)
+    std = torch.rand(600, 2, generator=rng(1), dtype=torch.float64) + 0.5
+    truth = torch.zeros_like(std)
+    got = spread_error(error * std, std.square(), truth, bins=6, ensemble_size=4)
+    for dim in range(2):
+        order = std[:, dim].argsort().chunk(6)
+        for part, spread, rmse in zip(order, got.spread[dim], got.error[dim], strict=True):
+            assert spread.item() == pytest.approx(math.sqrt(1.25 * std[part, dim].square().mean().item()))
+            assert rmse.item() == pytest.approx((error * std)[part, dim].square().mean().sqrt().item())
+    whole = spread_error(error * std, std.square(), truth, bins=1, ensemble_size=4)
+    ratio = spread_skill_ratio(error * std, std.square(), truth, 4)
+    torch.testing.assert_close(whole.spread[:, 0] / whole.error[:, 0], ratio)
+
+
+def test_interval_is_numpys_quantile():
+    ensemble = torch.randn(5, 23, 2, generator=rng(), dtype=torch.float64)
+    low, high = ensemble_interval(ensemble, level=0.8)
+    expected = np.quantile(ensemble.numpy(), [0.1, 0.9], axis=1, method="weibull")
+    np.testing.assert_allclose([low.numpy(), high.numpy()], expected, atol=1e-12)
+
+
+def test_frontier_is_that_of_the_definition():
+    costs = torch.randint(0, 6, (40, 2), generator=rng())
+    points = costs.tolist()
+    expected = [not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points) for p in points]
+    assert pareto_frontier(costs).tolist() == expected
+    assert 0 < sum(expected) < 40
+
+
+def test_errors_say_what_to_do():
+    ones = torch.ones(4, 2)
+    with pytest.raises(ValueError, match="cannot be negative"):
+        pit(ones, -ones, ones)
+    with pytest.raises(ValueError, match="must be finite"):
+        rank_histogram(torch.full((4, 3, 2), torch.nan), ones)
+    with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
+        rank_histogram(ones, ones)
+    with pytest.raises(ValueError, match="needs samples and bins"):
+        histogram_band(0, 10)
+    with pytest.raises(ValueError, match="5 bins need at least one state each; got 4"):
+        spread_error(ones, ones, ones, bins=5)
+    with pytest.raises(ValueError, match="leave out its row"):
+        pareto_frontier(torch.tensor([[1.0, torch.nan]]))
+    with pytest.raises(ValueError, match="a row a filter"):
+        pareto_frontier(torch.ones(3))

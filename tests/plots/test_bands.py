@@ -1,0 +1,139 @@
+"""Oracles: the tensors that were passed, quantiles of NumPy and of the normal distribution."""
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from tensordict import TensorDict
+
+from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
+from torch_denkf.metrics import wrap_angle
+from torch_denkf.plots import plot_bands
+
+NORMAL_90 = 1.6448536
+
+
+def line(axes, label):
+    (found,) = [line for line in axes.get_lines() if line.get_label() == label]
+    return [np.asarray(part, dtype=float) for part in found.get_data()]
+
+
+def band(axes):
+    """Times, lower and upper edge [T], read from the polygon: start, lower edge, end, upper edge back."""
+    (polygon,) = axes.collections[0].get_paths()
+    steps = (len(polygon.vertices) - 3) // 2
+    lower = polygon.vertices[1 : 1 + steps]
+    upper = polygon.vertices[2 + steps : 2 + 2 * steps][::-1]
+    np.testing.assert_array_equal(lower[:, 0], upper[:, 0])
+    return lower[:, 0], lower[:, 1], upper[:, 1]
+
+
+def test_a_kalman_filters_band_is_its_variances():
+    run = kalman_runs()[3]
+    panels = plot_bands(run, dims=[0, 3], names=["x, m", "vy, cm/s"], factors=[1, 100], time=DT)
+    for axes, dim, factor in zip(panels, (0, 3), (1, 100), strict=True):
+        seconds, low, high = band(axes)
+        mean, std = run["belief", "mean"][:, dim], run["belief", "var"][:, dim].sqrt()
+        np.testing.assert_allclose(seconds, DT * np.arange(80))
+        np.testing.assert_allclose(low, factor * (mean - NORMAL_90 * std), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(high, factor * (mean + NORMAL_90 * std), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(line(axes, "belief")[1], factor * mean, rtol=1e-5)
+        np.testing.assert_allclose(line(axes, "truth")[1], factor * run["state"][:, dim], rtol=1e-5)
+    assert [axes.get_ylabel() for axes in panels] == ["x, m", "vy, cm/s"]
+    assert panels[1].get_xlabel() == "time, s"
+    assert panels[0].get_xlim() == pytest.approx((-0.05, 7.95))
+    # The band is one that holds the truth: 90 % of it over all runs, and so about here.
+    inside = []
+    for row in range(20):
+        _, low, high = band(plot_bands(kalman_runs()[row], dims=[1])[0])
+        truth = kalman_runs()["state"][row, :, 1].numpy()
+        inside.append((low <= truth) & (truth <= high))
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.06)
+
+
+@pytest.mark.parametrize("level", [0.9, 0.5])
+def test_an_ensembles_band_is_its_quantiles(level):
+    run = ensemble_run()
+    (axes,) = plot_bands(run, dims=[1], level=level)
+    _, low, high = band(axes)
+    members = run["belief", "ensemble"][:, :, 1].double().numpy()
+    expected = np.quantile(members, [(1 - level) / 2, (1 + level) / 2], axis=1, method="weibull")
+    np.testing.assert_allclose([low, high], expected, rtol=1e-6)
+    # Members that do not reach the level: the variance's band.
+    few = run.clone()
+    few["belief", "ensemble"] = run["belief", "ensemble"][:, :5]
+    _, low, _ = band(plot_bands(few, dims=[1])[0])
+    _, wanted, _ = band(plot_bands(run, dims=[1], band="variance")[0])
+    np.testing.assert_allclose(low, wanted)
+
+
+def test_readings_are_dots_where_they_were_observed():
+    run = ensemble_run()
+    values = torch.arange(40.0)
+    values[3] = torch.nan
+    panels = plot_bands(run, dims=[0, 2], readings={2: values}, factors=[1, 10])
+    kept = [t for t in range(40) if bool(run["observed"][t]) and t != 3]
+    times, drawn = line(panels[1], "readings")
+    assert times.tolist() == kept
+    assert drawn.tolist() == [10.0 * t for t in kept]
+    assert not [line for line in panels[0].get_lines() if line.get_label() == "readings"]
+
+
+@pytest.mark.parametrize("width", [0, 1, 2])
+def test_what_was_not_observed_is_shaded(width):
+    run = ensemble_run()
+    seen = run["observed"][:, 0].clone()
+    run["observed"] = seen if width == 0 else seen.unsqueeze(-1).repeat(1, width)
+    if width == 2:
+        run["observed"][20, 0] = False  # one of two readings is there
+    for axes in plot_bands(run, dims=[0, 1], time=DT):
+        spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
+        np.testing.assert_allclose(spans, [(0.95, 1.45), (2.95, 3.05)])
+        assert "not observed" in axes.get_legend_handles_labels()[1]
+    assert not plot_bands(run, dims=[0], observed=torch.ones(40, 1, dtype=torch.bool))[0].patches
+
+
+def test_angles_stay_beside_the_mean():
+    rng = torch.Generator().manual_seed(0)
+    theta = torch.linspace(0, 9, 30)
+    wrap = wrap_angle
+    ensemble = theta[:, None, None] + 0.1 * torch.randn(30, 19, 1, generator=rng)
+    belief = {"mean": wrap(ensemble.mean(1)), "ensemble": wrap(ensemble)}
+    run = TensorDict({"belief": belief, "state": wrap(theta).unsqueeze(-1)}, [30])
+    (axes,) = plot_bands(run, angles=[0], readings={0: wrap(theta + 0.2)})
+    _, low, high = band(axes)
+    np.testing.assert_allclose(line(axes, "truth")[1], theta, atol=1e-5)
+    np.testing.assert_allclose(line(axes, "belief")[1], ensemble.mean(1)[:, 0], atol=1e-5)
+    np.testing.assert_allclose(line(axes, "readings")[1], theta + 0.2, atol=1e-5)
+    np.testing.assert_allclose(low, np.quantile(ensemble[..., 0], 0.05, axis=1, method="weibull"), atol=1e-5)
+    assert (high - low).max() < 0.8
+
+
+def test_times_means_and_axes_may_be_passed():
+    seconds = torch.tensor([0.0, 1.0, 4.0])
+    given = Figure().subplots(2, 1)
+    panels = plot_bands(torch.ones(3, 2), torch.zeros(3, 2), time=seconds, ax=given, legend=False)
+    assert panels == list(given)
+    np.testing.assert_array_equal(line(panels[0], "belief")[0], seconds)
+    assert panels[0].get_xlim() == (-0.5, 5.5)
+    assert not panels[0].collections
+    assert panels[1].get_legend() is None
+    assert plot_bands(torch.ones(3, 1))[0].get_xlabel() == "step"
+
+
+def test_errors_say_what_to_do():
+    run = ensemble_run()
+    with pytest.raises(ValueError, match="2 Axes are needed, one a component; got 1"):
+        plot_bands(run, dims=[0, 1], ax=Figure().add_subplot())
+    with pytest.raises(ValueError, match="names needs one entry a drawn component, 3; got 1"):
+        plot_bands(run, names=["x"])
+    with pytest.raises(ValueError, match=r"readings of \[2\] belong to no drawn component"):
+        plot_bands(run, dims=[0], readings={2: torch.zeros(40)})
+    with pytest.raises(ValueError, match=r"must be \[40\]; got 39"):
+        plot_bands(run, readings={2: torch.zeros(39)})
+    with pytest.raises(ValueError, match="40 increasing seconds"):
+        plot_bands(run, time=torch.zeros(40))
+    with pytest.raises(ValueError, match='pass band="variance"'):
+        plot_bands(kalman_runs()[0], band="ensemble")
+    with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
+        plot_bands(run, level=90)

@@ -1,0 +1,48 @@
+"""What an import costs, and what is said where an extra is missing."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import torch_denkf.plots as plots
+
+
+def test_import_needs_no_library_of_pictures():
+    code = """
+import sys
+import tensordict
+before = set(sys.modules)
+import torch_denkf.plots
+new = {name.partition(".")[0] for name in set(sys.modules) - before}
+print(*sorted({"matplotlib", "PIL", "cv2", "mujoco", "rerun", "torchrl"} & new))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == []
+
+
+def test_what_is_missing_is_named_with_its_extra(monkeypatch, tmp_path):
+    walk = torch.randn(5, 2)
+    for module, extra, call in (
+        ("matplotlib.figure", "plots", lambda: plots.plot_path(walk)),
+        ("PIL", "plots", lambda: plots.write_video(tmp_path / "a.gif", [torch.zeros(8, 8)], 5)),
+        ("rerun", "viewer", lambda: plots.log_rollout(walk)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, module, None)
+            with pytest.raises(ImportError, match=rf'pip install "torch_denkf\[{extra}\]"'):
+                call()
+    assert not list(tmp_path.iterdir())
+
+
+def test_pyplot_knows_nothing_of_the_figures(tmp_path):
+    import matplotlib.pyplot as plt
+
+    before, backend = plt.get_fignums(), plt.get_backend()
+    walk = torch.randn(5, 2).cumsum(0)
+    plots.plot_path(walk)
+    plots.plot_bands(walk)
+    plots.belief_video(tmp_path / "a.gif", walk, path={}, bands={}, size=(3, 2))
+    assert plt.get_fignums() == before
+    assert plt.get_backend() == backend

@@ -1,0 +1,125 @@
+"""Oracles: the tensors that were passed, eigenvectors of known ellipses, the share of a Gaussian that one holds."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from tensordict import TensorDict
+
+from tests.plots.runs_for_tests import ensemble_run, kalman_runs
+from torch_denkf.plots import plot_path
+
+
+def lines(axes):
+    """Coordinates [T, 2] by label; the first of those without one."""
+    return {line.get_label(): np.stack(line.get_data(), -1) for line in reversed(axes.get_lines())}
+
+
+def test_lines_are_the_paths():
+    run = ensemble_run()
+    other = run["state"][:7] + 1
+    axes = plot_path(run, others={"dead reckoning": other})
+    drawn = lines(axes)
+    np.testing.assert_allclose(drawn["truth"], run["state"][:, :2], rtol=1e-6)
+    np.testing.assert_allclose(drawn["belief"], run["belief", "mean"][:, :2], rtol=1e-6)
+    np.testing.assert_allclose(drawn["dead reckoning"], other[:, :2], rtol=1e-6)
+    np.testing.assert_allclose(drawn["members"], run["belief", "ensemble"][:, 0, :2], rtol=1e-6)
+    assert len(axes.get_lines()) == 19 + 3
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, m", "y, m")
+    assert axes.get_aspect() == 1
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["members", "truth", "dead reckoning", "belief"]
+
+
+def test_a_cars_path_drives_up():
+    run = ensemble_run()
+    drawn = lines(plot_path(run, forward_up=True, factor=100, unit="cm"))
+    np.testing.assert_allclose(drawn["truth"][:, 0], -100 * run["state"][:, 1], rtol=1e-6)
+    np.testing.assert_allclose(drawn["truth"][:, 1], 100 * run["state"][:, 0], rtol=1e-6)
+    axes = plot_path(run, forward_up=True, unit="cm")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("right, cm", "forward, cm")
+
+
+@pytest.mark.parametrize("forward_up", [False, True])
+def test_ellipses_hold_their_share_of_the_belief(forward_up):
+    cov = torch.tensor([[4.0, 1.5], [1.5, 1.0]], dtype=torch.float64).expand(3, 2, 2)
+    mean = torch.tensor([[5.0, -2.0]], dtype=torch.float64).expand(3, 2)
+    belief = TensorDict({"mean": mean, "cov": cov}, [3])
+    axes = plot_path(belief, forward_up=forward_up, ellipses=2, level=0.8)
+    assert [patch.get_gid() for patch in axes.patches] == ["step 0", "step 2"]
+    rng = torch.Generator().manual_seed(0)
+    draws = mean[0] + torch.randn(50_000, 2, generator=rng, dtype=torch.float64) @ torch.linalg.cholesky(cov[0]).T
+    if forward_up:
+        draws = torch.stack([-draws[:, 1], draws[:, 0]], -1)
+    patch = axes.patches[0]
+    inside = np.linalg.norm(patch.get_patch_transform().inverted().transform(draws.numpy()), axis=-1) <= 1
+    assert inside.mean() == pytest.approx(0.8, abs=0.01)
+    # An ellipse of another direction with the same share would not have the least area.
+    area = math.pi / 4 * patch.width * patch.height
+    assert area == pytest.approx(-2 * math.log(0.2) * math.pi * math.sqrt(float(cov[0].det())))
+
+
+def test_ellipses_of_a_kalman_filter_and_of_a_variance():
+    run = kalman_runs()[0]
+    axes = plot_path(run, ellipses=5)
+    assert [patch.get_gid() for patch in axes.patches] == ["step 0", "step 20", "step 40", "step 59", "step 79"]
+    reach = math.sqrt(-2 * math.log(0.1))
+    for patch, step in zip(axes.patches, (0, 20, 40, 59, 79), strict=True):
+        np.testing.assert_allclose(patch.center, run["belief", "mean"][step, :2], rtol=1e-6)
+        squares = np.linalg.eigvalsh(run["belief", "cov"][step, :2, :2].double())
+        np.testing.assert_allclose([patch.height, patch.width], 2 * reach * np.sqrt(squares), rtol=1e-5)
+    var = TensorDict({"mean": torch.zeros(1, 2), "var": torch.tensor([[1.0, 9.0]])}, [1])
+    (patch,) = plot_path(var).patches
+    np.testing.assert_allclose([patch.height, patch.width], [2 * reach, 6 * reach])
+    assert patch.angle % 180 == pytest.approx(90)
+
+
+def test_particles_are_summed_up_with_their_weights():
+    particles = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [9.0, 9.0]]])
+    log_weight = torch.tensor([[0.5, 0.5, 0.0]]).log()
+    axes = plot_path(TensorDict({"ensemble": particles, "log_weight": log_weight}, [1]))
+    np.testing.assert_allclose(lines(axes)["belief"], [[1.0, 0.0]])
+    np.testing.assert_allclose([axes.patches[0].width, axes.patches[0].height], [2 * 2.1460, 0], atol=1e-3)
+
+
+def test_space_has_one_span():
+    axes = plot_path(ensemble_run(), dims=[0, 1, 2])
+    (truth,) = [line for line in axes.get_lines() if line.get_label() == "truth"]
+    np.testing.assert_allclose(np.stack(truth.get_data_3d(), -1), ensemble_run()["state"], rtol=1e-6)
+    spans = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    np.testing.assert_allclose(spans, spans[0])
+    assert axes.get_zlabel() == "z, m"
+
+
+def test_any_belief_and_any_axes():
+    run = ensemble_run()
+    given = Figure().add_subplot()
+    forecast = TensorDict({"forecast": {"ensemble": run["belief", "ensemble"]}, "truth": run["state"]}, [40])
+    axes = plot_path(forecast["forecast"], forecast["truth"], legend=False, ax=given)
+    assert axes is given
+    assert axes.get_legend() is None
+    np.testing.assert_allclose(lines(axes)["belief"], run["belief", "mean"][:, :2], rtol=1e-5)
+    assert set(lines(plot_path(run["belief", "mean"]))) == {"belief"}
+    assert "truth" in lines(plot_path(run.exclude("state").set("pose", run["state"]), "pose"))
+
+
+def test_errors_say_what_to_do():
+    run = ensemble_run()
+    with pytest.raises(KeyError, match=r"no \(\"belief\", \"mean\"\)"):
+        plot_path(run.select("state"))
+    with pytest.raises(KeyError, match="no 'pose' among"):
+        plot_path(run, "pose")
+    with pytest.raises(ValueError, match="one sequence"):
+        plot_path(kalman_runs())
+    with pytest.raises(ValueError, match=r'pass spread="ellipses"'):
+        plot_path(kalman_runs()[0], spread="ensemble")
+    with pytest.raises(ValueError, match="variance or a covariance"):
+        plot_path(run["belief", "mean"], spread="ellipses")
+    with pytest.raises(ValueError, match="two dimensions, or three"):
+        plot_path(run, dims=[0])
+    with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
+        plot_path(run, dims=[0, 3])
+    with pytest.raises(ValueError, match="truth must be"):
+        plot_path(run, run["state"][:5])

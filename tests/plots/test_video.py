@@ -1,0 +1,177 @@
+"""Oracles: the frames that were written, decoded by OpenCV and pillow."""
+
+import gc
+import weakref
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.plots.runs_for_tests import ensemble_run
+from torch_denkf.plots import belief_video, write_video
+
+
+def smooth_frames(count=6, height=48, width=64):
+    y, x = np.mgrid[:height, :width]
+    return [
+        np.stack([3 * x + 10 * t, 4 * y, np.full_like(x, 30 * t)], -1).clip(0, 255).astype(np.uint8)
+        for t in range(count)
+    ]
+
+
+def decoded(file):
+    """Frames [T, H, W, 3] RGB, and frames a second."""
+    if file.suffix == ".gif":
+        with Image.open(file) as gif:
+            durations = []
+            frames = []
+            for number in range(gif.n_frames):
+                gif.seek(number)
+                frames.append(np.asarray(gif.convert("RGB")))
+                durations.append(gif.info["duration"])
+            return np.stack(frames), 1000 * len(durations) / sum(durations)
+    reader = cv2.VideoCapture(str(file))
+    frames = []
+    while (read := reader.read())[0]:
+        frames.append(read[1][..., ::-1])
+    return np.stack(frames), reader.get(cv2.CAP_PROP_FPS)
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_frames_come_back(tmp_path, ending):
+    frames = smooth_frames()
+    file = write_video(tmp_path / "new" / f"a.{ending}", iter(frames), 12)
+    got, fps = decoded(file)
+    assert got.shape == (6, 48, 64, 3)
+    assert fps == pytest.approx(12, abs=0.05)
+    error = np.abs(got.astype(int) - np.stack(frames))
+    assert error.mean() < 5
+    # Each is nearest to its own.
+    for number, frame in enumerate(got.astype(int)):
+        assert np.argmin([np.abs(frame - other).mean() for other in frames]) == number
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        torch.full((1, 20, 30), 0.5),
+        torch.full((20, 30), 128, dtype=torch.uint8),
+        torch.full((6, 20, 30), 0.5),  # a frame and its difference
+        torch.full((2, 20, 30), 0.5),
+        np.full((20, 30, 3), 0.5),
+        np.full((20, 30, 4), 128, dtype=np.uint8),
+    ],
+)
+def test_layouts_of_a_frame(tmp_path, frame):
+    got, _ = decoded(write_video(tmp_path / "a.gif", [frame], 10))
+    assert got.shape == (1, 20, 30, 3)
+    assert np.abs(got.astype(int) - 128).max() <= 1
+
+
+def test_a_gif_repeats_and_keeps_time_to_a_hundredth(tmp_path):
+    with Image.open(write_video(tmp_path / "a.gif", smooth_frames(30, 8, 8), 30)) as gif:
+        assert gif.info["loop"] == 0
+        times = []
+        for number in range(gif.n_frames):
+            gif.seek(number)
+            times.append(gif.info["duration"])
+    assert set(times) == {30, 40}
+    assert sum(times) == 1000
+
+
+def test_odd_sizes_grow_by_one(tmp_path):
+    got, _ = decoded(write_video(tmp_path / "a.mp4", [torch.full((3, 21, 31), 0.5)] * 2, 10))
+    assert got.shape == (2, 22, 32, 3)
+
+
+class Frame(np.ndarray):
+    """An array that can be counted."""
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_one_frame_is_held_at_a_time(tmp_path, ending):
+    references, most = [], 0
+
+    def frames():
+        nonlocal most
+        for t in range(40):
+            frame = np.full((16, 16, 3), 6 * t, dtype=np.uint8).view(Frame)
+            references.append(weakref.ref(frame))
+            gc.collect()
+            most = max(most, sum(reference() is not None for reference in references))
+            yield frame
+
+    write_video(tmp_path / f"a.{ending}", frames(), 10)
+    assert most <= 3
+
+
+def blue(frame):
+    """Where a band or a line of the belief is."""
+    return frame[..., 2].astype(int) - frame[..., 0] > 30
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_the_belief_grows_beside_the_camera(tmp_path, ending):
+    run = ensemble_run(steps=20)
+    run["observed"] = torch.arange(20).unsqueeze(-1) != 12
+    run["pixels"] = torch.zeros(20, 3, 8, 16)
+    run["pixels"][:, 1] = torch.linspace(0.3, 1, 20)[:, None, None]  # ever greener
+    settings = {"time": 0.1, "path": {"forward_up": True}, "bands": {"dims": [0, 1]}, "every": 2, "size": (8, 5)}
+    got, fps = decoded(belief_video(tmp_path / f"a.{ending}", run, title="a title", **settings))
+    assert got.shape == (10, 500, 800, 3)
+    assert fps == pytest.approx(5, abs=0.01)
+    # The camera's picture is that of the step.
+    places = np.argwhere((got[-1, ..., 1] > 230) & (got[-1, ..., 0] < 40) & (got[-1, ..., 2] < 40))
+    top, left = places.min(0) + 4
+    bottom, right = places.max(0) - 4
+    assert (bottom - top) > 40
+    for number, frame in enumerate(got):
+        colour = frame[top:bottom, left:right].reshape(-1, 3).mean(0)
+        expected = 255 * float(run["pixels"][2 * number, 1, 0, 0])
+        np.testing.assert_allclose(colour, [0, expected, 0], atol=12)
+    # What was not observed has a vermilion frame.
+    frames_of_red = [number for number, frame in enumerate(got) if vermilion(frame[: bottom + 40, : right + 8]) > 300]
+    assert frames_of_red == [6]
+    # Bands grow to the right, and nothing is drawn beyond the step.
+    ends = [np.flatnonzero(blue(frame[110:, 440:]).any(0)).max() for frame in got]
+    assert (np.diff(ends) > 0).all()
+    np.testing.assert_allclose(np.diff(ends[1:-1]), np.diff(ends[1:-1]).mean(), atol=3)
+    path = [blue(frame[bottom + 80 :, :right]).sum() for frame in got]
+    assert (np.diff(path) > 0).sum() >= 8
+
+
+def vermilion(frame):
+    return (np.abs(frame.astype(int) - (213, 94, 0)).max(-1) <= 60).sum()
+
+
+def test_parts_may_be_left_out(tmp_path):
+    run = ensemble_run(steps=4)
+    for name, given in {
+        "bands": {"bands": {"dims": [0]}},
+        "path": {"path": {}},
+        "camera": {"pixels": np.full((4, 8, 8, 3), 200, dtype=np.uint8)},
+    }.items():
+        got, fps = decoded(belief_video(tmp_path / f"{name}.gif", run, size=(4, 3), **given))
+        assert got.shape == (4, 300, 400, 3)
+        assert fps == pytest.approx(10)
+
+
+def test_errors_say_what_to_do(tmp_path):
+    run = ensemble_run(steps=4)
+    with pytest.raises(ValueError, match=r"ends with \.mp4 or \.gif; got 'a\.avi'"):
+        write_video(tmp_path / "a.avi", smooth_frames(), 10)
+    with pytest.raises(ValueError, match="at most 50 for a GIF"):
+        write_video(tmp_path / "a.gif", smooth_frames(), 60)
+    for ending in ("mp4", "gif"):
+        with pytest.raises(ValueError, match="needs frames"):
+            write_video(tmp_path / f"a.{ending}", [], 10)
+        with pytest.raises(ValueError, match="frame 1 has shape"):
+            write_video(tmp_path / f"a.{ending}", [np.zeros((8, 8)), np.zeros((8, 9))], 10)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        belief_video(tmp_path / "a.gif", run)
+    with pytest.raises(KeyError, match="no 'image' among"):
+        belief_video(tmp_path / "a.gif", run, "image")
+    with pytest.raises(ValueError, match="a picture a step, 4; got 3"):
+        belief_video(tmp_path / "a.gif", run, torch.zeros(3, 3, 8, 8))

@@ -1,0 +1,132 @@
+"""Axes to draw into, colours that colour-blind people tell apart, and legends that cover no data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe & Ito 2008, "Color universal design".
+BELIEF, FILL, READING, TRUTH, UNSEEN = "#0072B2", "#9CCBEA", "#D55E00", "black", "0.85"
+OTHERS = ("#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#0072B2")
+DASHES = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+def new_figure(size: tuple[float, float]) -> Figure:
+    """A figure of its own that pyplot does not know, width and height in inches.
+
+    Raises:
+        ImportError: without matplotlib.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: pip install "torch_denkf[plots]"') from error
+    return Figure(figsize=size, layout="constrained")
+
+
+def axes_for(
+    ax: Axes | Sequence[Axes] | None, count: int, size: tuple[float, float], *, share: bool = False
+) -> list[Axes]:
+    """The Axes that were passed, or ``count`` new ones below each other.
+
+    Args:
+        ax: an Axes, ``count`` of them, or ``None``.
+        count: how many are needed.
+        size: of a new figure, width and height in inches.
+        share: whether new Axes share their horizontal axis.
+
+    Raises:
+        ImportError: without matplotlib.
+        ValueError: if another number of Axes was passed.
+    """
+    if ax is None:
+        figure = new_figure(size)
+        return list(figure.subplots(count, 1, sharex=share, squeeze=False).flat)
+    given = list(np.ravel(np.asarray(ax, dtype=object)))
+    if len(given) != count:
+        raise ValueError(f"{count} Axes are needed, one a component; got {len(given)}")
+    return given
+
+
+def legend_above(axes: Axes) -> None:
+    """Adds a legend over the Axes, in as many columns as fit; for a headline use ``axes.figure.suptitle``."""
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return
+    width = 1.1 * axes.get_window_extent().width / axes.figure.dpi * 72  # points; the layout to come widens it
+    sizes = [4.8 * len(label) + 43 for label in labels]
+    columns = len(labels)
+    while columns > 1:
+        rows = -(-len(labels) // columns)  # filled column by column
+        if sum(max(sizes[first : first + rows]) for first in range(0, len(sizes), rows)) <= width:
+            break
+        columns -= 1
+    legend = axes.legend(
+        handles,
+        labels,
+        loc="lower left",
+        bbox_to_anchor=(0, 1.01),
+        borderaxespad=0,
+        ncols=columns,
+        fontsize=9,
+        frameon=False,
+    )
+    for handle in legend.get_lines():  # faint lines, one of many, are seen in the legend too
+        handle.set_alpha(max(handle.get_alpha() or 1.0, 0.6))
+
+
+def labels_for(names: Sequence[str] | None, dims: Sequence[int]) -> list[str]:
+    """One label a component: the names, or ``state 3`` for dimension 3.
+
+    Raises:
+        ValueError: if there are not as many names as components.
+    """
+    if names is None:
+        return [f"state {dim}" for dim in dims]
+    if len(names) != len(dims):
+        raise ValueError(f"names needs one entry a drawn component, {len(dims)}; got {len(names)}")
+    return list(names)
+
+
+def factors_for(factors: Sequence[float] | None, dims: Sequence[int]) -> list[float]:
+    """One factor a component, 1 by default.
+
+    Raises:
+        ValueError: if there are not as many factors as components.
+    """
+    if factors is None:
+        return [1.0] * len(dims)
+    if len(factors) != len(dims):
+        raise ValueError(f"factors needs one entry a drawn component, {len(dims)}; got {len(factors)}")
+    return [float(factor) for factor in factors]
+
+
+def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
+    """Seconds of the steps ``[T]`` from the seconds between two, or the steps' numbers.
+
+    Raises:
+        ValueError: for another number of times, and where they do not increase.
+    """
+    if isinstance(time, Tensor):
+        seconds = time.detach().cpu().double().flatten().numpy()
+    else:
+        seconds = np.arange(steps) * (1.0 if time is None else float(time))
+    if len(seconds) != steps or bool((np.diff(seconds) <= 0).any()):
+        raise ValueError(f"time must be {steps} increasing seconds, one a step, or the seconds between two")
+    return seconds
+
+
+def step_bounds(seconds: np.ndarray) -> np.ndarray:
+    """Where steps begin and end, half way between their times, ``[T+1]``."""
+    if len(seconds) == 1:
+        return np.array([seconds[0] - 0.5, seconds[0] + 0.5])
+    middle = (seconds[1:] + seconds[:-1]) / 2
+    return np.concatenate([[2 * seconds[0] - middle[0]], middle, [2 * seconds[-1] - middle[-1]]])

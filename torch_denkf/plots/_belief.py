@@ -1,0 +1,155 @@
+"""What the pictures read from a roll-out: belief, truth and which readings there were."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var, weighted_mean, weighted_var
+
+Truth: TypeAlias = Tensor | NestedKey | None
+
+
+class Belief(NamedTuple):
+    """Detached, in float64 and on the CPU; what is not there is ``None``.
+
+    Attributes:
+        mean: ``[*B, S]``.
+        var: ``[*B, S]``.
+        cov: ``[*B, S, S]``.
+        ensemble: ``[*B, E, S]``.
+        log_weight: of particles, ``[*B, E]``.
+        truth: ``[*B, S']``; S' may be smaller than S.
+        observed: ``[*B, O]`` bool.
+    """
+
+    mean: Tensor
+    var: Tensor | None = None
+    cov: Tensor | None = None
+    ensemble: Tensor | None = None
+    log_weight: Tensor | None = None
+    truth: Tensor | None = None
+    observed: Tensor | None = None
+
+    @property
+    def ensemble_size(self) -> int | None:
+        """E of an ensemble whose members have one weight, else ``None``."""
+        return None if self.ensemble is None or self.log_weight is not None else self.ensemble.shape[-2]
+
+
+def read_belief(
+    belief: TensorDictBase | Tensor, truth: Truth = None, observed: Truth = None, *, one_sequence: bool = False
+) -> Belief:
+    """Reads ``("belief", ...)``, the truth and the observed mask.
+
+    Args:
+        belief: a roll-out with ``("belief", "mean")`` or ``("belief", "ensemble")``; or the belief itself, with
+            ``"mean"`` or ``"ensemble"``, such as ``rollout["forecast"]``; or means ``[*B, S]``.
+        truth: a tensor ``[*B, S']``, a key of the roll-out, or ``None`` for ``"state"`` where it is there.
+        observed: a tensor ``[*B, O]`` or ``[*B]`` bool, a key, or ``None`` for ``"observed"`` where it is there.
+        one_sequence: whether ``*B`` has to be ``T``.
+
+    Raises:
+        KeyError: if the roll-out has no belief, or not the key that was named.
+        ValueError: if the shapes do not fit.
+    """
+    if isinstance(belief, Tensor):
+        parts: dict[str, Tensor] = {"mean": number(belief)}
+        source = None
+    else:
+        source = belief
+        root = belief.get("belief", None)
+        root = belief if root is None else root
+        names = ("mean", "var", "cov", "ensemble", "log_weight")
+        parts = {name: number(root[name]) for name in names if name in set(root.keys())}
+        if not {"mean", "ensemble"} & parts.keys():
+            raise KeyError(
+                f'no ("belief", "mean") and no ("belief", "ensemble") among {list(source.keys(True, True))}; pass what '
+                'a filter\'s sequence or a roll-out of an environment with DEnKFTransform gives, or its "next"'
+            )
+    parts = _summarise(parts)
+    optional = {"truth": _entry(source, truth, "state"), "observed": _entry(source, observed, "observed")}
+    read = Belief(**parts, **{name: value for name, value in optional.items() if value is not None})
+    batch = read.mean.shape[:-1]
+    if one_sequence and len(batch) != 1:
+        raise ValueError(f"one sequence [T, S] is drawn at a time, got means {list(read.mean.shape)}; index the batch")
+    if read.observed is not None:
+        seen = read.observed.bool()
+        read = read._replace(observed=seen.unsqueeze(-1) if seen.shape == batch else seen)
+    for name in ("truth", "observed"):
+        value = getattr(read, name)
+        if value is not None and (value.ndim < 1 or value.shape[:-1] != batch):
+            raise ValueError(f"{name} must be [*B, ...] with *B = {list(batch)}; got {list(value.shape)}")
+    return read
+
+
+def number(value: Tensor) -> Tensor:
+    """The tensor detached, on the CPU, in float64; masks stay masks."""
+    value = torch.as_tensor(value).detach().cpu()
+    return value if value.dtype == torch.bool else value.double()
+
+
+def dims_of(read: Belief, dims: object) -> list[int]:
+    """Checked dimensions of the state; all by default.
+
+    Raises:
+        IndexError: if there is no such dimension.
+    """
+    size = read.mean.shape[-1]
+    chosen = list(range(size)) if dims is None else [int(dim) for dim in dims]  # type: ignore[attr-defined]
+    for dim in chosen:
+        if not 0 <= dim < size:
+            raise IndexError(f"dims names dimension {dim} of a state of {size} dimensions")
+    return chosen
+
+
+def with_truth(read: Belief, dims: list[int]) -> Tensor:
+    """The truth of the chosen dimensions, ``[*B, len(dims)]``.
+
+    Raises:
+        ValueError: without a truth, or if it lacks the dimensions.
+    """
+    if read.truth is None:
+        raise ValueError('the truth is missing: pass truth=, or a roll-out with "state"')
+    if read.truth.shape[-1] <= max(dims):
+        raise ValueError(f"the truth has {read.truth.shape[-1]} dimensions, but {dims} are to be drawn")
+    return read.truth[..., dims]
+
+
+def _entry(source: TensorDictBase | None, value: Truth, default: str) -> Tensor | None:
+    if isinstance(value, Tensor):
+        return number(value)
+    if source is None:
+        if value is not None:
+            raise KeyError(f"{value!r} is a key, but the belief is a tensor; pass a tensor")
+        return None
+    if value is None:
+        found = source.get(default, None)
+        return None if found is None else number(found)
+    found = source.get(value, None)
+    if found is None:
+        raise KeyError(f"no {value!r} among {list(source.keys(True, True))}")
+    return number(found)
+
+
+def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Adds mean, variance and covariance where they follow from what is there."""
+    ensemble, weight, cov = parts.get("ensemble"), parts.get("log_weight"), parts.get("cov")
+    out = dict(parts)
+    if cov is not None:
+        out.setdefault("var", cov.diagonal(dim1=-2, dim2=-1))
+    if ensemble is not None and weight is None:
+        out.setdefault("mean", ensemble_mean(ensemble))
+        if ensemble.shape[-2] > 1:
+            out.setdefault("var", ensemble_var(ensemble))
+            out.setdefault("cov", ensemble_cov(ensemble))
+    elif ensemble is not None and weight is not None:
+        out.setdefault("mean", weighted_mean(ensemble, weight))
+        out.setdefault("var", weighted_var(ensemble, weight))
+        centred = ensemble - weighted_mean(ensemble, weight).unsqueeze(-2)
+        share = weight.softmax(-1).unsqueeze(-1)
+        out.setdefault("cov", (share * centred).mT @ centred)
+    return out

@@ -1,0 +1,175 @@
+"""Components of a belief over time, with the band that should hold the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_denkf.metrics import ensemble_interval, wrap_angle
+from torch_denkf.plots._axes import (
+    BELIEF,
+    READING,
+    TRUTH,
+    UNSEEN,
+    axes_for,
+    factors_for,
+    labels_for,
+    legend_above,
+    step_bounds,
+    times_of,
+)
+from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_bands"]
+
+
+def plot_bands(
+    belief: TensorDictBase | Tensor,
+    truth: Truth = None,
+    *,
+    dims: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+    factors: Sequence[float] | None = None,
+    readings: Mapping[int, Tensor] | None = None,
+    observed: Truth = None,
+    time: float | Tensor | None = None,
+    level: float = 0.9,
+    band: Literal["auto", "ensemble", "variance"] = "auto",
+    angles: Sequence[int] = (),
+    legend: bool = True,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> list[Axes]:
+    """Draws components over time: the belief's mean and band, the truth, readings, and where none was observed.
+
+    Args:
+        belief: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` and ``("belief", "var")`` or
+            ``("belief", "ensemble")`` ``[T, E, S]``; or means ``[T, S]``, which have no band.
+        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
+        dims: components to draw, an Axes each; all by default.
+        names: a label with its unit for each of them, such as ``"v, m/s"``.
+        factors: what each is multiplied with, such as ``180 / pi`` for degrees.
+        readings: by component, ``[T]`` in the state's units; NaN and what is not observed are left out.
+        observed: ``[T]``, ``[T, 1]`` or ``[T, O]`` bool, or its key; by default ``"observed"`` of the roll-out where it
+            is there. Steps at which no reading was observed are shaded.
+        time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
+        level: probability of the band.
+        band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
+            the ensemble where its members have equal weights and are enough for ``level``.
+        angles: components that are angles in rad: the mean is unwrapped, all else lies within π of it.
+        legend: whether to add one above the first Axes.
+        ax: as many Axes as components; ``None`` makes a figure.
+
+    Returns:
+        The Axes, one a component.
+
+    Raises:
+        ImportError: without matplotlib; the message names the extra.
+        KeyError: if the roll-out has no belief, or not the keys that were named.
+        ValueError: for more than one sequence, for shapes that do not fit, and for a band that is not there.
+        IndexError: if ``dims`` names no dimension.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> mean = torch.zeros(5, 1)
+        >>> sequence = TensorDict({"belief": {"mean": mean, "var": mean + 4}, "state": mean + 1}, [5])
+        >>> (axes,) = plot_bands(sequence, names=["x, m"], time=0.1)
+        >>> [round(float(edge), 2) for edge in axes.collections[0].get_datalim(axes.transData).intervaly]
+        [-3.29, 3.29]
+    """
+    read = read_belief(belief, truth, observed, one_sequence=True)
+    chosen = dims_of(read, dims)
+    panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
+    labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
+    seconds = times_of(time, len(read.mean))
+    bounds = step_bounds(seconds)
+    angular = [dim in {int(angle) % read.mean.shape[-1] for angle in angles} for dim in chosen]
+    mean, lower, upper = _edges(read, chosen, angular, level, band)
+    true = None if read.truth is None else _beside(with_truth(read, chosen), mean, angular)
+    stray = sorted(set(readings or {}) - set(chosen))
+    if stray:
+        raise ValueError(f"readings of {stray} belong to no drawn component; dims are {chosen}")
+    within = f"{100 * level:g} % of the belief"
+    for column, (axes, dim, label, scale) in enumerate(zip(panels, chosen, labels, scales, strict=True)):
+        if read.observed is not None:
+            _shade(axes, bounds, ~read.observed.any(-1))
+        if lower is not None and upper is not None:
+            edges = (scale * lower[:, column].numpy(), scale * upper[:, column].numpy())
+            style: dict[str, Any] = {
+                "color": BELIEF,
+                "alpha": 0.3,
+                "linewidth": 0,
+                "label": within,
+            }
+            axes.fill_between(seconds, *edges, **style)
+        if readings is not None and dim in readings:
+            values = number(readings[dim]).reshape(-1, 1)
+            if len(values) != len(seconds):
+                raise ValueError(f"readings of component {dim} must be [{len(seconds)}]; got {len(values)}")
+            values = _beside(values, mean[:, [column]], [angular[column]])[:, 0]
+            shown = values.isfinite()
+            if read.observed is not None:
+                shown &= read.observed.any(-1)
+            dots = scale * values[shown].numpy()
+            axes.plot(seconds[shown.numpy()], dots, ".", color=READING, markersize=3.5, label="readings")
+        if true is not None:
+            axes.plot(seconds, scale * true[:, column].numpy(), color=TRUTH, linewidth=1.2, label="truth")
+        axes.plot(seconds, scale * mean[:, column].numpy(), color=BELIEF, linewidth=1.4, label="belief")
+        axes.set_ylabel(label)
+        axes.set_xlim(bounds[0], bounds[-1])
+    panels[-1].set_xlabel("step" if time is None else "time, s")
+    if legend:
+        legend_above(panels[0])
+    return panels
+
+
+def _edges(
+    read: Belief, dims: list[int], angular: list[bool], level: float, band: str
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Mean, lower and upper end of the band, each ``[T, K]``."""
+    if band not in ("auto", "ensemble", "variance"):
+        raise ValueError(f'band must be "auto", "ensemble" or "variance"; got {band!r}')
+    if not 0 < level < 1:
+        raise ValueError(f"level is the probability of the band, in (0, 1); got {level}")
+    mean = read.mean[:, dims]
+    for column, turns in enumerate(angular):
+        if turns:
+            mean[:, column] = _unwrap(mean[:, column])
+    size = read.ensemble_size
+    if band == "ensemble" and size is None:
+        raise ValueError('band="ensemble" needs ("belief", "ensemble") of equal weights; pass band="variance"')
+    if band == "variance" and read.var is None:
+        raise ValueError('band="variance" needs ("belief", "var")')
+    if size is not None and (band == "ensemble" or (band == "auto" and level <= (size - 1) / (size + 1))):
+        assert read.ensemble is not None
+        members = _beside(read.ensemble[..., dims], mean.unsqueeze(1), angular)
+        return mean, *ensemble_interval(members, level=level)
+    if read.var is None:
+        return mean, None, None
+    half = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)) * read.var[:, dims].sqrt()
+    return mean, mean - half, mean + half
+
+
+def _unwrap(angle: Tensor) -> Tensor:
+    return torch.cat([angle[:1], angle[0] + wrap_angle(angle.diff()).cumsum(0)])
+
+
+def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:
+    """The values; angles brought within π of the mean."""
+    turned = torch.tensor(angular)
+    return torch.where(turned, mean + wrap_angle(values - mean), values)
+
+
+def _shade(axes: Axes, bounds: np.ndarray, unseen: Tensor) -> None:
+    """Shades the runs of steps that were not observed, one span a run."""
+    change = np.diff(np.concatenate([[0], unseen.numpy().astype(int), [0]]))
+    for first, last in zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True):
+        label = None if axes.patches else "not observed"
+        axes.axvspan(bounds[first], bounds[last], color=UNSEEN, linewidth=0, zorder=0.5, label=label)

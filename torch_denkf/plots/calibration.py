@@ -1,0 +1,124 @@
+"""Histograms that are flat for a calibrated belief."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_denkf.metrics import histogram_band, pit, rank_histogram
+from torch_denkf.plots._axes import FILL, TRUTH, axes_for, labels_for, legend_above
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_calibration"]
+
+
+def plot_calibration(
+    belief: TensorDictBase,
+    truth: Truth = None,
+    *,
+    dims: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+    kind: Literal["auto", "pit", "rank"] = "auto",
+    bins: int = 10,
+    every: int = 1,
+    level: float = 0.99,
+    angles: Sequence[int] = (),
+    legend: bool = True,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> list[Axes]:
+    """Draws where the truth lies in the belief: flat for a calibrated filter, high at both ends if it trusts itself.
+
+    A Gaussian belief gives the probability integral transform, an ensemble the rank of the truth among its members.
+    The bars of a calibrated filter all end in the grey band with probability ``level``, if the states are independent.
+
+    Args:
+        belief: roll-outs or sequences ``[*B]``, time last, with ``("belief", "mean")`` ``[*B, S]`` and
+            ``("belief", "var")``, or ``("belief", "ensemble")`` ``[*B, E, S]``.
+        truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
+        dims: components to draw, an Axes each; all by default.
+        names: a label for each of them.
+        kind: ``"rank"`` or ``"pit"``; ``"auto"`` takes ranks where there is an ensemble whose members have equal
+            weights. Particles are taken as a Gaussian of their mean and variance.
+        bins: of the histogram. An ensemble's E+1 ranks are laid on them in equal parts.
+        every: use every n-th step of time. Errors of successive steps are alike, which moves bars out of the band.
+        level: probability of the band, for all bars of an Axes together.
+        angles: dimensions of the state that are angles in rad, whose errors are wrapped.
+        legend: whether to add one above the first Axes.
+        ax: as many Axes as components; ``None`` makes a figure.
+
+    Returns:
+        The Axes, one a component, with a bar a bin, its height in per cent of the states; the band has the gid
+        ``"band"``.
+
+    Raises:
+        ImportError: without matplotlib; the message names the extra.
+        KeyError: if the roll-out has no belief, or not the truth that was named.
+        ValueError: without a truth, for shapes that do not fit, for a kind that the belief cannot give, and for more
+            bins than an ensemble has ranks.
+        IndexError: if ``dims`` names no dimension.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> draws = torch.randn(1000, 10, 1, generator=torch.Generator().manual_seed(0))
+        >>> (axes,) = plot_calibration(TensorDict({"ensemble": draws[:, 1:]}, [1000]), draws[:, 0], names=["x"])
+        >>> [round(float(bar.get_height()), 1) for bar in axes.containers[0]]
+        [10.2, 10.2, 10.8, 9.7, 10.2, 10.2, 11.4, 9.2, 8.8, 9.3]
+    """
+    read = read_belief(belief, truth)
+    chosen = dims_of(read, dims)
+    if every < 1 or bins < 2:
+        raise ValueError(f"every must be at least 1 and bins at least 2; got {every} and {bins}")
+    ranks = kind == "rank" or (kind == "auto" and read.ensemble_size is not None)
+    if kind not in ("auto", "pit", "rank"):
+        raise ValueError(f'kind must be "auto", "pit" or "rank"; got {kind!r}')
+    if ranks and read.ensemble_size is None:
+        raise ValueError('kind="rank" needs ("belief", "ensemble") of equal weights; pass kind="pit"')
+    true = with_truth(read, chosen)
+    turns = [column for column, dim in enumerate(chosen) if dim in {int(a) % read.mean.shape[-1] for a in angles}]
+    time = slice(None, None, every)
+    true = true[..., time, :]
+    if ranks:
+        assert read.ensemble is not None
+        counts = _rebin(rank_histogram(read.ensemble[..., time, :, chosen], true, angles=turns), bins)
+    elif read.var is None:
+        raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
+    else:
+        values = pit(read.mean[..., time, chosen], read.var[..., time, chosen], true, angles=turns).flatten(0, -2)
+        counts = torch.stack([torch.histc(column, bins, 0, 1) for column in values.unbind(-1)])
+    samples = true[..., 0].numel()
+    low, high = (100 * count / samples for count in histogram_band(samples, bins, level=level))
+    panels = axes_for(ax, len(chosen), (8, 1.2 + 2.4 * len(chosen)), share=True)
+    for axes, label, heights in zip(panels, labels_for(names, chosen), counts, strict=True):
+        shares, what = 100 * heights.numpy() / samples, "ranks" if ranks else "PIT values"
+        axes.bar(np.arange(bins) / bins, shares, 1 / bins, align="edge", color=FILL, edgecolor="white", label=what)
+        axes.axhline(100 / bins, color=TRUTH, linewidth=1, linestyle=":", label="uniform")
+        band = f"a calibrated filter's bars end here ({100 * level:g} %)"
+        axes.axhspan(low, high, facecolor=(0, 0, 0, 0.12), edgecolor="0.3", linewidth=1, label=band, gid="band")
+        axes.set(ylabel=f"{label}\nshare of steps, %", xlim=(0, 1), ylim=(0, 1.1 * max(shares.max(), high)))
+    where = (
+        "rank of the truth among the members, 0 to 1" if ranks else "probability that the belief puts below the truth"
+    )
+    panels[-1].set_xlabel(where)
+    if legend:
+        legend_above(panels[0])
+    return panels
+
+
+def _rebin(counts: Tensor, bins: int) -> Tensor:
+    """Lays E+1 ranks on [0, 1] in equal parts and counts again, ``[S, bins]``; parts of ranks go to two bins."""
+    ranks = counts.shape[-1]
+    if bins > ranks:
+        raise ValueError(f"{ranks - 1} members have {ranks} ranks, too few for {bins} bins")
+    edges = torch.arange(bins + 1, dtype=torch.float64) * ranks / bins
+    total = torch.cat([torch.zeros_like(counts[:, :1]), counts.cumsum(-1)], -1)
+    whole = edges.floor().long().clamp(max=ranks - 1)
+    below = total[:, whole] + (edges - whole) * counts[:, whole]
+    return below.diff(dim=-1)

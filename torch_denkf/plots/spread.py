@@ -1,0 +1,101 @@
+"""Spread against error: does the filter know how wrong it is?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from tensordict import TensorDictBase
+
+from torch_denkf.metrics import spread_error
+from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, factors_for, labels_for, legend_above
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_spread_error"]
+
+
+def plot_spread_error(
+    belief: TensorDictBase,
+    truth: Truth = None,
+    *,
+    dims: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+    factors: Sequence[float] | None = None,
+    bins: int = 8,
+    angles: Sequence[int] = (),
+    log: bool = False,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draws the root mean square error of the mean over the predicted spread, in bins of similar spread.
+
+    On the diagonal the filter knows how wrong it is; above it, it trusts itself too much.
+
+    Args:
+        belief: roll-outs or sequences ``[*B]`` with ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "var")`` or
+            ``("belief", "ensemble")`` ``[*B, E, S]``. The spread of E members is scaled with sqrt((E+1)/E).
+        truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
+        dims: components to draw, a line each; all by default. They should have a similar size, or pass ``log``.
+        names: a label with its unit for each of them, such as ``"v, m/s"``.
+        factors: what each is multiplied with, such as ``180 / pi`` for degrees.
+        bins: points of a line, each for as many states.
+        angles: dimensions of the state that are angles in rad, whose errors are wrapped.
+        log: whether both axes are logarithmic.
+        legend: whether to add one above the Axes.
+        ax: to draw into; ``None`` makes a figure.
+
+    Returns:
+        The Axes: a line a component, then the diagonal.
+
+    Raises:
+        ImportError: without matplotlib; the message names the extra.
+        KeyError: if the roll-out has no belief, or not the truth that was named.
+        ValueError: without a truth or a variance, for shapes that do not fit, and for fewer states than bins.
+        IndexError: if ``dims`` names no dimension.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> std = torch.linspace(1, 2, 4000).unsqueeze(-1)
+        >>> belief = TensorDict({"mean": 0 * std, "var": std**2}, [4000])
+        >>> axes = plot_spread_error(belief, std * torch.randn(4000, 1), names=["x, m"])
+        >>> [line.get_label() for line in axes.get_lines()]
+        ['x, m', 'spread = error']
+    """
+    read = read_belief(belief, truth)
+    chosen = dims_of(read, dims)
+    if read.var is None:
+        raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
+    turns = [column for column, dim in enumerate(chosen) if dim in {int(a) % read.mean.shape[-1] for a in angles}]
+    points = spread_error(
+        read.mean[..., chosen],
+        read.var[..., chosen],
+        with_truth(read, chosen),
+        bins=bins,
+        ensemble_size=read.ensemble_size,
+        angles=turns,
+    )
+    (axes,) = axes_for(ax, 1, (6.4, 6.8))
+    labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
+    lowest, highest = float("inf"), 0.0
+    for column, (label, scale) in enumerate(zip(labels, scales, strict=True)):
+        spread, error = scale * points.spread[column].numpy(), scale * points.error[column].numpy()
+        colour = (BELIEF, *OTHERS)[column % 6]
+        axes.plot(spread, error, "-", marker=MARKERS[column % len(MARKERS)], color=colour, label=label)
+        lowest = min(lowest, spread.min(), error.min())
+        highest = max(highest, spread.max(), error.max())
+    low, high = (lowest / 1.2, highest * 1.2) if log else (0.0, highest * 1.05)
+    axes.plot([low, high], [low, high], ":", color=TRUTH, label="spread = error")
+    if log:
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    units = {label.rpartition(", ")[2] for label in labels if ", " in label}
+    unit = f", {units.pop()}" if len(units) == 1 else ""
+    axes.set(xlabel=f"predicted spread{unit}", ylabel=f"RMS error{unit}", xlim=(low, high), ylim=(low, high))
+    axes.set_aspect("equal", adjustable="box")
+    if legend:
+        legend_above(axes)
+    return axes

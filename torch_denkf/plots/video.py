@@ -1,0 +1,224 @@
+"""Videos: frames to a file, and a belief that grows with time beside what the camera saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torch_denkf.plots._axes import BELIEF, READING, new_figure, step_bounds, times_of
+from torch_denkf.plots._belief import Truth, read_belief
+from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
+from torch_denkf.plots._pixels import find_pixels
+from torch_denkf.plots.bands import plot_bands
+from torch_denkf.plots.path import plot_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
+__all__ = ["belief_video", "write_video"]
+
+
+def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: float) -> Path:
+    """Writes frames one by one, so that only one is held in memory; needs no display.
+
+    Args:
+        file: ``.mp4`` is written by OpenCV as MPEG-4, ``.gif`` by pillow with 256 colours a frame. Its folder is made.
+        frames: pictures of one size, ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1]; see
+            :func:`belief_video` for C. Odd heights and widths of an MP4 grow by one row or column.
+        fps: frames a second; at most 50 for a GIF, whose times are hundredths of a second.
+
+    Returns:
+        The file.
+
+    Raises:
+        ImportError: for a GIF without pillow; the message names the extra.
+        ValueError: for another ending, without frames, for frames of several sizes or other shapes, and for ``fps``
+            out of range.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> file = write_video(f"{tempfile.mkdtemp()}/grey.gif", (torch.full((8, 8), t / 9) for t in range(10)), fps=25)
+        >>> file.name
+        'grey.gif'
+    """
+    file = Path(file)
+    writers = {".mp4": write_mp4, ".gif": write_gif}
+    if file.suffix.lower() not in writers:
+        raise ValueError(f"a video ends with .mp4 or .gif; got {file.name!r}")
+    if not fps > 0 or (file.suffix.lower() == ".gif" and fps > 50):
+        raise ValueError(f"fps must be positive, and at most 50 for a GIF; got {fps}")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    writers[file.suffix.lower()](file, (as_picture(frame) for frame in frames), fps)
+    return file
+
+
+def belief_video(
+    file: str | Path,
+    belief: TensorDictBase | Tensor,
+    pixels: Tensor | np.ndarray | NestedKey | None = None,
+    *,
+    truth: Truth = None,
+    observed: Truth = None,
+    time: float | Tensor | None = None,
+    path: Mapping[str, Any] | None = None,
+    bands: Mapping[str, Any] | None = None,
+    title: str | None = None,
+    fps: float | None = None,
+    every: int = 1,
+    size: tuple[float, float] = (10, 5.6),
+    dpi: float = 100,
+) -> Path:
+    """Writes a video of one sequence: the camera, the path and the bands, growing with time.
+
+    Frames are drawn and written one by one. A red frame around the picture marks steps that were not observed.
+
+    Args:
+        file: ``.mp4`` or ``.gif``, see :func:`write_video`.
+        belief: a roll-out or sequence of T steps, see :func:`plot_path` and :func:`plot_bands`.
+        pixels: pictures ``[T, C, H, W]`` or ``[T, H, W, C]``, or their key; by default ``"pixels"`` of the roll-out
+            where it is there. One channel is grey, three are colours. Of more, as of a frame with its difference to the
+            one before, the first three are drawn, of two the first.
+        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
+        observed: ``[T, 1]`` bool, or its key; by default ``"observed"`` of the roll-out where it is there.
+        time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
+        path: keywords of :func:`plot_path` for two dims, such as ``{"forward_up": True}``; ``None`` leaves it out.
+        bands: keywords of :func:`plot_bands`, such as ``{"dims": [3, 4]}``; ``None`` leaves them out.
+        title: headline.
+        fps: frames a second; by default those of the sequence's own speed, 10 where ``time`` is not given.
+        every: draw every n-th step; the default of ``fps`` follows.
+        size: of a frame, width and height in inches.
+        dpi: pixels an inch.
+
+    Returns:
+        The file.
+
+    Raises:
+        ImportError: without matplotlib or pillow; the message names the extra.
+        KeyError: if the roll-out lacks a key that was named.
+        ValueError: if there is nothing to draw, and for all that the functions above refuse.
+
+    Example:
+        >>> import tempfile
+        >>> walk = torch.randn(4, 2).cumsum(0)
+        >>> file = belief_video(f"{tempfile.mkdtemp()}/walk.gif", walk, path={}, bands={}, size=(3, 2))
+    """
+    read = read_belief(belief, truth, observed, one_sequence=True)
+    pictures = find_pixels(belief, pixels, len(read.mean))
+    if every < 1:
+        raise ValueError(f"every counts steps and must be at least 1; got {every}")
+    if pictures is None and path is None and bands is None:
+        raise ValueError("nothing to draw: pass pixels, path={} or bands={}")
+    scene = _Scene(size, dpi, title, pictures, path is not None, _panel_count(bands, read.mean.shape[-1]))
+    if path is not None:
+        plot_path(belief, truth, ax=scene.path, **path)
+    if bands is not None:
+        given = {"observed": observed, "time": time, "ax": scene.bands, **bands}
+        plot_bands(belief, truth, **given)
+    scene.freeze(None if read.observed is None else read.observed.any(-1), times_of(time, len(read.mean)))
+    frames = (scene.frame(step) for step in range(0, len(read.mean), every))
+    return write_video(file, frames, _own_speed(time, every) if fps is None else fps)
+
+
+class _Scene:
+    """The figure of a video: everything is drawn once, and each frame shows what has happened until then."""
+
+    def __init__(
+        self,
+        size: tuple[float, float],
+        dpi: float,
+        title: str | None,
+        pictures: Tensor | np.ndarray | None,
+        path: bool,
+        bands: int,
+    ):
+        figure = new_figure(size)
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        figure.set_dpi(dpi)
+        self.canvas, self.figure, self.pictures = FigureCanvasAgg(figure), figure, pictures
+        left = (pictures is not None) + path
+        columns = figure.add_gridspec(1, 2 if left and bands else 1, width_ratios=[1, 1.25] if left and bands else None)
+        self.camera = self.path = None
+        if left:
+            rows = columns[0, 0].subgridspec(left, 1, height_ratios=[1, 1.6] if left == 2 else None)
+            if pictures is not None:
+                self.camera = figure.add_subplot(rows[0])
+                self.image = self.camera.imshow(as_picture(pictures[0]), interpolation="nearest")
+                self.camera.set(xticks=[], yticks=[])
+            if path:
+                self.path = figure.add_subplot(rows[-1])
+        self.bands: list[Axes] = []
+        if bands:
+            grid = columns[0, -1].subgridspec(bands, 1)
+            for row in range(bands):
+                self.bands.append(figure.add_subplot(grid[row], sharex=self.bands[0] if row else None))
+                self.bands[row].tick_params(labelbottom=row == bands - 1)
+        if title is not None:
+            figure.suptitle(title)
+
+    def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
+        """Fixes layout and limits, and remembers what is to grow."""
+        self.seen, self.bounds = seen, step_bounds(seconds)
+        self.figure.draw_without_rendering()
+        self.figure.set_layout_engine("none")
+        drawn = [axes for axes in (self.path, *self.bands) if axes is not None]
+        for axes in drawn:
+            axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())
+        self.lines: list[tuple[Line2D, np.ndarray]] = []
+        if self.path is not None:
+            self.path.set_aspect("auto")  # the limits are those of equal scales
+            self.lines = [(line, np.asarray(line.get_data())) for line in self.path.get_lines()]
+            self.lines = [(line, data) for line, data in self.lines if data.shape[1] == len(seconds)]
+            self.here = self.path.plot([], [], "o", color=BELIEF, markersize=5, zorder=3)[0]
+
+    def frame(self, step: int) -> np.ndarray:
+        """The picture of one step, ``[H, W, 3]`` uint8."""
+        if self.camera is not None and self.pictures is not None:
+            self.image.set_data(as_picture(self.pictures[step]))
+            unseen = self.seen is not None and not bool(self.seen[step])
+            self.camera.set_xlabel("not observed" if unseen else " ", color=READING)
+            for spine in self.camera.spines.values():
+                spine.set(color=READING if unseen else "black", linewidth=3 if unseen else 0.8)
+        for line, data in self.lines:
+            line.set_data(data[:, : step + 1])
+            if line.get_label() == "belief":
+                self.here.set_data(data[:, step : step + 1])
+        if self.path is not None:
+            for patch in self.path.patches:
+                patch.set_visible(int(str(patch.get_gid()).removeprefix("step ")) <= step)
+        for axes in self.bands:
+            self._uncover(axes, self.bounds[step + 1])
+        self.canvas.draw()
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+    @staticmethod
+    def _uncover(axes: Axes, until: float) -> None:
+        """Clips what is drawn in the Axes at the right of ``until``."""
+        from matplotlib.transforms import Bbox, TransformedBbox
+
+        box = TransformedBbox(Bbox([[axes.get_xlim()[0], 0], [until, 1]]), axes.get_xaxis_transform())
+        for artist in (*axes.lines, *axes.collections, *axes.patches):
+            artist.set_clip_path(None)
+            artist.set_clip_box(box)
+
+
+def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:
+    if bands is None:
+        return 0
+    return state_dim if bands.get("dims") is None else len(bands["dims"])
+
+
+def _own_speed(time: float | Tensor | None, every: int) -> float:
+    """Frames a second at which the sequence goes by as fast as it did."""
+    if time is None:
+        return 10.0 / every
+    dt = float(torch.as_tensor(time).flatten().diff().median()) if isinstance(time, Tensor) else time
+    return 1.0 / (dt * every)
