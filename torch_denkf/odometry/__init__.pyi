@@ -3,8 +3,9 @@ from .checkpoint import load_car_filter, read_config, save_car_filter
 from .evaluation import evaluate_car_filter, markdown_table, write_rows
 from .images import read_camera, read_frames, read_times
 from .paths import read_path, write_path
+from .roles import assign_roles
 from .tracking import TrackedBelief, track
-from .training import Updates, assign_roles, train_car_filter
+from .training import Updates, train_car_filter
 
 __all__ = [
     "CarFilter",

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torch_denkf._progress import progress_bar
 from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_devkit_error, kitti_endpoint_error
-from torch_denkf.odometry.batches import filter_readings, first_state
 from torch_denkf.odometry.car import VELOCITIES, CarFilter
+from torch_denkf.odometry.scores import filter_readings, first_state
 from torch_denkf.odometry.streams import Drive, all_frames, lose_frames, read_spans
 from torch_denkf.vision import KITTI_HEIGHT
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.data import list_kitti_drives, render_drives
-from torch_denkf.odometry.batches import (
+from torch_denkf.odometry.batches import PairSampler, ReadingSampler
+from torch_denkf.odometry.car import VELOCITIES, CarFilter, CarSettings
+from torch_denkf.odometry.checkpoint import save_car_filter
+from torch_denkf.odometry.roles import drives_by_role, recorded_drives, rendered_drives
+from torch_denkf.odometry.scores import (
     EndToEndLoss,
-    PairSampler,
-    ReadingSampler,
     SensorLoss,
     belief_error,
     belief_loss,
@@ -24,15 +25,11 @@ from torch_denkf.odometry.batches import (
     gain_of,
     sensor_error,
 )
-from torch_denkf.odometry.car import VELOCITIES, CarFilter, CarSettings
-from torch_denkf.odometry.checkpoint import save_car_filter
 from torch_denkf.odometry.streams import Drive, read_spans
 from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.vision import KITTI_HEIGHT
 
-__all__ = ["Updates", "assign_roles", "train_car_filter"]
-
-_PITCH = 0.03  # rad: rendered cameras look at most so far up or down
+__all__ = ["Updates", "train_car_filter"]
 
 
 @dataclass(frozen=True)
@@ -56,26 +53,6 @@ class Updates:
             raise ValueError(f"each stage needs at least one update, and windows two steps; got {self}.")
 
 
-def assign_roles(names: Sequence[str]) -> dict[str, list[str]]:
-    """Who trains what: a tenth of the drives validates, a quarter trains the filter, the others train the sensor.
-
-    A single drive trains the filter; of two, the second trains the sensor.
-
-    Args:
-        names: of drives of one kind, recorded or rendered.
-
-    Returns:
-        Names by role: ``"validation"``, ``"filter"``, ``"sensor"``.
-
-    Example:
-        >>> assign_roles(["00", "01", "02", "03"])
-        {'validation': ['00'], 'filter': ['01'], 'sensor': ['02', '03']}
-    """
-    checked = max(len(names) // 10, 1) if len(names) > 2 else 0
-    tuned = checked + (max(len(names) // 4, 1) if names else 0)
-    return {"validation": list(names[:checked]), "filter": list(names[checked:tuned]), "sensor": list(names[tuned:])}
-
-
 def train_car_filter(
     out: str | Path,
     *,
@@ -96,7 +73,7 @@ def train_car_filter(
     """Trains a car filter on recorded drives, rendered ones, or both.
 
     A filter learns how wrong its sensor is on new drives, so the sensor and the filter learn from different ones; and
-    what decides between parameters is measured on a third kind (:func:`assign_roles`). The stages:
+    what decides between parameters is measured on a third kind (:func:`torch_denkf.odometry.assign_roles`). The stages:
 
     1. the sensor alone, by the CRPS of its samples against the true velocities;
     2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are lost on purpose, and
@@ -140,14 +117,12 @@ def train_car_filter(
     """
     out, updates, longest = Path(out).expanduser(), updates or Updates(), CarSettings.longest
     common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache"}
-    recorded = (
-        [Drive(Path(root), name, height=height, **common) for name in _names(root, drives, leave_out)] if root else []
-    )
-    roles = _roles(recorded, _rendered(out / "rendered", rendered, frames, seed, processes, progress, common))
+    recorded = recorded_drives(root, drives, leave_out, height=height, **common) if root is not None else []
+    options: dict[str, Any] = {"frames": frames, "seed": seed, "processes": processes, "progress": progress}
+    roles = drives_by_role(recorded, rendered_drives(out / "rendered", rendered, **options, **common))
     alone = [each for drive in roles["sensor"] for each in (*drive.disturbed(), *drive.longer(longest))]
-    data = _read(
-        [*alone, *(s for role in ("filter", "validation") for d in roles[role] for s in _spans(d, longest))], progress
-    )
+    others = [part for role in ("filter", "validation") for drive in roles[role] for part in drive.disturbed()]
+    data = _read([*alone, *(each for part in others for each in part.spans(longest))], progress)
 
     torch.manual_seed(seed)
     car = CarFilter(_settings(alone, data))
@@ -171,52 +146,6 @@ def train_car_filter(
 
 
 # ---------------------------------------------------------------------------------------------------------- the drives
-
-
-def _names(root: str | Path, drives: Sequence[str] | None, leave_out: Sequence[str]) -> list[str]:
-    """Drives below ``root`` that may be seen."""
-    there = list_kitti_drives(root)
-    if unknown := [name for name in (*(drives or ()), *leave_out) if name not in there]:
-        raise FileNotFoundError(f"no drives {unknown} with images and poses below {root}; it has {there}")
-    names = [name for name in (drives or there) if name not in leave_out]
-    if not names:
-        raise FileNotFoundError(f"no drive below {root} has both images and poses, or all are left out")
-    return names
-
-
-def _rendered(
-    root: Path, count: int, frames: int, seed: int, processes: int | None, progress: bool, common: dict
-) -> list[Drive]:
-    """Renders drives with traffic; each is seen by a camera that is turned up or down a little, as another car's is."""
-    if not count:
-        return []
-    names = [f"r{number:02d}" for number in range(count)]
-    with progress_bar("rendering", count * frames, unit=" images", shown=progress) as bar:
-        options = {"names": names, "frames": frames, "size": common["size"], "seed": seed, "processes": processes}
-        render_drives(root, **options, progress=bar.update)
-    pitches = (torch.rand(count, generator=torch.Generator().manual_seed(seed)) * 2 - 1) * _PITCH
-    return [
-        Drive(root, name, pitch=round(float(pitch), 4), **common) for name, pitch in zip(names, pitches, strict=True)
-    ]
-
-
-def _roles(*kinds: Sequence[Drive]) -> dict[str, list[Drive]]:
-    """The drives of all kinds by role; in each role every drive has the same weight."""
-    roles: dict[str, list[Drive]] = {"validation": [], "filter": [], "sensor": []}
-    for kind in kinds:
-        of = {drive.name: drive for drive in kind}
-        for role, names in assign_roles(list(of)).items():
-            roles[role] += [of[name] for name in names]
-    if lacking := [role for role, parts in roles.items() if not parts]:
-        raise ValueError(
-            f"{sum(map(len, kinds))} drives are too few: none is left for {lacking}. Pass three or more, recorded "
-            "(root, drives) or rendered"
-        )
-    return {role: [replace(drive, weight=1 / len(parts)) for drive in parts] for role, parts in roles.items()}
-
-
-def _spans(drive: Drive, longest: int) -> list[Drive]:
-    return [each for part in drive.disturbed() for each in part.spans(longest)]
 
 
 def _read(drives: Sequence[Drive], progress: bool) -> dict[Drive, TensorDict]:
