@@ -31,7 +31,7 @@ layers: $(STAMP)
 	$(BIN)/lint-imports
 
 define suite
-OMP_NUM_THREADS=1 $(1)/bin/python -m pytest -n 2
+OMP_NUM_THREADS=1 $(1)/bin/python -m pytest -n 2 -rs
 OMP_NUM_THREADS=1 $(1)/bin/python -m pytest -n 2 tests/filters/test_kalman.py --compiled
 endef
 

@@ -6,7 +6,19 @@ from .envs.kitti import KITTIReplayEnv
 from .envs.linear import LinearGaussianEnv
 from .envs.ur5.expert import UR5Expert
 from .envs.ur5.table import UR5TableEnv
-from .filters import DPF, EKF, PFM, UKF, BackpropKF, DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter
+from .filters import (
+    DPF,
+    EKF,
+    PFM,
+    UKF,
+    BackpropKF,
+    DEnKF,
+    Filter,
+    KalmanFilter,
+    LSTMFilter,
+    MixtureParticleFilter,
+    ParticleFilter,
+)
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .training import FilterTrainer, Stage
 from .transforms import (
@@ -44,6 +56,7 @@ __all__ = [
     "LeRobotExperienceReplay",
     "LinearGaussianEnv",
     "MissingFrames",
+    "MixtureParticleFilter",
     "MixtureLoss",
     "ObservationLoss",
     "OccludingBox",

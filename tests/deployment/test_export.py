@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
 
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
@@ -136,6 +137,21 @@ def test_training_mode_is_left_as_it_was(tmp_path):
         filter, TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}), tmp_path / "a.pt2", compiled=False
     )
     assert filter.training
+
+
+def test_a_filter_in_training_is_exported_as_it_is_evaluated(tmp_path):
+    """A user's network with layers that depend on the mode: the package holds their deterministic forward."""
+    filter = small_filter()
+    filter.module["transition"] = LearnedTransition(nn.Sequential(nn.Dropout(0.5), nn.Linear(3, 3)))
+    example = TensorDict({"state": torch.ones(3), "reading": torch.zeros(2), "observed": torch.tensor([False])})
+    step = load_step(export_step(filter.train(), example, tmp_path / "a.pt2", compiled=False))
+    assert set(example.keys()) == {"state", "reading", "observed"}, "the example is left as it is"
+    row = filter.initialise(example.copy())
+    found = step({name: row[tuple(name.split("."))] for name in step.inputs})
+    assert set(step.outputs) == {f"belief.{name}" for name in ("ensemble", "mean", "var")}
+    expected = filter.eval().step(row)
+    for name in step.outputs:
+        torch.testing.assert_close(found[name], expected[tuple(name.split("."))])
 
 
 def test_errors(tmp_path, monkeypatch):

@@ -4,9 +4,11 @@ import pickle
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from tests.filters.factories import has_compiler, toy_denkf, toy_frames
+from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
 from torch_denkf.filters.inductor import need_compiler
+from torch_denkf.modules import ConstantNoise, LinearObservation
 
 #: float32: a few roundings through eight steps; float64 likewise.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -29,7 +31,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
     filter.compile(chunk=2, backend="eager")
     compiled = filter.sequence(frames.copy(), detach_every=2)
     compiled_step = filter.step(eager[:, 2].copy())
-    assert sorted(facts[0] for facts in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
+    assert sorted(kind[0] for kind in filter.compiled._functions) == ["chunk", "chunk", "first", "step"]
     assert_close(compiled, eager, filter.out_keys, dtype)
     assert_close(compiled_step, eager_step, filter.out_keys, dtype)
     ours = torch.autograd.grad(compiled["belief", "mean"].square().sum(), list(filter.parameters()))
@@ -135,3 +137,29 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
     assert toy_denkf().compile(backend="eager").compiled is not None  # dynamo alone needs none
     with pytest.raises(RuntimeError, match="C\\+\\+ compiler"):
         need_compiler()
+
+
+def test_a_part_or_an_option_that_is_replaced_after_compiling_is_noticed(float64):
+    torch.manual_seed(0)
+    filter, frames = linear_denkf(), TensorDict({"observation": torch.randn(2, 5, 2)}, [2, 5])
+    outs = []
+
+    def agree(change):
+        change(filter)
+        found = []
+        for compiled in (None, cache):
+            filter.compiled = compiled
+            sequence = filter.sequence(frames.copy())
+            step = filter.step(sequence[:, -1].copy())
+            found.append(torch.cat([sequence["belief", "mean"], step["belief", "mean"].unsqueeze(1)], 1))
+        torch.testing.assert_close(found[1], found[0], rtol=0, atol=1e-12)
+        assert not any(found[0].allclose(other) for other in outs)
+        outs.append(found[0])
+
+    cache = filter.compile(chunk=2, backend="eager").compiled
+    agree(lambda model: None)
+    agree(
+        lambda model: model.module.__setitem__("observation", LinearObservation(torch.diag(torch.tensor([2.0, 3.0]))))
+    )
+    agree(lambda model: model.module.__setitem__("noise", ConstantNoise([1.0, 2.0], in_key="observation")))
+    agree(lambda model: setattr(model, "update_at_reset", True))

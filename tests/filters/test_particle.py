@@ -10,7 +10,7 @@ from tests.filters.differences_for_tests import central_difference
 from tests.filters.factories import OBS, NoisyLinear, assert_equal, linear_system, make_dyadic, stepwise, toy_frames
 from tests.filters.particle_for_tests import BELIEF, SCHEMES, E, bootstrap, toy_filter
 from torch_denkf.filters import ParticleFilter
-from torch_denkf.modules import ConstantNoise, GaussianLikelihood, LinearObservation
+from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -119,6 +119,23 @@ def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
     for t in (3, 4):
         assert found["forecast", "log_weight"][:, t].equal(found["belief", "log_weight"][:, t - 1]), "not resampled"
     assert found["forecast", "log_weight"][:, 2].std() < found["belief", "log_weight"][:, 2].std()
+
+
+def test_the_default_likelihood_heeds_a_mask_of_another_name(float64):
+    """Without a likelihood of its own the filter makes one: the mask is for that, too."""
+    F, Q, H, R = linear_system()
+    prior = GaussianPrior([1.0, -1.0], [1.0, 1.4], ensemble_size=20)
+    noise = ConstantNoise(R.sqrt(), in_key=("sensor", "ensemble"), out_key=("camera", "r"))
+    parts = (NoisyLinear(F, torch.linalg.cholesky(Q)), None, LinearObservation(H))
+    usual, renamed = (ParticleFilter(*parts, initial=prior, noise=noise, **key) for key in ({}, {"observed_key": "up"}))
+    frames = TensorDict({"sensor": {"ensemble": torch.randn(3, 8, 1, 2)}}, [3, 8])
+    frames["observed"] = torch.rand(3, 8, 2) < 0.6
+    frames = usual.draw_noise(frames)
+    expected = usual.sequence(frames.copy())
+    frames["up"] = frames["observed"]
+    assert_equal(renamed.sequence(frames.copy().exclude("observed")), expected, BELIEF)
+    frames["observed"] = ~frames["observed"]  # somebody else's
+    assert_equal(renamed.sequence(frames.copy()), expected, BELIEF)
 
 
 # ------------------------------------------------------------------------------------------------- gradients

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, M, toy_frames
 from tests.filters.particle_for_tests import E, toy_parts
-from torch_denkf.filters import DPF, PFM, ParticleFilter
+from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
     AroundState,
     ClonedPrior,
@@ -46,14 +46,16 @@ def test_dpf():
 @pytest.mark.parametrize("learned", [False, True])
 def test_pfm(learned):
     likelihood = LearnedLikelihood(M, OBS, bound="clipped", encoding_key="measurement") if learned else None
-    filter = PFM(**toy_parts(), noise=None if learned else DiagonalNoise(OBS), learned_likelihood=likelihood)
+    filter = MixtureParticleFilter(
+        **toy_parts(), noise=None if learned else DiagonalNoise(OBS), learned_likelihood=likelihood
+    )
     assert (filter["transition"].scheme, filter["transition"].alpha) == ("soft", 0.05)
     assert isinstance(filter["likelihood"], LearnedLikelihood if learned else GaussianLikelihood)
     out = filter.sequence(toy_frames((3, 6)))
     out["belief", "mean"].square().sum().backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())
     with pytest.raises(ValueError, match="its Gaussian likelihood, or a learned_likelihood"):
-        PFM(**toy_parts())
+        MixtureParticleFilter(**toy_parts())
 
 
 def test_what_is_there_already_is_kept():

@@ -25,6 +25,7 @@ from torch_denkf.modules import (
     PairObservation,
     Select,
     StochasticMLP,
+    SubModel,
     UnicycleMotion,
     UnicycleTransition,
     VectorSensor,
@@ -242,3 +243,34 @@ def test_float64(name):
     module, td = make(name)
     out = run(module.double(), td.to(torch.float64))
     assert all(out[key].dtype != torch.float32 for key in module.out_keys)
+
+
+class TwoNoises(SubModel):
+    """Adds two noises by name to a value, behind an entry of whole numbers."""
+
+    noise_names = ("push", "pull")
+
+    def __init__(self):
+        super().__init__(nn.Identity(), ["count", "x"], ["y"])
+
+    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None, **_):
+        draw = lambda: torch.randn(*batch_size, 2, device=device, dtype=dtype, generator=generator)  # noqa: E731
+        return {"push": draw(), "pull": draw()}
+
+    def compute(self, count, x, *, noise):
+        return count.unsqueeze(-1) * x + noise["push"] - noise["pull"]
+
+
+def test_noise_is_drawn_in_the_precision_of_what_is_read_and_all_or_none_is_given():
+    module, zero = TwoNoises(), torch.zeros(3, 2, dtype=torch.float64)
+    td = TensorDict({"count": torch.tensor([1, 2, 3]), "x": zero}, [3])
+    torch.manual_seed(0)
+    drawn = torch.randn(2, 3, 2, dtype=torch.float64)
+    torch.manual_seed(0)
+    assert module(td.copy())["y"].equal(drawn[0] - drawn[1])
+    given = {"push": zero + 1.0, "pull": zero + 3.0}
+    td["noise", "self"] = given
+    assert (module(td.copy())["y"] == -2.0).all()
+    del td["noise", "self", "pull"]  # half of it is as good as none
+    torch.manual_seed(0)
+    assert module(td)["y"].equal(drawn[0] - drawn[1])

@@ -150,3 +150,82 @@ def test_an_episode_that_is_done_needs_a_mark_after_it():
     rows["next", "done"] = (torch.arange(12) % 6 == 5).unsqueeze(-1)
     with pytest.raises(ValueError, match=r"is done, and the next begins, at 6"):
         objective()(rows)
+
+
+# ------------------------------------------------------------------------------------- what breaks, and what goes on
+
+
+def rows_of(count=12):
+    return TensorDict({"observation": torch.randn(count, 2), "state": torch.randn(count, 2)}, [count])
+
+
+def with_next(rows, breaks_at=None):
+    """``rows`` and a ``"next"`` part that is what follows, but for one break."""
+    following = torch.roll(rows["observation"], -1, 0).clone()
+    if breaks_at is not None:
+        following[breaks_at - 1] += 1.0
+    done = (torch.arange(len(rows)) == len(rows) - 1).unsqueeze(-1)
+    return rows.copy().set("next", TensorDict({"observation": following, "done": done}, [len(rows)]))
+
+
+def accepted(batch, as_rows):
+    torch.testing.assert_close(objective()(batch)["loss_state"], objective()(as_rows)["loss_state"])
+
+
+def refused(batch, match):
+    with pytest.raises(ValueError, match=match):
+        objective()(batch)
+
+
+def test_a_clock_may_leap_within_slices_that_are_marked():
+    """A camera that lost a frame; without marks it looks like the next slice."""
+    rows = rows_of()
+    batch = rows.copy().set("step", torch.tensor([0, 1, 2, 3, 4, 5, 0, 1, 2, 5, 6, 7]))
+    refused(batch.select("observation", "state", "step")[5:], "'step' does not go on")
+    accepted(batch.set("is_init", torch.arange(12) % 6 == 0), rows.reshape(2, 6))
+    batch["step"][10] = 0  # back, that is another one all the same
+    refused(batch, r"'step' does not go on.* at 10")
+
+
+def test_one_step_left_out_is_a_leap():
+    rows = rows_of()
+    refused(rows.copy().set("step", torch.tensor([0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12])), "at 6")
+    uneven = torch.tensor([0.0, 0.1, 0.2, 0.34, 0.44, 0.54, 0.64, 0.74, 0.84, 0.94, 1.04, 1.14])
+    accepted(rows.copy().set("time", uneven), rows)
+
+
+def test_an_entry_that_never_changes_does_not_hide_a_break():
+    rows = rows_of().set("goal", torch.ones(12, 3))
+    batch = with_next(rows, breaks_at=6)
+    batch["next", "goal"] = torch.ones(12, 3)
+    refused(batch, r"what was next is not what follows at 6")
+    whole = with_next(rows)
+    whole["next", "goal"] = torch.ones(12, 3)
+    accepted(whole, rows)
+    still = rows_of(1).expand(12).clone()
+    accepted(with_next(still), still)  # a robot that stands still goes on
+
+
+def test_readings_that_are_no_numbers_go_on():
+    rows = rows_of()
+    rows["camera"] = torch.randn(12, 2)
+    rows["camera"][4:6] = torch.nan
+    batch = with_next(rows)
+    batch["next"] = TensorDict({"camera": torch.roll(rows["camera"], -1, 0), "done": batch["next", "done"]}, [12])
+    accepted(batch, rows)
+
+
+def test_the_numbers_of_the_next_step_are_one_ahead():
+    """An episode's number under ``"next"`` changes one element before the mark."""
+    rows = rows_of().set("episode", torch.arange(12) // 6)
+    rows["is_init"] = (torch.arange(12) % 6 == 0).unsqueeze(-1)
+    batch = with_next(rows)
+    batch["next", "episode"] = torch.tensor([0] * 5 + [1] * 7)
+    accepted(batch, rows.select("observation", "state").reshape(2, 6))
+
+
+def test_a_marked_beginning_is_enough_where_nothing_else_tells():
+    rows = rows_of()
+    batch = rows.copy().set(("next", "done"), torch.zeros(12, 1, dtype=torch.bool))
+    refused(batch, "may hold several sequences")
+    accepted(batch.set("is_init", (torch.arange(12) % 6 == 0).unsqueeze(-1)), rows.reshape(2, 6))

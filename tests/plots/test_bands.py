@@ -77,6 +77,8 @@ def test_readings_are_dots_where_they_were_observed():
     assert times.tolist() == kept
     assert drawn.tolist() == [10.0 * t for t in kept]
     assert not [line for line in panels[0].get_lines() if line.get_label() == "readings"]
+    labels = [text.get_text() for text in panels[0].get_legend().get_texts()]
+    assert labels == ["not observed", "90 % of the belief", "truth", "belief", "readings"]
 
 
 @pytest.mark.parametrize("width", [0, 1, 2])

@@ -84,6 +84,15 @@ def test_particles_are_summed_up_with_their_weights():
     np.testing.assert_allclose([axes.patches[0].width, axes.patches[0].height], [2 * 2.1460, 0], atol=1e-3)
 
 
+def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
+    run = ensemble_run()
+    for patch in plot_path(run, spread="ellipses", ellipses=3).patches:
+        step = int(patch.get_gid().removeprefix("step "))
+        squares = np.linalg.eigvalsh(np.cov(run["belief", "ensemble"][step, :, :2].double().numpy().T))
+        wanted = 2 * math.sqrt(-2 * math.log(0.1)) * np.sqrt(squares)
+        np.testing.assert_allclose([patch.height, patch.width], wanted, rtol=1e-5)
+
+
 def test_space_has_one_span():
     axes = plot_path(ensemble_run(), dims=[0, 1, 2])
     (truth,) = [line for line in axes.get_lines() if line.get_label() == "truth"]
@@ -119,6 +128,8 @@ def test_errors_say_what_to_do():
         plot_path(run["belief", "mean"], spread="ellipses")
     with pytest.raises(ValueError, match="two dimensions, or three"):
         plot_path(run, dims=[0])
+    with pytest.raises(ValueError, match="three need projection"):
+        plot_path(run, dims=[0, 1, 2], ax=Figure().add_subplot())
     with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
         plot_path(run, dims=[0, 3])
     with pytest.raises(ValueError, match="truth must be"):

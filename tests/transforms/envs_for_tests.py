@@ -9,6 +9,8 @@ from torch_denkf.modules import GaussianPrior
 from torch_denkf.transforms import DEnKFTransform
 
 PRIOR_MEAN = [0.5, -0.25]
+BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
+STEPS = [3, 5]  # episode lengths of the two (or first two) rows
 
 
 def base_env(**kwargs):
@@ -56,3 +58,13 @@ def toy_base_env(**kwargs):
 def toy_filter(**kwargs):
     """Four learned sub-models that read "observation"."""
     return toy_denkf(in_key="observation", **kwargs)
+
+
+def seeded_env(seed, **kwargs):
+    """The plain environment, seeded: a worker's."""
+    return base_env(seed=seed, **kwargs)
+
+
+def random_rollout(env, steps=12):
+    """Random actions, over the ends of episodes."""
+    return env.rollout(steps, break_when_any_done=False)

@@ -1,4 +1,4 @@
-"""The ten points of the check-list for a drop-in part, and the transform's own options.
+"""The ten points of the check-list for a drop-in part.
 
 ``kind`` names how the transform is combined with an environment: on a batch-locked environment of batch size [] or
 [3], inside or outside of a ``SerialEnv`` or ``ParallelEnv`` of two.
@@ -11,16 +11,14 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import Binary, LazyTensorStorage, ReplayBuffer, SliceSampler
 from torchrl.envs import (
     Compose,
-    DoubleToFloat,
     InitTracker,
     ParallelEnv,
-    RenameTransform,
     SerialEnv,
     StepCounter,
     Transform,
@@ -28,28 +26,25 @@ from torchrl.envs import (
     check_env_specs,
 )
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import FixedEnsemble, NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
 from tests.transforms.envs_for_tests import (
+    BELIEF,
     PRIOR_MEAN,
+    STEPS,
     base_env,
     filtered_env,
     fixed_filter,
     known_start_filter,
     random_filter,
+    random_rollout,
+    seeded_env,
     toy_base_env,
     toy_filter,
 )
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation
 from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform, MissingFrames
-
-BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
-STEPS = [3, 5]  # episode lengths of the two (or first two) rows
-
-
-def seeded_env(seed, **kwargs):
-    return base_env(seed=seed, **kwargs)
+from torch_denkf.transforms import DEnKFTransform
 
 
 def make_env(kind, make_filter=known_start_filter):
@@ -75,19 +70,7 @@ def env(request):
     env.close()
 
 
-def assert_equal(first, second, keys, *, atol=0.0):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
-
-
-def random_rollout(env, steps=12):
-    return env.rollout(steps, break_when_any_done=False)
-
-
-# ------------------------------------------------------------------------------------------------- the check-list
-
-
-def test_point_01_specs(env):
+def test_specs(env):
     check_env_specs(env)
     shape = (*env.batch_size, 6, 2)
     for spec in (env.full_observation_spec, env.full_state_spec):
@@ -95,7 +78,7 @@ def test_point_01_specs(env):
     assert ("belief", "mean") in env.full_observation_spec.keys(True, True)
 
 
-def test_point_02_partial_resets(env):
+def test_partial_resets(env):
     prior = torch.tensor(PRIOR_MEAN)
     rollout = random_rollout(env)
     if not env.batch_size:
@@ -121,7 +104,7 @@ def test_point_02_partial_resets(env):
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("kind", ["[]", "[3]", "serial outside"])
-def test_point_03_steps_equal_the_sequence(kind, update_at_reset):
+def test_steps_equal_the_sequence(kind, update_at_reset):
     env = make_env(kind, partial(fixed_filter, update_at_reset=update_at_reset))
     env = TransformedEnv(env, InitTracker())
     rollout = random_rollout(env)
@@ -135,7 +118,7 @@ def test_point_03_steps_equal_the_sequence(kind, update_at_reset):
     assert frames["forecast", "ensemble"].shape == frames["belief", "ensemble"].shape
 
 
-def test_point_04_collector_replay_buffer_loss_gradients():
+def test_collector_replay_buffer_loss_gradients():
     filter = toy_filter()
     env = TransformedEnv(
         toy_base_env(batch_size=[3], max_steps=[7, 9, 50], missing=0.2),
@@ -168,7 +151,7 @@ def test_point_04_collector_replay_buffer_loss_gradients():
 
 
 @pytest.mark.parametrize("copy", [lambda t: pickle.loads(pickle.dumps(t)), deepcopy, lambda t: t.clone()])
-def test_point_05_copies_compute_the_same(copy):
+def test_copies_compute_the_same(copy):
     transform = DEnKFTransform(toy_filter())
     rollouts = []
     for part in (transform, copy(transform)):
@@ -177,7 +160,7 @@ def test_point_05_copies_compute_the_same(copy):
     assert_equal(*rollouts, BELIEF)
 
 
-def test_point_05_state_dict():
+def test_state_dict():
     first, second = (DEnKFTransform(toy_filter()) for _ in range(2))
     env, other = (TransformedEnv(toy_base_env(batch_size=[3]), part) for part in (first, second))
 
@@ -192,13 +175,13 @@ def test_point_05_state_dict():
     assert set(first.state_dict()) == {f"filter.{name}" for name in first.filter.state_dict()}
 
 
-def test_point_05_float64(float64):
+def test_float64(float64):
     rollout = random_rollout(filtered_env(random_filter, batch_size=[3]))
     assert {rollout["next", key].dtype for key in (("belief", "ensemble"), ("belief", "var"))} == {torch.float64}
     check_env_specs(filtered_env(random_filter, batch_size=[3]))
 
 
-def test_point_06_kalman_filter_in_the_transform(float64):
+def test_kalman_filter_in_the_transform(float64):
     kf = linear_kalman()
     env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
     check_env_specs(env)
@@ -207,7 +190,7 @@ def test_point_06_kalman_filter_in_the_transform(float64):
     assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
 
 
-def test_point_06_a_large_ensemble_follows_the_kalman_filter(float64):
+def test_a_large_ensemble_follows_the_kalman_filter(float64):
     size, rollouts = 20_000, []
     kf = linear_kalman()
     env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(linear_kalman()))
@@ -222,7 +205,7 @@ def test_point_06_a_large_ensemble_follows_the_kalman_filter(float64):
     assert (ours["var"] / exact["var"] - 1).abs().max() < 10 * (2 / size) ** 0.5
 
 
-def test_point_07_nothing_observed_is_pure_prediction(float64):
+def test_nothing_observed_is_pure_prediction(float64):
     env = filtered_env(fixed_filter, batch_size=[3], missing=1.0)
     rollout = env.rollout(5)
     assert rollout["observation"].isnan().all()
@@ -254,7 +237,7 @@ class MaskColumns(Transform):
         return observation_spec
 
 
-def test_point_07_partial_mask_is_the_filter_of_the_rest(float64):
+def test_partial_mask_is_the_filter_of_the_rest(float64):
     F, _, H, R = linear_system()
     start = FixedEnsemble(torch.randn(6, 2))
 
@@ -272,7 +255,7 @@ def test_point_07_partial_mask_is_the_filter_of_the_rest(float64):
     assert_equal(both, single, BELIEF, atol=1e-12)
 
 
-def test_point_08_same_seed_same_rollout(env):
+def test_same_seed_same_rollout(env):
     def run(seed):
         torch.manual_seed(seed)  # of the filter, where it runs in this process
         env.set_seed(seed)
@@ -284,7 +267,7 @@ def test_point_08_same_seed_same_rollout(env):
 
 
 @pytest.mark.parametrize("kind", ["[3]", "serial inside", "serial outside", "parallel inside", "parallel outside"])
-def test_point_08_rows_and_workers_differ(kind):
+def test_rows_and_workers_differ(kind):
     env = make_env(kind, random_filter)
     try:
         unseeded = env.reset()["belief", "ensemble"]
@@ -300,7 +283,7 @@ def test_point_08_rows_and_workers_differ(kind):
         env.close()
 
 
-def test_point_09_nothing_on_self():
+def test_nothing_on_self():
     transform = DEnKFTransform(random_filter())
     env = TransformedEnv(base_env(batch_size=[3]), transform)
     before = {name: value for name, value in vars(transform).items() if name not in ("_modules", "_parent")}
@@ -317,7 +300,7 @@ def test_point_09_nothing_on_self():
     assert env.rollout(3).shape == (3, 3)
 
 
-def test_point_09_spec_cache_is_cleared_on_append():
+def test_spec_cache_is_cleared_on_append():
     env = TransformedEnv(base_env(batch_size=[3]))
     assert "belief" not in env.full_observation_spec
     assert "belief" not in env.full_state_spec
@@ -327,328 +310,3 @@ def test_point_09_spec_cache_is_cleared_on_append():
     check_env_specs(env)
     env.append_transform(StepCounter())
     check_env_specs(env)
-
-
-# --------------------------------------------------------------------------------------------------- missing frames
-
-
-class BreakObservation(Transform):
-    """NaN in the reading from the third step on; ``observed`` says so, or lies."""
-
-    def __init__(self, honest):
-        super().__init__()
-        self.honest = honest
-
-    def _call(self, next_tensordict):
-        bad = next_tensordict["step"] >= 3
-        next_tensordict["observation"] = torch.where(bad, torch.nan, next_tensordict["observation"])
-        next_tensordict["observed"] = ~bad if self.honest else torch.ones_like(bad)
-        return next_tensordict
-
-    _reset = lambda self, tensordict, tensordict_reset: self._call(tensordict_reset)  # noqa: E731
-
-
-class ZeroUnobserved(Transform):
-    def _call(self, next_tensordict):
-        reading = next_tensordict["observation"]
-        next_tensordict["observation"] = torch.where(next_tensordict["observed"], reading, 0.0)
-        return next_tensordict
-
-    _reset = lambda self, tensordict, tensordict_reset: self._call(tensordict_reset)  # noqa: E731
-
-
-@pytest.mark.parametrize(("make_base", "make_filter"), [(base_env, random_filter), (toy_base_env, toy_filter)])
-def test_unobserved_nan_changes_nothing(make_base, make_filter):
-    filter, rollouts = make_filter(), []
-    for transforms in ([BreakObservation(True)], [BreakObservation(True), ZeroUnobserved()]):
-        env = TransformedEnv(make_base(batch_size=[3]), Compose(*transforms, DEnKFTransform(filter)))
-        torch.manual_seed(1)
-        rollouts.append(env.rollout(8))
-    assert rollouts[0]["observation"].isnan().any()
-    assert not rollouts[1]["observation"].isnan().any()
-    assert rollouts[0]["belief", "mean"].isfinite().all()
-    assert_equal(rollouts[0]["next"], rollouts[1]["next"], BELIEF)
-
-
-@pytest.mark.parametrize(("make_base", "make_filter"), [(base_env, random_filter), (toy_base_env, toy_filter)])
-def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
-    def make(**kwargs):
-        transforms = Compose(BreakObservation(False), DEnKFTransform(make_filter(), **kwargs))
-        return TransformedEnv(make_base(batch_size=[3]), transforms)
-
-    assert make().rollout(2).shape == (3, 2)
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\].*'observed'"):
-        make().rollout(8)
-    assert make(check_finite=False).rollout(8)["next", "belief", "mean"].isnan().any()
-
-
-def test_nan_at_reset_with_an_update_there():
-    env = TransformedEnv(base_env(), Compose(NanAtReset(), DEnKFTransform(fixed_filter(update_at_reset=True))))
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-        env.reset()
-
-
-class NanAtReset(Transform):
-    def _call(self, next_tensordict):
-        return next_tensordict
-
-    def _reset(self, tensordict, tensordict_reset):
-        return tensordict_reset.set("observation", torch.full_like(tensordict_reset["observation"], torch.nan))
-
-
-def test_divergence_is_told_apart():
-    filter = linear_denkf()
-    filter["transition"].matrix.mul_(1e30)
-    with pytest.raises(ValueError, match="the filter diverged"):
-        TransformedEnv(base_env(), DEnKFTransform(filter)).rollout(5)
-
-
-def test_missing_frames_before_the_filter():
-    env = TransformedEnv(
-        base_env(batch_size=[3]), Compose(MissingFrames(0.5, in_keys=["observation"]), DEnKFTransform(random_filter()))
-    )
-    check_env_specs(env)
-    rollout = env.rollout(20)
-    seen = rollout["observed"].squeeze(-1)
-    assert seen.any()
-    assert (rollout["observation"][~seen] == 0).all()
-    assert not seen.all()
-
-
-# ------------------------------------------------------------------------------------------------------ errors
-
-
-def test_missing_key_names_key_and_environment():
-    filter = linear_kalman(observation_key="gps")
-    with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
-        TransformedEnv(base_env(), DEnKFTransform(filter)).reset()
-    with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
-        _ = TransformedEnv(base_env(), DEnKFTransform(filter)).observation_spec
-
-
-def test_lost_belief_is_an_error():
-    env = filtered_env()
-    td = env.rand_action(env.reset()).exclude("belief")
-    with pytest.raises(KeyError, match=r"carries the belief in \('belief', 'ensemble'\)"):
-        env.step(td)
-
-
-def test_float64_environment_and_float32_filter():
-    torch.set_default_dtype(torch.float64)
-    try:
-        base = base_env()
-    finally:
-        torch.set_default_dtype(torch.float32)
-    with pytest.raises(TypeError, match="DoubleToFloat"):
-        _ = TransformedEnv(base, DEnKFTransform(linear_denkf())).observation_spec
-    mended = TransformedEnv(
-        base,
-        Compose(DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"]), DEnKFTransform(linear_denkf())),
-    )
-    assert mended.rollout(3)["next", "belief", "mean"].dtype == torch.float32
-
-
-def test_constructor_errors():
-    with pytest.raises(TypeError, match="together with its initial belief"):
-        DEnKFTransform(TensorDictSequential(*fixed_filter()))
-    with pytest.raises(TypeError, match="Linear"):
-        DEnKFTransform(nn.Linear(1, 1))
-    with pytest.raises(TypeError, match="has its initial belief already"):
-        DEnKFTransform(fixed_filter(), initial=fixed_filter().initial)
-    with pytest.raises(KeyError, match="'info', 'gain'"):
-        DEnKFTransform(fixed_filter(), diagnostics=[("info", "gain")])
-
-
-# ----------------------------------------------------------------------------------------------------- options
-
-
-def test_plain_sequential_with_its_initial_belief():
-    filter = fixed_filter()
-    plain = TensorDictSequential(*filter)
-    rollouts = [
-        random_rollout(TransformedEnv(base_env(batch_size=[3], max_steps=[3, 5, 9]), transform))
-        for transform in (DEnKFTransform(filter), DEnKFTransform(plain, initial=filter.initial))
-    ]
-    assert_equal(rollouts[0]["next"], rollouts[1]["next"], BELIEF)
-
-
-def test_store_ensemble_false_holds_the_same_numbers():
-    rollouts = []
-    for store in (True, False):
-        env = filtered_env(random_filter, transform={"store_ensemble": store}, batch_size=[3], max_steps=[3, 5, 30])
-        check_env_specs(env)
-        torch.manual_seed(1)
-        env.set_seed(1)
-        rollouts.append(random_rollout(env))
-    full, small = rollouts
-    assert ("belief", "ensemble") in full.keys(True, True)
-    for part in (small, small["next"]):
-        assert set(part["belief"].keys()) == {"mean", "var"}
-    for key in (("belief", "mean"), ("belief", "var")):
-        assert full[key].equal(small[key])
-        assert full["next"][key].equal(small["next"][key])
-
-
-def test_store_ensemble_false_outside_of_a_batched_environment():
-    plain = SerialEnv(2, [partial(seeded_env, n, max_steps=n) for n in STEPS])
-    env = TransformedEnv(plain, DEnKFTransform(known_start_filter(), store_ensemble=False))
-    check_env_specs(env)
-    rollout = random_rollout(env)
-    assert set(rollout["next", "belief"].keys()) == {"mean", "var"}
-    assert (rollout["belief", "mean"][0, [0, 3, 6, 9]] == torch.tensor(PRIOR_MEAN)).all()
-    assert (rollout["belief", "mean"][0, [1, 2, 4, 5]] != torch.tensor(PRIOR_MEAN)).all()
-
-
-@pytest.mark.parametrize("use_buffers", [False, True])
-def test_store_ensemble_false_in_a_collector(use_buffers):
-    def collect(store):
-        torch.manual_seed(1)
-        env = filtered_env(random_filter, transform={"store_ensemble": store}, batch_size=[2], max_steps=[3, 5])
-        collector = Collector(env, None, frames_per_batch=16, total_frames=32, use_buffers=use_buffers)
-        data = [batch.clone() for batch in collector]
-        collector.shutdown()
-        return torch.cat(data, -1)
-
-    full, small = collect(True), collect(False)
-    # A collector's buffers hold what env.reset() gives: an ensemble there would be data, of zeros.
-    assert set(small["belief"].keys()) == set(small["next", "belief"].keys()) == {"mean", "var"}
-    assert small["next", "belief", "mean"].equal(full["next", "belief", "mean"])
-    assert small["belief", "mean"].equal(full["belief", "mean"])
-
-
-def test_store_ensemble_false_inside_of_workers_raises():
-    make = partial(filtered_env, transform={"store_ensemble": False})
-    with pytest.raises(RuntimeError, match="cannot live inside a SerialEnv or ParallelEnv"):
-        SerialEnv(2, make).reset()
-
-
-@pytest.mark.parametrize("no_grad", [True, False])
-def test_gradients_through_a_rollout(no_grad):
-    filter = toy_filter()
-    env = TransformedEnv(toy_base_env(batch_size=[3]), DEnKFTransform(filter, no_grad=no_grad))
-    td, beliefs = env.reset(), []
-    for _ in range(4):
-        td = env.step(env.rand_action(td))["next"]
-        beliefs.append(td["belief", "mean"])
-    assert [belief.requires_grad for belief in beliefs] == [not no_grad] * 4
-    if not no_grad:
-        beliefs[-1].square().sum().backward()
-        for name in ("transition", "sensor", "observation", "noise"):
-            assert any(p.grad is not None and (p.grad != 0).any() for p in filter[name].parameters()), name
-        assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())
-
-
-def test_prior_given_to_reset(float64):
-    env = filtered_env(known_start_filter, batch_size=[3])
-    given = torch.randn(3, 6, 2)
-    td = env.reset(TensorDict({("belief", "ensemble"): given}, [3]))
-    assert td["belief", "ensemble"].equal(given)
-    torch.testing.assert_close(td["belief", "mean"], given.mean(-2), rtol=0, atol=1e-15)
-    torch.testing.assert_close(td["belief", "var"], given.var(-2), rtol=0, atol=1e-15)
-
-
-def test_reset_of_some_rows_leaves_the_others(float64):
-    env = filtered_env(known_start_filter, batch_size=[3])
-    td = env.rollout(3)[:, -1]["next"].clone()
-    before = td["belief"].clone()
-    td["_reset"] = torch.tensor([[False], [True], [False]])
-    after = env.reset(td)["belief"]
-    assert (after["ensemble"][1] == torch.tensor(PRIOR_MEAN)).all()
-    assert after["ensemble"][[0, 2]].equal(before["ensemble"][[0, 2]])
-    torch.testing.assert_close(after["mean"][[0, 2]], before["mean"][[0, 2]], rtol=0, atol=1e-15)
-    assert (after["var"][1] == 0).all()
-
-
-@pytest.mark.parametrize("shape", [(3,), (3, 1)])
-def test_reset_mask_of_the_transform_alone(float64, shape):
-    # An environment merges the rows once more; the transform does not rely on it.
-    given = torch.randn(3, 6, 2)
-    mask = torch.tensor([False, True, False]).reshape(shape)
-    td = TensorDict({("belief", "ensemble"): given, "_reset": mask}, [3])
-    observed = TensorDict({"observation": torch.zeros(3, 2)}, [3])
-    transform = DEnKFTransform(known_start_filter())
-    out = transform._reset(td, observed.copy())
-    expected = given.clone()
-    expected[1] = torch.tensor(PRIOR_MEAN)
-    # Environments that reset by themselves hand over one tensordict for both.
-    both = td.copy().update(observed)
-    assert transform._reset_on_native_autoreset(both, both)["belief", "ensemble"].equal(expected)
-    assert out["belief", "ensemble"].equal(expected)
-    torch.testing.assert_close(out["belief", "mean"], expected.mean(-2), rtol=0, atol=1e-15)
-    torch.testing.assert_close(out["belief", "var"], expected.var(-2), rtol=0, atol=1e-15)
-
-
-def test_nested_reset_key(float64):
-    # done and _reset inside of a group, as in multi-agent environments: the mask is agent-wise.
-    env = TransformedEnv(
-        base_env(batch_size=[3], max_steps=[3, 5, 30]),
-        Compose(
-            RenameTransform(
-                in_keys=["done", "terminated", "truncated"],
-                out_keys=[("group", "done"), ("group", "terminated"), ("group", "truncated")],
-                create_copy=True,
-            ),
-            DEnKFTransform(known_start_filter()),
-        ),
-    )
-    rollout = random_rollout(env)
-    start = torch.cat([torch.ones(3, 1, dtype=torch.bool), rollout["next", "done"][:, :-1].squeeze(-1)], 1)
-    ensemble = rollout["belief", "ensemble"]
-    assert (ensemble[start] == torch.tensor(PRIOR_MEAN)).all()
-    assert ensemble[:, 1:][~start[:, 1:]].equal(rollout["next", "belief", "ensemble"][:, :-1][~start[:, 1:]])
-
-
-@pytest.mark.parametrize("update_at_reset", [False, True])
-def test_diagnostics(float64, update_at_reset):
-    keys = [("info", "nis"), ("info", "innovation"), ("forecast", "ensemble")]
-    filter = fixed_filter(update_at_reset=update_at_reset)
-    env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(filter, diagnostics=keys))
-    check_env_specs(env)
-    rollout = env.rollout(6)
-    expected = filter.sequence(rollout.select("observation", "observed"))
-    assert_equal(rollout, expected, keys, atol=1e-12)
-    assert (rollout["info", "nis"][:, 1:] > 0).all()
-    start = filter.initialise(rollout[:, 0].select("observation", "observed"))
-    assert_equal(rollout[:, 0], start, [("forecast", "ensemble")], atol=1e-12)
-    if not update_at_reset:  # an initial belief has no innovation, and is its own forecast
-        assert all((rollout[key][:, 0] == 0).all() for key in keys[:2])
-        assert rollout["forecast", "ensemble"][:, 0].equal(rollout["belief", "ensemble"][:, 0])
-
-
-def test_randomness_does_not_depend_on_the_mode():
-    transform = DEnKFTransform(toy_filter())
-    env, rollouts = TransformedEnv(toy_base_env(batch_size=[3]), transform), []
-    assert not transform.training
-    for mode in (True, False):
-        transform.train(mode)
-        torch.manual_seed(1)
-        env.set_seed(1)
-        rollouts.append(env.rollout(4))
-    assert_equal(*rollouts, BELIEF)
-    assert (rollouts[0]["next", "belief", "var"] > 0).all()
-
-
-def test_specs_use_up_no_random_numbers():
-    env = filtered_env(random_filter)
-    state = torch.get_rng_state()
-    _ = env.observation_spec, env.state_spec
-    assert torch.get_rng_state().equal(state)
-
-
-def test_gradient_mode_in_a_replay_buffer():
-    filter = toy_filter()
-    frames = TensorDict({"observation": torch.randn(2, 5, 4), "action": torch.randn(2, 5, 2)}, [2, 5])
-    assert not DEnKFTransform(filter)(frames.copy())["belief", "mean"].requires_grad
-    assert DEnKFTransform(filter, no_grad=False)(frames.copy())["belief", "mean"].requires_grad
-
-
-def test_in_a_replay_buffer(float64):
-    filter = fixed_filter()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=DEnKFTransform(filter), batch_size=3)
-    frames = TensorDict(
-        {"observation": torch.randn(4, 7, 2), "number": torch.arange(4).unsqueeze(-1).expand(4, 7)}, [4, 7]
-    )
-    buffer.extend(frames)
-    sample = buffer.sample()
-    expected = filter.sequence(frames[sample["number"][:, 0]].clone())
-    assert_equal(sample, expected, BELIEF, atol=1e-14)

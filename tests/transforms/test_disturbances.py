@@ -1,5 +1,7 @@
 """Oracles: counts and pictures by hand, OpenCV's box filter, the binomial distribution."""
 
+from contextlib import nullcontext
+
 import cv2
 import numpy as np
 import pytest
@@ -333,6 +335,10 @@ def test_difference_images_are_refused(tmp_path):
     env = KITTIReplayEnv(tmp_path, "town", size=(20, 60), cache=None)
     with pytest.raises(ValueError, match="'pixels' can be negative"):
         TransformedEnv(env, Blur()).observation_spec  # noqa: B018
+    for low, refused in (([0.0, -1.0], True), ([0.0, 0.0], False)):  # one channel is enough
+        spec = Composite(pixels=Bounded(torch.tensor(low).reshape(2, 1, 1), torch.ones(2, 1, 1)))
+        with pytest.raises(ValueError, match="can be negative") if refused else nullcontext():
+            Blur().transform_observation_spec(spec)
 
 
 def test_errors_name_key_dtype_and_shape():

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from torch_denkf.deployment.package import FACTS
+from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters.inductor import need_compiler
 from torch_denkf.modules._base import flat_noise
@@ -88,7 +88,7 @@ def export_step(
         raise ValueError(f"the filter does not write {unknown}; it writes {written}")
     in_keys = _inputs(filter, example)
     values = tuple(example.get(key) for key in in_keys)
-    facts = {
+    signature = {
         "inputs": [
             (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)
         ],
@@ -104,10 +104,10 @@ def export_step(
         filter.train(was_training)
     path.parent.mkdir(parents=True, exist_ok=True)
     if compiled:
-        options = {"aot_inductor.metadata": {FACTS: json.dumps(facts)}}
+        options = {"aot_inductor.metadata": {SIGNATURE: json.dumps(signature)}}
         torch._inductor.aoti_compile_and_package(program, package_path=str(path), inductor_configs=options)
     else:
-        torch.export.save(program, path, extra_files={FACTS: json.dumps(facts)})
+        torch.export.save(program, path, extra_files={SIGNATURE: json.dumps(signature)})
     return path
 
 

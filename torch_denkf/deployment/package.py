@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-FACTS = "torch_denkf"  # name of the description inside a package
+SIGNATURE = "torch_denkf"  # name of the description inside a package
 
 
 class PackagedStep:
@@ -20,7 +20,7 @@ class PackagedStep:
 
     Args:
         run: takes the inputs in order and returns the outputs in order.
-        facts: names, shapes and dtypes, as :func:`torch_denkf.deployment.export_step` wrote them.
+        signature: names, shapes and dtypes, as :func:`torch_denkf.deployment.export_step` wrote them.
 
     Attributes:
         inputs: what a call needs, by name: shape and dtype.
@@ -28,11 +28,11 @@ class PackagedStep:
         carry: the outputs that are inputs of the next step.
     """
 
-    def __init__(self, run: Callable[..., tuple[Tensor, ...]], facts: dict):
+    def __init__(self, run: Callable[..., tuple[Tensor, ...]], signature: dict):
         self._run = run
-        self.inputs = {name: (tuple(shape), dtype) for name, shape, dtype in facts["inputs"]}
-        self.outputs: list[str] = facts["outputs"]
-        self.carry: list[str] = facts["carry"]
+        self.inputs = {name: (tuple(shape), dtype) for name, shape, dtype in signature["inputs"]}
+        self.outputs: list[str] = signature["outputs"]
+        self.carry: list[str] = signature["carry"]
 
     def __call__(self, entries: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Takes one step.
@@ -80,11 +80,11 @@ def load_step(path: str | Path) -> PackagedStep:
     run: Callable[..., tuple[Tensor, ...]]
     if compiled:
         run = torch._inductor.aoti_load_package(str(path))
-        facts = run.get_metadata().get(FACTS, "")
+        signature = run.get_metadata().get(SIGNATURE, "")
     else:
-        files = {FACTS: ""}
+        files = {SIGNATURE: ""}
         run = torch.export.load(path, extra_files=files).module()
-        facts = files[FACTS]
-    if not facts:
-        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {FACTS!r}")
-    return PackagedStep(run, json.loads(facts))
+        signature = files[SIGNATURE]
+    if not signature:
+        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
+    return PackagedStep(run, json.loads(signature))

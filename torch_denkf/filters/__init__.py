@@ -5,8 +5,20 @@ from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
 from torch_denkf.filters.kalman import KalmanFilter
-from torch_denkf.filters.particle import DPF, PFM, ParticleFilter
+from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
 from torch_denkf.filters.recurrent import LSTMFilter
 from torch_denkf.filters.ukf import UKF
 
-__all__ = ["Filter", "DEnKF", "KalmanFilter", "EKF", "UKF", "BackpropKF", "ParticleFilter", "DPF", "PFM", "LSTMFilter"]
+__all__ = [
+    "Filter",
+    "DEnKF",
+    "KalmanFilter",
+    "EKF",
+    "UKF",
+    "BackpropKF",
+    "ParticleFilter",
+    "DPF",
+    "MixtureParticleFilter",
+    "PFM",
+    "LSTMFilter",
+]

@@ -70,7 +70,7 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries) 
     """Raises a ``ValueError`` where the new belief is not finite; the message names the input that is not."""
     if all(torch.isfinite(written[key]).all() for key in structure.carry if key in written):
         return
-    given = {key: value for key, value in entries.items() if value.is_floating_point() and key[0] != "noise"}
+    given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
     why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
     raise ValueError(

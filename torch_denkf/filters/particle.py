@@ -20,7 +20,7 @@ from torch_denkf.modules import (
     as_process_noise,
 )
 
-__all__ = ["DPF", "PFM", "ParticleFilter"]
+__all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
 
 class ParticleFilter(Filter):
@@ -184,7 +184,7 @@ class DPF(ParticleFilter):
         super().__init__(transition, sensor, observation, likelihood, initial=initial, **kwargs)
 
 
-class PFM(ParticleFilter):
+class MixtureParticleFilter(ParticleFilter):
     """Differentiable particle filters of Kloss et al. for the mixture loss: dPF-M and dPF-M-lrn.
 
     Soft resampling in every step, so that the gradient goes on from step to step; "M" is the loss,
@@ -211,7 +211,7 @@ class PFM(ParticleFilter):
         >>> import torch
         >>> from torch_denkf.modules import AroundState, DiagonalNoise, Select, UnicycleTransition, VectorSensor
         >>> from torch_denkf.modules import StochasticMLP
-        >>> pf = PFM(
+        >>> pf = MixtureParticleFilter(
         ...     UnicycleTransition(StochasticMLP(2, 2), dt=0.1),
         ...     VectorSensor(6, 2, ensemble_size=1, layer="none"),
         ...     Select([3, 4]),
@@ -235,7 +235,7 @@ class PFM(ParticleFilter):
         **kwargs,
     ):
         if noise is None and learned_likelihood is None:
-            raise ValueError("PFM needs noise, for its Gaussian likelihood, or a learned_likelihood.")
+            raise ValueError("MixtureParticleFilter needs noise, for its Gaussian likelihood, or a learned_likelihood.")
         super().__init__(
             transition,
             sensor,
@@ -247,3 +247,7 @@ class PFM(ParticleFilter):
             initial=initial,
             **kwargs,
         )
+
+
+#: The short name.
+PFM = MixtureParticleFilter

@@ -81,9 +81,9 @@ class _MotionTrunk(nn.Module):
         doubt = [(turn_std / _TURN_UNIT).log(), pitch_std.log()]
         trust = self.gate(torch.cat([code, torch.stack(doubt, 1)], 1)).squeeze(-1).sigmoid()
         turned = torch.lerp(ahead, fitted, trust)
-        facts = [spread / 0.2, of_pitch, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE, turned / _TURN_UNIT]
-        facts += [of_pitch - pitch, *doubt]
-        return moved, turned, torch.cat([code, torch.stack(facts, 1)], 1)
+        cues = [spread / 0.2, of_pitch, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE, turned / _TURN_UNIT]
+        cues += [of_pitch - pitch, *doubt]
+        return moved, turned, torch.cat([code, torch.stack(cues, 1)], 1)
 
 
 class FlowSensor(StochasticSensor):

@@ -14,9 +14,7 @@ from torchrl.objectives import LossModule
 
 from torch_denkf.filters import Filter
 from torch_denkf.functional import wrap_angles
-
-#: A scale of each dimension; infinite where the dimension does not count.
-Scale = Sequence[float] | Tensor | None
+from torch_denkf.objectives._options import Scale
 
 
 class FilterLoss(LossModule):
@@ -43,7 +41,15 @@ class FilterLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """The entries that all objectives read."""
+        """The entries that all objectives read.
+
+        Attributes:
+            state: true state ``[*B, S]``; of sequences ``*B`` ends with time, here and below.
+            target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
+                no parameters, it is that model's observation of the true state.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``.
+            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+        """
 
         state: NestedKey = "state"
         target_observation: NestedKey = "target_observation"

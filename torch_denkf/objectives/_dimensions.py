@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from torch_denkf.filters import Filter
-from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._options import Scale
 from torch_denkf.objectives._sequence import SequenceLoss
 
 
@@ -42,9 +42,9 @@ class DimensionsLoss(SequenceLoss):
         filter: Filter,
         weights: Mapping[str, float | None],
         *,
-        dims: Sequence[int] | None,
-        state_scale: Scale,
-        angles: Sequence[int],
+        dims: Sequence[int] | None = None,
+        state_scale: Scale = None,
+        angles: Sequence[int] = (),
         **kwargs,
     ):
         if dims is not None:

@@ -32,7 +32,7 @@ class SequenceLoss(ReadingsLoss):
 
     @dataclass
     class _AcceptedKeys(ReadingsLoss._AcceptedKeys):
-        """What all objectives read, and the innovation's likelihood."""
+        """What all objectives read, and ``log_likelihood``, that of the innovation."""
 
         log_likelihood: NestedKey = ("info", "log_likelihood")
 

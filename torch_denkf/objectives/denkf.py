@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules import StochasticMLP
-from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._options import SequenceOptions
 from torch_denkf.objectives._scores import MEMBER_SCORES, score_members
 from torch_denkf.objectives._sequence import SequenceLoss
 
@@ -50,13 +49,7 @@ class DEnKFLoss(SequenceLoss):
         observation: weight of ``loss_observation``.
         nll: weight of ``loss_nll``.
         kl: weight of ``loss_kl``.
-        state_scale: ``[S]``; errors of the state are divided by it, so that dimensions with different units count
-            alike. A dimension with infinite scale does not count: means are taken over the others.
-        observation_scale: ``[O]``, likewise.
-        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        observation_angles: likewise, dimensions of observations.
-        detach_every: truncated back-propagation: steps after which the belief is detached.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+        **options: scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, or slices that are not marked.
@@ -76,17 +69,11 @@ class DEnKFLoss(SequenceLoss):
 
     @dataclass
     class _AcceptedKeys(SequenceLoss._AcceptedKeys):
-        """The entries that the loss reads.
+        """The entries that the loss reads beside those of :class:`FilterLoss`.
 
         Attributes:
-            state: true state ``[*B, T, S]``.
-            target_observation: true observation ``[*B, T, O]``; where it is missing and the filter's observation
-                model has no parameters, it is that model's observation of the true state.
-            observed: mask ``[*B, T, 1]`` or ``[*B, T, O]``.
             belief: ensemble of the belief.
             forecast: ensemble of the forecast.
-            sensor: the sensor's samples.
-            log_likelihood: of the innovation.
         """
 
         belief: NestedKey = ("belief", "ensemble")
@@ -108,23 +95,13 @@ class DEnKFLoss(SequenceLoss):
         observation: float = 0.0,
         nll: float = 0.0,
         kl: float = 0.0,
-        state_scale: Scale = None,
-        observation_scale: Scale = None,
-        angles: Sequence[int] = (),
-        observation_angles: Sequence[int] = (),
-        detach_every: int | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[SequenceOptions],
     ):
         super().__init__(
             filter,
             dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True)),
             score=score,
-            state_scale=state_scale,
-            observation_scale=observation_scale,
-            angles=angles,
-            observation_angles=observation_angles,
-            detach_every=detach_every,
-            reduction=reduction,
+            **options,
         )
 
     @classmethod

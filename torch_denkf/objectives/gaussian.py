@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.objectives._base import Scale
 from torch_denkf.objectives._dimensions import DimensionsLoss
+from torch_denkf.objectives._options import DimensionsOptions
 from torch_denkf.objectives._scores import GAUSSIAN_SCORES, score_gaussian
 
 __all__ = ["GaussianLoss"]
@@ -43,15 +42,7 @@ class GaussianLoss(DimensionsLoss):
         sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
-        dims: state dimensions that count; all of the truth's by default. The belief may have more dimensions than the
-            truth, which must then come first.
-        state_scale: ``[len(dims)]``, or ``[S]`` without ``dims``: errors of the state are divided by it. A dimension
-            with infinite scale does not count.
-        observation_scale: ``[O]``, likewise, for the sensor.
-        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        observation_angles: likewise, dimensions of observations.
-        detach_every: truncated back-propagation: steps after which the belief is detached.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`DimensionsOptions`.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``,
@@ -73,17 +64,11 @@ class GaussianLoss(DimensionsLoss):
 
     @dataclass
     class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
-        """The entries that the loss reads.
+        """The entries that the loss reads beside those of :class:`FilterLoss`.
 
         Attributes:
-            state: true state ``[*B, T, S]``.
-            target_observation: true observation ``[*B, T, O]``; where it is missing and the filter's observation
-                model has no parameters, it is that model's observation of the true state.
-            observed: mask ``[*B, T, 1]`` or ``[*B, T, O]``.
             belief: prefix of ``mean`` and ``cov`` of the belief.
             forecast: prefix of ``mean`` and ``cov`` of the forecast.
-            sensor: the sensor's samples ``[*B, T, E, O]`` or readings ``[*B, T, O]``.
-            log_likelihood: of the innovation.
         """
 
     default_keys = _AcceptedKeys
@@ -99,25 +84,13 @@ class GaussianLoss(DimensionsLoss):
         transition: float = 1.0,
         sensor: float | None = None,
         nll: float = 0.0,
-        dims: Sequence[int] | None = None,
-        state_scale: Scale = None,
-        observation_scale: Scale = None,
-        angles: Sequence[int] = (),
-        observation_angles: Sequence[int] = (),
-        detach_every: int | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[DimensionsOptions],
     ):
         super().__init__(
             filter,
             dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True)),
             score=score,
-            dims=dims,
-            state_scale=state_scale,
-            observation_scale=observation_scale,
-            angles=angles,
-            observation_angles=observation_angles,
-            detach_every=detach_every,
-            reduction=reduction,
+            **options,
         )
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]

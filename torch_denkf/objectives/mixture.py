@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from tensordict import TensorDictBase
 
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_weighted, weighted_mean
-from torch_denkf.objectives._base import Scale
 from torch_denkf.objectives._dimensions import DimensionsLoss
+from torch_denkf.objectives._options import DimensionsOptions
 
 __all__ = ["MixtureLoss"]
 
@@ -49,15 +49,8 @@ class MixtureLoss(DimensionsLoss):
         mean: weight of ``loss_mean``.
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
-        dims: state dimensions that count; all of the truth's by default. The belief may have more dimensions than the
-            truth, which must then come first.
-        state_scale: ``[len(dims)]``, or ``[S]`` without ``dims``: errors of the state are divided by it. A dimension
-            with infinite scale does not count. The mixture is a density of the state in its own units all the same.
-        observation_scale: ``[O]``, likewise, for the sensor.
-        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        observation_angles: likewise, dimensions of observations.
-        detach_every: truncated back-propagation: steps after which the belief is detached.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`DimensionsOptions`. With a
+            ``state_scale`` the mixture is a density of the state in its own units all the same.
 
     Raises:
         ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``, or
@@ -87,16 +80,11 @@ class MixtureLoss(DimensionsLoss):
 
     @dataclass
     class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
-        """The entries that the loss reads.
+        """The entries that the loss reads beside those of :class:`FilterLoss`.
 
         Attributes:
-            state: true state ``[*B, T, S]``.
-            target_observation: true observation ``[*B, T, O]``; where it is missing and the filter's observation
-                model has no parameters, it is that model's observation of the true state.
-            observed: mask ``[*B, T, 1]`` or ``[*B, T, O]``.
             belief: prefix of ``ensemble`` and ``log_weight`` of the belief.
             forecast: prefix of ``ensemble`` and ``log_weight`` of the forecast.
-            sensor: the sensor's samples ``[*B, T, E, O]`` or readings ``[*B, T, O]``.
             log_likelihood: of the reading.
         """
 
@@ -116,29 +104,18 @@ class MixtureLoss(DimensionsLoss):
         mean: float = 0.0,
         sensor: float = 0.0,
         nll: float = 0.0,
-        dims: Sequence[int] | None = None,
-        state_scale: Scale = None,
-        observation_scale: Scale = None,
-        angles: Sequence[int] = (),
-        observation_angles: Sequence[int] = (),
-        detach_every: int | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[DimensionsOptions],
     ):
         super().__init__(
             filter,
             dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True)),
             score=score,
-            dims=dims,
-            state_scale=state_scale,
-            observation_scale=observation_scale,
-            angles=angles,
-            observation_angles=observation_angles,
-            detach_every=detach_every,
-            reduction=reduction,
+            **options,
         )
         self.register_scale("component_std", component_std)
         if not (self.component_std > 0).all():
             raise ValueError(f"component_std is the width of each component, positive; got {component_std}.")
+        dims = options.get("dims")
         if dims is not None and self.component_std.numel() not in (1, len(dims)):
             raise ValueError(f"component_std has one entry for each of dims={list(dims)}; got {component_std}.")
 

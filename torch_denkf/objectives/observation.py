@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Unpack
 
 from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._options import ReadingsOptions
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._readings import ReadingsLoss
 
@@ -24,11 +23,7 @@ class ObservationLoss(PartLoss, ReadingsLoss):
 
     Args:
         filter: the filter whose observation model is trained; a module with an ``observe()`` method.
-        observation_scale: ``[O]``; errors are divided by it. A dimension with infinite scale does not count: means are
-            taken over the others.
-        observation_angles: dimensions of the observation that are angles in radians; their errors are wrapped to
-            [-pi, pi).
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``).
+        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
         ValueError: if a scale is not positive.
@@ -57,22 +52,8 @@ class ObservationLoss(PartLoss, ReadingsLoss):
     default_keys = _AcceptedKeys
     SCORES = ("mse",)
 
-    def __init__(
-        self,
-        filter: Filter,
-        *,
-        observation_scale: Scale = None,
-        observation_angles: Sequence[int] = (),
-        reduction: Literal["mean", "sum", "none"] = "mean",
-    ):
-        super().__init__(
-            filter,
-            {"observation": 1.0},
-            score="mse",
-            observation_scale=observation_scale,
-            observation_angles=observation_angles,
-            reduction=reduction,
-        )
+    def __init__(self, filter: Filter, **options: Unpack[ReadingsOptions]):
+        super().__init__(filter, {"observation": 1.0}, score="mse", **options)
 
     def _trained(self):
         model = self._observation_model()

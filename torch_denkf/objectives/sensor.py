@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Unpack
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
@@ -13,7 +12,7 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 from torch_denkf.filters import Filter
 from torch_denkf.modules._base import Call, reads, run_modules
 from torch_denkf.modules._gaussian import as_covariance
-from torch_denkf.objectives._base import Scale
+from torch_denkf.objectives._options import ReadingsOptions
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._readings import ReadingsLoss
 from torch_denkf.objectives._scores import MEMBER_SCORES, score_gaussian
@@ -42,11 +41,7 @@ class SensorLoss(PartLoss, ReadingsLoss):
             first two are its absolute error, and the length of its error: the scores of a point.
         sensor: weight of ``loss_sensor``.
         noise: weight of ``loss_noise``. R must follow from frames alone.
-        observation_scale: ``[O]``; errors are divided by it. A dimension with infinite scale does not count: means are
-            taken over the others. ``loss_noise`` is a density in the observation's own units all the same.
-        observation_angles: dimensions of the observation that are angles in radians; their errors are wrapped to
-            [-pi, pi).
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
+        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
         ValueError: on an unknown score, or a scale that is not positive.
@@ -87,17 +82,13 @@ class SensorLoss(PartLoss, ReadingsLoss):
         score: Literal["crps", "energy", "mse"] = "crps",
         sensor: float = 1.0,
         noise: float = 0.0,
-        observation_scale: Scale = None,
-        observation_angles: Sequence[int] = (),
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[ReadingsOptions],
     ):
         super().__init__(
             filter,
             {"sensor": sensor, "noise": noise},
             score=score,
-            observation_scale=observation_scale,
-            observation_angles=observation_angles,
-            reduction=reduction,
+            **options,
         )
 
     def _trained(self):

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules._base import reads
-from torch_denkf.objectives._base import FilterLoss, Scale
+from torch_denkf.objectives._base import FilterLoss
+from torch_denkf.objectives._options import Scale
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._scores import GAUSSIAN_SCORES, MEMBER_SCORES, score_gaussian, score_members
 from torch_denkf.objectives._true_steps import forecasts_from_truth, has_members, members_of

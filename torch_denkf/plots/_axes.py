@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -56,12 +56,21 @@ def axes_for(
     return given
 
 
-def legend_above(axes: Axes) -> None:
-    """Adds a legend over the Axes, in as many columns as fit; for a headline use ``axes.figure.suptitle``."""
-    handles, labels = axes.get_legend_handles_labels()
+def legend_above(axes: Axes, *others: Axes) -> None:
+    """Adds a legend over the Axes for all that is labelled in it and in the others, in as many columns as fit.
+
+    For a headline use ``axes.figure.suptitle``.
+    """
+    found: dict[str, Any] = {}
+    for part in (axes, *others):
+        for handle, label in zip(*part.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    labels, handles = list(found), list(found.values())
     if not handles:
         return
-    width = 1.1 * axes.get_window_extent().width / axes.figure.dpi * 72  # points; the layout to come widens it
+    pixels, whole = axes.get_window_extent().width, axes.figure.bbox.width
+    pixels *= 1.1 if pixels > 0.7 * whole else 1.0  # the layout to come widens one that has the figure to itself
+    width = 72 * pixels / axes.figure.dpi  # points
     sizes = [4.8 * len(label) + 43 for label in labels]
     columns = len(labels)
     while columns > 1:

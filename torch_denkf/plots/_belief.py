@@ -86,6 +86,21 @@ def read_belief(
     return read
 
 
+def covariance_at(read: Belief, step: int, dims: list[int]) -> Tensor:
+    """The belief's covariance of the chosen dimensions at one step, ``[len(dims), len(dims)]``; needs ``read.var``."""
+    assert read.var is not None
+    if read.cov is not None:
+        return read.cov[step][dims][:, dims]
+    if read.ensemble is None or read.ensemble.shape[-2] < 2:
+        return read.var[step, dims].diag()
+    members = read.ensemble[step][:, dims]
+    if read.log_weight is None:
+        return ensemble_cov(members)
+    share = read.log_weight[step].softmax(-1).unsqueeze(-1)
+    centred = members - (share * members).sum(0)
+    return (share * centred).mT @ centred
+
+
 def number(value: Tensor) -> Tensor:
     """The tensor detached, on the CPU, in float64; masks stay masks."""
     value = torch.as_tensor(value).detach().cpu()
@@ -136,7 +151,7 @@ def _entry(source: TensorDictBase | None, value: Truth, default: str) -> Tensor 
 
 
 def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Adds mean, variance and covariance where they follow from what is there."""
+    """Adds mean and variance where they follow from what is there."""
     ensemble, weight, cov = parts.get("ensemble"), parts.get("log_weight"), parts.get("cov")
     out = dict(parts)
     if cov is not None:
@@ -145,11 +160,7 @@ def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:
         out.setdefault("mean", ensemble_mean(ensemble))
         if ensemble.shape[-2] > 1:
             out.setdefault("var", ensemble_var(ensemble))
-            out.setdefault("cov", ensemble_cov(ensemble))
     elif ensemble is not None and weight is not None:
         out.setdefault("mean", weighted_mean(ensemble, weight))
         out.setdefault("var", weighted_var(ensemble, weight))
-        centred = ensemble - weighted_mean(ensemble, weight).unsqueeze(-2)
-        share = weight.softmax(-1).unsqueeze(-1)
-        out.setdefault("cov", (share * centred).mT @ centred)
     return out

@@ -18,7 +18,10 @@ def as_picture(frame: Tensor | np.ndarray) -> np.ndarray:
     Raises:
         ValueError: for other shapes.
     """
-    array = frame.detach().cpu().numpy() if isinstance(frame, Tensor) else np.asarray(frame)
+    if isinstance(frame, Tensor):
+        frame = frame.detach().cpu()
+        frame = (frame.float() if frame.is_floating_point() else frame).numpy()
+    array = np.asarray(frame)
     if array.ndim == 2:
         array = array[..., None]
     if array.ndim != 3:

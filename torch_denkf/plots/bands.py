@@ -126,7 +126,7 @@ def plot_bands(
         axes.set_xlim(bounds[0], bounds[-1])
     panels[-1].set_xlabel("step" if time is None else "time, s")
     if legend:
-        legend_above(panels[0])
+        legend_above(*panels)
     return panels
 
 

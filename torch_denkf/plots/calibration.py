@@ -108,7 +108,7 @@ def plot_calibration(
     )
     panels[-1].set_xlabel(where)
     if legend:
-        legend_above(panels[0])
+        legend_above(*panels)
     return panels
 
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, TRUTH, axes_for, legend_above, new_figure
-from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, Truth, covariance_at, dims_of, number, read_belief, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +128,10 @@ def _kind(read: Belief, spread: str, count: int) -> str:
 def _axes(ax: Axes | None, count: int) -> Axes:
     if ax is None and count == 3:
         return new_figure((8, 6)).add_subplot(projection="3d")
-    return axes_for(ax, 1, (8, 6))[0]
+    (axes,) = axes_for(ax, 1, (8, 6))
+    if hasattr(axes, "set_zlabel") != (count == 3):
+        raise ValueError(f"{count} dims do not fit the Axes; three need projection='3d', two must not")
+    return axes
 
 
 def _name(dim: int) -> str:
@@ -143,15 +146,12 @@ def _draw_ellipses(
 
     if not 0 < level < 1:
         raise ValueError(f"level is the probability of an ellipse, in (0, 1); got {level}")
-    assert read.var is not None
-    cov = torch.diag_embed(read.var[:, dims]) if read.cov is None else read.cov[:, dims][:, :, dims]
-    mean = read.mean[:, dims]
-    if forward_up:
-        turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)  # (x, y) to (-y, x)
-        cov, mean = turn @ cov @ turn.T, mean @ turn.T
+    # (x, y) to (-y, x)
+    turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]] if forward_up else [[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    mean = read.mean[:, dims] @ turn.T
     reach = factor * math.sqrt(-2 * math.log1p(-level))
     for first, step in enumerate(np.unique(np.linspace(0, len(mean) - 1, count).round().astype(int)).tolist()):
-        squares, directions = np.linalg.eigh(cov[step].numpy())
+        squares, directions = np.linalg.eigh((turn @ covariance_at(read, step, dims) @ turn.T).numpy())
         small, large = 2 * reach * np.sqrt(squares.clip(0))
         angle = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
         style: dict[str, Any] = {"facecolor": BELIEF, "edgecolor": BELIEF, "alpha": 0.3, "zorder": 1.5}

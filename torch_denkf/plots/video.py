@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.plots._axes import BELIEF, READING, new_figure, step_bounds, times_of
+from torch_denkf.plots._axes import times_of
 from torch_denkf.plots._belief import Truth, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
 from torch_denkf.plots._pixels import find_pixels
+from torch_denkf.plots._scene import Scene
 from torch_denkf.plots.bands import plot_bands
 from torch_denkf.plots.path import plot_path
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
 
 __all__ = ["belief_video", "write_video"]
 
@@ -116,7 +113,7 @@ def belief_video(
         raise ValueError(f"every counts steps and must be at least 1; got {every}")
     if pictures is None and path is None and bands is None:
         raise ValueError("nothing to draw: pass pixels, path={} or bands={}")
-    scene = _Scene(size, dpi, title, pictures, path is not None, _panel_count(bands, read.mean.shape[-1]))
+    scene = Scene(size, dpi, title, pictures, path is not None, _panel_count(bands, read.mean.shape[-1]))
     if path is not None:
         plot_path(belief, truth, ax=scene.path, **path)
     if bands is not None:
@@ -125,89 +122,6 @@ def belief_video(
     scene.freeze(None if read.observed is None else read.observed.any(-1), times_of(time, len(read.mean)))
     frames = (scene.frame(step) for step in range(0, len(read.mean), every))
     return write_video(file, frames, _own_speed(time, every) if fps is None else fps)
-
-
-class _Scene:
-    """The figure of a video: everything is drawn once, and each frame shows what has happened until then."""
-
-    def __init__(
-        self,
-        size: tuple[float, float],
-        dpi: float,
-        title: str | None,
-        pictures: Tensor | np.ndarray | None,
-        path: bool,
-        bands: int,
-    ):
-        figure = new_figure(size)
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-        figure.set_dpi(dpi)
-        self.canvas, self.figure, self.pictures = FigureCanvasAgg(figure), figure, pictures
-        left = (pictures is not None) + path
-        columns = figure.add_gridspec(1, 2 if left and bands else 1, width_ratios=[1, 1.25] if left and bands else None)
-        self.camera = self.path = None
-        if left:
-            rows = columns[0, 0].subgridspec(left, 1, height_ratios=[1, 1.6] if left == 2 else None)
-            if pictures is not None:
-                self.camera = figure.add_subplot(rows[0])
-                self.image = self.camera.imshow(as_picture(pictures[0]), interpolation="nearest")
-                self.camera.set(xticks=[], yticks=[])
-            if path:
-                self.path = figure.add_subplot(rows[-1])
-        self.bands: list[Axes] = []
-        if bands:
-            grid = columns[0, -1].subgridspec(bands, 1)
-            for row in range(bands):
-                self.bands.append(figure.add_subplot(grid[row], sharex=self.bands[0] if row else None))
-                self.bands[row].tick_params(labelbottom=row == bands - 1)
-        if title is not None:
-            figure.suptitle(title)
-
-    def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
-        """Fixes layout and limits, and remembers what is to grow."""
-        self.seen, self.bounds = seen, step_bounds(seconds)
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")
-        drawn = [axes for axes in (self.path, *self.bands) if axes is not None]
-        for axes in drawn:
-            axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())
-        self.lines: list[tuple[Line2D, np.ndarray]] = []
-        if self.path is not None:
-            self.path.set_aspect("auto")  # the limits are those of equal scales
-            self.lines = [(line, np.asarray(line.get_data())) for line in self.path.get_lines()]
-            self.lines = [(line, data) for line, data in self.lines if data.shape[1] == len(seconds)]
-            self.here = self.path.plot([], [], "o", color=BELIEF, markersize=5, zorder=3)[0]
-
-    def frame(self, step: int) -> np.ndarray:
-        """The picture of one step, ``[H, W, 3]`` uint8."""
-        if self.camera is not None and self.pictures is not None:
-            self.image.set_data(as_picture(self.pictures[step]))
-            unseen = self.seen is not None and not bool(self.seen[step])
-            self.camera.set_xlabel("not observed" if unseen else " ", color=READING)
-            for spine in self.camera.spines.values():
-                spine.set(color=READING if unseen else "black", linewidth=3 if unseen else 0.8)
-        for line, data in self.lines:
-            line.set_data(data[:, : step + 1])
-            if line.get_label() == "belief":
-                self.here.set_data(data[:, step : step + 1])
-        if self.path is not None:
-            for patch in self.path.patches:
-                patch.set_visible(int(str(patch.get_gid()).removeprefix("step ")) <= step)
-        for axes in self.bands:
-            self._uncover(axes, self.bounds[step + 1])
-        self.canvas.draw()
-        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
-
-    @staticmethod
-    def _uncover(axes: Axes, until: float) -> None:
-        """Clips what is drawn in the Axes at the right of ``until``."""
-        from matplotlib.transforms import Bbox, TransformedBbox
-
-        box = TransformedBbox(Bbox([[axes.get_xlim()[0], 0], [until, 1]]), axes.get_xaxis_transform())
-        for artist in (*axes.lines, *axes.collections, *axes.patches):
-            artist.set_clip_path(None)
-            artist.set_clip_box(box)
 
 
 def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:

@@ -1,4 +1,7 @@
-"""Checkpoint files: written whole or not at all, checked before they are used."""
+"""Checkpoint files: written whole or not at all, checked before they are used.
+
+torchrl's own ``Checkpoint`` has neither checksums nor a sync with the disk, and may read pickles.
+"""
 
 from __future__ import annotations
 

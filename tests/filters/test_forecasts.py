@@ -1,0 +1,95 @@
+"""Which entry is the forecast of which, and modules that undo each other."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import (
+    NoisyLinear,
+    linear_denkf,
+    linear_system,
+)
+from torch_denkf.filters import Filter
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+)
+
+ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
+BELIEF = [ENSEMBLE, MEAN, VAR]
+
+
+def close(first, second, keys, atol=1e-12):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
+
+
+class Reversed(NoisyLinear):
+    """Writes something else before the forecast, and the forecast of a Kalman filter in another order."""
+
+    def __init__(self, matrix):
+        super().__init__(matrix)
+        self.out_keys = [("forecast", "speed"), ("forecast", "ensemble")]
+
+    def compute(self, state, *, noise):
+        moved = super().compute(state, noise=noise)
+        return (moved - state).norm(dim=-1), moved
+
+
+def test_forecasts_are_told_by_their_names(float64):
+    F, _, _, _ = linear_system()
+    plain = linear_denkf(update_at_reset=True)
+    other = Filter(
+        {"transition": Reversed(F), **{name: plain[name] for name in ("noise", "observation", "analysis")}},
+        initial=plain.initial,
+        update_at_reset=True,
+    )
+    assert other.structure.forecast_of == {ENSEMBLE: ("forecast", "ensemble")}
+    frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
+    out = other.sequence(frames.copy())
+    close(out, plain.sequence(frames.copy()), BELIEF)
+    assert (out["forecast", "speed"][:, 0] == 0).all()
+    assert (out["forecast", "speed"][:, 1:] > 0).all()
+
+
+def test_two_forecasts_of_one_name_are_refused_until_one_is_named():
+    F, *_ = linear_system()
+
+    class Two(NoisyLinear):
+        def __init__(self):
+            super().__init__(F)
+            self.out_keys = [("a", "ensemble"), ("forecast", "ensemble")]
+
+        def compute(self, state, *, noise):
+            moved = super().compute(state, noise=noise)
+            return moved, moved
+
+    plain = linear_denkf()
+    modules = {"transition": Two(), **{name: plain[name] for name in ("noise", "observation", "analysis")}}
+    with pytest.raises(ValueError, match="forecast_keys="):
+        Filter(modules, initial=plain.initial)
+    Filter(modules, initial=plain.initial, forecast_keys={ENSEMBLE: ("forecast", "ensemble")})
+    with pytest.raises(ValueError, match="forecast_keys names"):
+        Filter(modules, initial=plain.initial, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
+
+
+def test_a_module_that_undoes_another_is_refused():
+    plain = linear_denkf()
+    with pytest.raises(ValueError, match=r"over what 'analysis' .* before any module has read it"):
+        Filter(
+            {name: plain[name] for name in ("noise", "transition", "observation", "analysis")}
+            | {"again": EnsembleAnalysis("etkf", sensor_key="observation")},
+            initial=plain.initial,
+        )
+    with pytest.raises(ValueError, match="'observation' is a tensor"):
+        Filter(
+            {
+                "noise": ConstantNoise([1.0, 1.0], in_key="observation", out_key=("observation", "noise")),
+                "transition": plain["transition"],
+                "observation": plain["observation"],
+                "analysis": EnsembleAnalysis(
+                    "etkf", sensor_key="observation", noise_variance_key=("observation", "noise")
+                ),
+            },
+            initial=plain.initial,
+        )

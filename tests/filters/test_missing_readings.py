@@ -1,0 +1,194 @@
+"""NaN, steps without a frame or without a reading, and systems that nobody observes."""
+
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import (
+    NoisyLinear,
+    linear_denkf,
+    linear_kalman,
+    linear_system,
+)
+from tests.filters.gaussian_for_tests import linear_filter
+from tests.filters.particle_for_tests import bootstrap
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LinearObservation,
+)
+
+ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
+LOG_WEIGHT = ("belief", "log_weight")
+BELIEF = [ENSEMBLE, MEAN, VAR]
+
+
+def close(first, second, keys, atol=1e-12):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("make", [linear_denkf, linear_kalman, lambda: bootstrap(50)])
+def test_a_step_refuses_nan_and_leaves_the_belief_as_it_was(make):
+    filter = make()
+    td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
+    before = td.copy()
+    td["observation"] = torch.tensor([0.0, torch.nan])
+    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+        filter.step(td)
+    assert all(td[key] is before[key] for key in filter.carry_keys)
+    filter.check_finite = False
+    assert not filter.step(td)[MEAN].isfinite().all()
+
+
+def test_noise_that_is_given_and_is_not_finite_is_named():
+    filter = linear_denkf("perturbed", noisy=True)
+    td = filter.draw_noise(filter.initialise(TensorDict({"observation": torch.zeros(2)})))
+    td["noise", "transition"][3, 1] = torch.inf
+    with pytest.raises(ValueError, match=r"NaN or infinity in \[\('noise', 'transition'\)\]"):
+        filter.step(td)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [linear_denkf, linear_kalman, lambda: bootstrap(50), *(lambda n=n: linear_filter(n) for n in ("EKF", "UKF"))],
+)
+def test_a_step_without_a_frame_is_the_forecast(float64, make):
+    filter = make()
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    hidden = td.copy().set("observed", torch.tensor([False]))
+    torch.manual_seed(0)
+    expected = filter.step(hidden)
+    torch.manual_seed(0)
+    out = filter.predict(td.exclude("observation"))
+    close(out, expected, filter.belief_keys)
+    assert out.get("observation", None) is None
+    with pytest.raises(KeyError, match="'observation'"):
+        filter.step(td.exclude("observation"))
+
+
+@pytest.mark.parametrize("observed", [None, True])
+def test_a_prediction_does_not_resample_and_leaves_the_mask_alone(float64, observed):
+    """Where there is no frame, particles and weights go on as they are, whatever the mask of the last frame said."""
+    filter, (F, *_) = bootstrap(50, noisy=False), linear_system()
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    td["belief", "log_weight"] = torch.randn(50).log_softmax(-1)
+    if observed is not None:
+        td["observed"] = torch.tensor([observed])
+    out = filter.predict(td.copy())
+    close(out, {ENSEMBLE: td[ENSEMBLE] @ F.mT, LOG_WEIGHT: td[LOG_WEIGHT]}, [ENSEMBLE, LOG_WEIGHT], atol=1e-14)
+    mask = out.get("observed", None)
+    assert mask is None if observed is None else mask.item() is True
+
+
+def test_only_readings_are_left_out_of_a_prediction(float64):
+    F, *_ = linear_system()
+    plain = linear_denkf()
+
+    class Wind(NoisyLinear):
+        def __init__(self):
+            super().__init__(F)
+            self.in_keys, self.out_keys = [("forecast", "ensemble"), "wind"], [("forecast", "ensemble")]
+
+        def compute(self, ensemble, wind, *, noise):
+            return ensemble + wind.unsqueeze(-2)
+
+    names = ("noise", "observation", "analysis")
+    filter = Filter(
+        {"transition": plain["transition"], "wind": Wind(), **{name: plain[name] for name in names}},
+        initial=plain.initial,
+    )
+    assert filter.structure.readings == ("observation",)
+    td = filter.initialise(TensorDict({"wind": torch.tensor([3.0, -1.0])}))
+    moved = td[MEAN] @ F.mT + td["wind"]
+    close(filter.predict(td), {MEAN: moved}, [MEAN])
+    for name in ("analysis", "observed"):  # a mask that is not there hides nothing
+        with pytest.raises(KeyError, match="which no module must find"):
+            filter.step(td, without=[name])
+    with pytest.raises(TypeError, match="list of keys"):
+        filter.step(td, without="observation")
+
+
+def test_a_filter_under_vmap_is_the_filter_row_by_row(float64):
+    filter, frames = linear_denkf(), torch.randn(4, 3, 6, 2)
+
+    def means(observation):
+        return filter.sequence(TensorDict({"observation": observation}, observation.shape[:-1]))[MEAN]
+
+    expected = torch.stack([means(rows) for rows in frames])
+    torch.testing.assert_close(torch.vmap(means)(frames), expected, rtol=0, atol=1e-12)
+
+
+def test_one_of_two_sensors_may_be_missing(float64):
+    _, _, H, R = linear_system()
+    plain = linear_denkf()
+    both = Filter(
+        {
+            "transition": plain["transition"],
+            "r0": ConstantNoise(R[:1].sqrt(), in_key="y0", out_key="r0"),
+            "r1": ConstantNoise(R[1:].sqrt(), in_key="y1", out_key="r1"),
+            "h0": LinearObservation(H[:1], out_key="p0"),
+            "a0": EnsembleAnalysis(
+                "etkf", predicted_key="p0", sensor_key="y0", noise_variance_key="r0", belief_key="mid"
+            ),
+            "h1": LinearObservation(H[1:], in_key=("mid", "ensemble"), out_key="p1"),
+            "a1": EnsembleAnalysis(
+                "etkf", forecast_key=("mid", "ensemble"), predicted_key="p1", sensor_key="y1", noise_variance_key="r1"
+            ),
+        },
+        initial=plain.initial,
+    )
+    y = torch.randn(2)
+    td = both.initialise(TensorDict({"y0": y[:1], "y1": y[1:]}))
+    for missing, kept in (("y0", 1), ("y1", 0)):
+        one = Filter(
+            {
+                "transition": plain["transition"],
+                "noise": ConstantNoise(R[[kept]].sqrt(), in_key="y"),
+                "observation": LinearObservation(H[[kept]]),
+                "analysis": EnsembleAnalysis("etkf", sensor_key="y"),
+            },
+            initial=plain.initial,
+        )
+        expected = one.step(td.select("belief").copy().set("y", y[[kept]]))
+        close(both.step(td.exclude(missing).copy(), without=[missing]), expected, BELIEF)
+
+
+@pytest.mark.parametrize("kind", ["ensemble", "kalman", "particles"])
+def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kind):
+    """Unheld it overflows at step 872 in float32: the standard deviation grows by a tenth a step."""
+    F, one = 1.1 * torch.eye(1), torch.eye(1)
+    if kind == "kalman":
+        filter = KalmanFilter(F, one, one, one, mean=torch.ones(1), cov=one)
+    else:
+        parts = {"observation": LinearObservation(one), "noise": ConstantNoise([1.0], in_key="observation")}
+        prior = GaussianPrior([1.0], [1.0], ensemble_size=64)
+        if kind == "ensemble":
+            filter = DEnKF(NoisyLinear(F, one), None, **parts, initial=prior, observation_key="observation")
+        else:
+            filter = bootstrap(64, initial=prior)
+            filter.module["transition"].module = NoisyLinear(F, one)
+            filter.module["observation"], filter.module["noise"] = parts["observation"], parts["noise"]
+    td = filter.initialise(TensorDict({"observation": torch.zeros(1)}))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(2_000):
+            td = filter.predict(td)
+    assert sum("variance_ceiling" in str(warning.message) for warning in said) == 1
+    assert td[MEAN].isfinite().all()
+    assert td[VAR] <= 1.001e12
+    if kind == "particles":  # a reading that none of the 64 particles explains leaves one of them
+        return
+    for reading in (3.0, 3.3, 3.6, 4.0, 4.4, 4.8):
+        td = filter.step(td.set("observation", torch.tensor([reading])))
+    assert (td[MEAN] - 4.8).abs() < 3.0
+    assert td[VAR] < 3.0
+    loose = KalmanFilter(F, one, one, one, mean=torch.ones(1), cov=one, variance_ceiling=None)
+    frames = TensorDict(
+        {"observation": torch.zeros(1000, 1), "observed": torch.zeros(1000, 1, dtype=torch.bool)}, [1000]
+    )
+    assert not loose.sequence(frames)[VAR].isfinite().all()

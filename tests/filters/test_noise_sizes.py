@@ -1,0 +1,143 @@
+"""How large the noise is that a filter draws in bulk, and what happens where nothing says so."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system, toy_denkf, toy_frames
+from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
+from torch_denkf.modules._base import run_module
+
+MEAN, ENSEMBLE = ("belief", "mean"), ("belief", "ensemble")
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    torch.manual_seed(0)
+
+
+def readings(*batch):
+    return TensorDict({"observation": torch.randn(*batch, 2)}, batch)
+
+
+def by_steps(filter, frames):
+    """Means of single steps with the noise in ``frames`` ``[B, T]``, from the belief that is stored at the first."""
+    row, means = frames[:, 0].copy(), [frames[ENSEMBLE][:, 0].mean(-2)]
+    for t in range(1, frames.shape[1]):
+        row = filter.step(frames[:, t].copy().set(ENSEMBLE, row[ENSEMBLE]))
+        means.append(row[MEAN])
+    return torch.stack(means, 1)
+
+
+def test_a_stored_ensemble_may_be_larger_than_the_initial_one():
+    filter, frames = linear_denkf("perturbed", noisy=True), readings(3, 5)
+    assert filter.initial.ensemble_size == 6
+    frames[ENSEMBLE] = torch.randn(3, 5, 9, 2)
+    assert filter.sequence(frames.copy())[ENSEMBLE].shape == (3, 5, 9, 2)
+    filter.draw_noise(frames)
+    assert frames["noise", "transition"].shape == frames["noise", "analysis"].shape == (3, 5, 9, 2)
+    out = filter.sequence(frames.copy())
+    torch.testing.assert_close(out[MEAN], by_steps(filter, frames), rtol=0, atol=1e-12)
+
+
+class Unsaid(FixedEnsemble):
+    """An initial belief that does not say how many members it has, nor of how many dimensions."""
+
+    def __init__(self, members):
+        super().__init__(members)
+        del self.ensemble_size, self.state_dim
+
+
+def foreign_noise(filter):
+    """The noise from a module that does not say how many readings it is for."""
+    _, _, _, R = linear_system()
+    filter.module["noise"] = TensorDictModule(nn.Linear(2, 2), ["observation"], [("sensor", "noise")])
+    with torch.no_grad():
+        filter["noise"].module.weight.zero_()
+        filter["noise"].module.bias.copy_(R)
+
+
+@pytest.mark.parametrize("case", ["initial", "noise"])
+def test_sizes_that_only_the_entries_tell_are_enough_to_draw_in_bulk(case):
+    """Drawn in bulk, a seed gives what it gives the filter whose modules say their sizes; and chunks compile."""
+    told = linear_denkf("perturbed", noisy=True)
+    filter = linear_denkf("perturbed", noisy=True)
+    if case == "initial":
+        filter.initial = Unsaid(filter.initial.members)
+    else:
+        foreign_noise(filter)
+    frames, outs = readings(3, 5), []
+    for model in (told, filter, filter.compile(chunk=2, backend="eager")):
+        torch.manual_seed(1)
+        outs.append(model.sequence(frames.copy())[MEAN])
+    for out in outs[1:]:
+        torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
+    assert filter.compiled._functions
+
+
+class SizeAtTheStep(NoisyLinear):
+    """A transition whose noise only a step can draw."""
+
+    def draw_noise(self, batch_size, *, members=None, here=False, **kwargs):
+        return super().draw_noise(batch_size, members=members, **kwargs) if here else None
+
+    def noise_sizes(self, *values):
+        return {**super().noise_sizes(*values), "here": True}
+
+
+def test_a_noise_of_unknown_size_leaves_steps_and_sequences_eager():
+    F, Q, _, _ = linear_system()
+    filter, frames, outs = linear_denkf("perturbed", noisy=True), readings(3, 5), []
+    filter.module["transition"] = SizeAtTheStep(F, torch.linalg.cholesky(Q))
+    for chunk in (0, 2):
+        filter.compile(chunk=chunk, backend="eager")
+        torch.manual_seed(1)
+        outs.append(filter.sequence(frames.copy()))
+        assert filter.step(outs[-1][:, -1].copy())[MEAN].isfinite().all()
+    assert outs[0][MEAN].equal(outs[1][MEAN])
+    assert not filter.compiled._functions
+    drawn = filter.draw_noise(frames.copy())["noise"]
+    assert set(drawn.keys()) == {"analysis"}, "as far as it is known"
+
+
+def test_flipout_in_a_sensor_has_a_perturbation_of_its_own_at_each_time():
+    """As if the sequence were taken step by step; the noise drawn where it is needed is that drawn in bulk."""
+    filter = toy_denkf(sensor_layer="flipout", layer="none", action=False)
+    frames, outs = toy_frames((3, 5), masks=0, resets=False).exclude("action"), []
+    for bulk in (False, True):
+        torch.manual_seed(1)
+        given = frames.copy()
+        if bulk:
+            given["noise", "sensor"] = filter["sensor"].draw_noise([3, 5], time=True, dtype=torch.float64)
+        outs.append(filter.sequence(given)["sensor", "ensemble"])
+    assert outs[0].equal(outs[1])
+
+
+class SideBySide(SubModel):
+    """Two noise modules for one reading, one behind the other."""
+
+    def __init__(self, *modules):
+        super().__init__(nn.ModuleList(modules), ["observation"], [("sensor", "noise")])
+
+    def on_entries(self, entries, call):
+        parts = [run_module(module, entries, call)[module.out_keys[0]] for module in self.module]
+        return {("sensor", "noise"): torch.cat(parts, -1)}
+
+
+def test_parts_of_different_sizes_say_nothing_of_the_whole():
+    """What is drawn in bulk leaves that noise out; a sequence, which has seen the variances, draws it."""
+    plain, other = linear_denkf("perturbed", noisy=True), linear_denkf("perturbed", noisy=True)
+    _, _, H, R = linear_system()
+    sd = torch.cat([R, R[:1]]).sqrt()
+    for filter in (plain, other):
+        filter.module["observation"] = LinearObservation(torch.cat([H, H[:1]]))
+    plain.module["noise"] = ConstantNoise(sd, in_key="observation")
+    other.module["noise"] = SideBySide(*(ConstantNoise(part, in_key="observation") for part in (sd[:1], sd[1:])))
+    frames, outs = TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]), []
+    assert set(other.draw_noise(frames.copy())["noise"].keys()) == {"transition"}
+    for filter in (plain, other):
+        torch.manual_seed(1)
+        outs.append(filter.sequence(frames.copy())[MEAN])
+    torch.testing.assert_close(outs[1], outs[0])

@@ -1,0 +1,121 @@
+"""Sequences that go on from the beliefs of a policy. Oracle: single steps."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+
+FILTERS = {"DEnKF": linear_denkf, "Kalman": linear_kalman}
+every_filter = pytest.mark.parametrize("name", FILTERS)
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    torch.manual_seed(0)
+
+
+def close(first, second, keys, atol=1e-12):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def policy_data(filter, *, anew=()):
+    """What a filter in a policy leaves on ``[2, 7]``: the belief before each step; and what each step gives."""
+    frames, rows, steps = TensorDict({"observation": torch.randn(2, 7, 2)}, [2, 7]), [], []
+    belief = filter.step(filter.initialise(frames[:, 0].copy()).update(frames[:, 0]))
+    for t in range(7):
+        row = frames[:, t].copy().set(("previous", "known"), torch.full((2, 1), t not in anew))
+        for key in filter.carry_keys:
+            row["previous", *key] = belief[key]
+        belief = filter(row.copy())
+        rows.append(row)
+        steps.append(belief.select(*filter.out_keys))
+    return torch.stack(rows, 1), torch.stack(steps, 1)
+
+
+@every_filter
+@pytest.mark.parametrize("anew", [(), (3,), (0, 5)])
+def test_every_element_is_a_step_diagnostics_and_all(name, anew):
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter, anew=anew)
+    out = filter.sequence(data.copy())
+    close(out, steps, filter.out_keys)
+    for t in range(7):
+        assert ((out["info", "nis"][:, t] == 0) == (t in anew)).all()
+
+
+@every_filter
+def test_marks_that_say_nothing_do_not_hide_a_missing_belief(name):
+    """Without a belief before it an element starts anew, though ``is_init`` says that none begins."""
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter, anew=(3,))
+    data["is_init"] = torch.zeros(2, 7, 1, dtype=torch.bool)
+    rows = [filter(data[:, t].copy()).select(*filter.out_keys) for t in range(7)]
+    close(torch.stack(rows, 1), steps, filter.out_keys)
+    close(filter.sequence(data.copy()), steps, filter.out_keys)
+
+
+@every_filter
+def test_within_a_slice_the_belief_is_the_filters_own(name):
+    """The beliefs that a policy stored are of older parameters: only where a slice begins one is taken."""
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter)
+    for key in filter.carry_keys:
+        data["previous", *key][:, 1:] *= 3.0
+    close(filter.sequence(data.copy()), steps, filter.out_keys)
+    begins = torch.zeros(2, 7, 1, dtype=torch.bool)
+    begins[:, [0, 4]] = True
+    parts = [filter.sequence(part.copy()) for part in (data[:, :4], data[:, 4:])]
+    close(filter.sequence(data.set("is_init", begins)), torch.cat(parts, 1), filter.out_keys)
+
+
+@every_filter
+def test_an_element_without_a_belief_before_it_starts_from_the_initial_one(name):
+    """Not from the belief that the policy stored for its actor."""
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter, anew=(3,))
+    for key in filter.carry_keys:
+        data[key] = 3.0 * steps[key]
+    out = filter.sequence(data.copy())
+    close(out, steps, filter.belief_keys)
+    start = filter.initialise(TensorDict({}, [2]))
+    close(out[:, 3], start, filter.belief_keys)
+
+
+@every_filter
+def test_a_compiled_filter_goes_on_from_the_same_belief(name):
+    filter = FILTERS[name]()
+    data, steps = policy_data(filter, anew=(3,))
+    filter.compile(chunk=2, backend="eager")
+    close(filter.sequence(data.copy()), steps, filter.out_keys)
+
+
+def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
+    control = torch.tensor([[0.5], [-1.0]])
+    filter = linear_denkf(control=control)
+    frames = TensorDict({"observation": torch.randn(2, 7, 2), "action": torch.randn(2, 7, 1)}, [2, 7])
+    expected = filter.sequence(frames.copy())
+    data = frames[:, 1:].exclude("action")
+    for key, value in (("action", frames["action"]), (("belief", "ensemble"), expected["belief", "ensemble"])):
+        data.set(("previous", *((key,) if isinstance(key, str) else key)), value[:, :-1])
+    close(filter.sequence(data.copy()), expected[:, 1:], filter.out_keys)
+    rows = [filter(data[:, t].copy().set("action", torch.full((2, 1), 9.0))) for t in range(6)]
+    close(torch.stack([row.select(*filter.out_keys) for row in rows], 1), expected[:, 1:], filter.out_keys)
+
+
+def test_a_policy_carries_actions_that_need_not_be_there():
+    """A transition that can do without the action: the primer brings it all the same."""
+
+    class Coasting(NoisyLinear):
+        def __init__(self, matrix, control):
+            super().__init__(matrix, control=control)
+            self.in_keys, self.optional_keys = self.in_keys[:1], ["action"]
+
+    filter = linear_denkf()
+    filter.module["transition"] = Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]]))
+    assert ("previous", "action") in filter.make_tensordict_primer().actions.values()
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    coasting = filter.predict(td.copy())["belief", "mean"]
+    driven = filter.predict(td.copy().set("action", torch.tensor([2.0])))["belief", "mean"]
+    torch.testing.assert_close(driven - coasting, torch.tensor([1.0, -2.0]))

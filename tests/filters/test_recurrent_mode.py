@@ -1,0 +1,70 @@
+"""torchrl's recurrent mode inside a filter: on for modules that read frames of a sequence, off for its steps."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+from torchrl.modules import set_recurrent_mode
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+
+from tests.filters.factories import linear_denkf
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.filters import Filter
+from torch_denkf.transforms import DEnKFTransform
+
+MEAN = ("belief", "mean")
+
+
+class Smoothed(TensorDictModuleBase):
+    """Adds up readings in time in recurrent mode, as torchrl's recurrent modules go through a sequence."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys = ["raw"], ["observation"]
+
+    def forward(self, tensordict):
+        raw = tensordict["raw"]
+        return tensordict.set("observation", raw.cumsum(-2) if recurrent_mode() else raw)
+
+
+class Pushed(TensorDictModuleBase):
+    """Moves the forecast by one, and by a hundred where it takes its step for a sequence."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys = self.out_keys = [("forecast", "ensemble")]
+
+    def forward(self, tensordict):
+        push = 100.0 if recurrent_mode() else 1.0
+        return tensordict.set(("forecast", "ensemble"), tensordict["forecast", "ensemble"] + push)
+
+
+@pytest.mark.parametrize("mode", [False, True])
+def test_frames_of_a_sequence_are_one_and_steps_are_not(float64, mode):
+    plain = linear_denkf()
+    modules = {"raw": Smoothed(), "noise": plain["noise"], "transition": plain["transition"], "push": Pushed()}
+    filter = Filter(modules | {name: plain[name] for name in ("observation", "analysis")}, initial=plain.initial)
+    frames = TensorDict({"raw": torch.randn(3, 6, 2)}, [3, 6])
+    with set_recurrent_mode(mode):
+        out = filter.sequence(frames.copy())
+    torch.testing.assert_close(out["observation"], frames["raw"].cumsum(1))
+    row = filter.initialise(out[:, 0].select("raw"))
+    for t in range(1, 6):
+        row["raw"] = out["observation"][:, t]
+        row = filter.step(row)
+        torch.testing.assert_close(out[MEAN][:, t], row[MEAN], rtol=0, atol=1e-12)
+
+
+def test_an_environment_takes_single_steps_whatever_the_mode():
+    """A collector inside of torchrl's recurrent mode: the beliefs that it stores are those of steps."""
+    plain, rollouts = linear_denkf(), []
+    modules = {"noise": plain["noise"], "transition": plain["transition"], "push": Pushed()}
+    filter = Filter(modules | {name: plain[name] for name in ("observation", "analysis")}, initial=plain.initial)
+    for mode in (False, True):
+        env = TransformedEnv(base_env(seed=0, batch_size=[2], max_steps=[3, 4]), DEnKFTransform(filter))
+        torch.manual_seed(0)
+        with set_recurrent_mode(mode):
+            rollouts.append(env.rollout(6, break_when_any_done=False))
+    assert rollouts[1][MEAN].equal(rollouts[0][MEAN])
+    assert rollouts[1]["next", *MEAN].equal(rollouts[0]["next", *MEAN])

@@ -1,0 +1,144 @@
+"""Several analyses in one filter: their diagnostics, and readings of which one is missing."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.filters import Filter
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel
+
+ENSEMBLE, MEAN, VAR = (("belief", name) for name in ("ensemble", "mean", "var"))
+TOTALS = [("info", "nis"), ("info", "log_likelihood")]
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    torch.manual_seed(0)
+
+
+def close(first, second, keys, atol=1e-12):
+    for key in keys:
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def parts(index, before, after, **kwargs):
+    """Noise, observation and analysis of one of two readings."""
+    _, _, H, R = linear_system()
+    return {
+        f"r{index}": ConstantNoise(R[[index]].sqrt(), in_key=f"y{index}", out_key=f"r{index}"),
+        f"h{index}": LinearObservation(H[[index]], in_key=(before, "ensemble"), out_key=f"p{index}"),
+        f"a{index}": EnsembleAnalysis(
+            "etkf",
+            forecast_key=(before, "ensemble"),
+            predicted_key=f"p{index}",
+            sensor_key=f"y{index}",
+            noise_variance_key=f"r{index}",
+            belief_key=after,
+            **kwargs,
+        ),
+    }
+
+
+def readings(*batch):
+    frames = TensorDict({"observation": torch.randn(*batch, 2)}, batch)
+    return frames.update({f"y{i}": frames["observation"][..., i : i + 1] for i in (0, 1)})
+
+
+def test_their_diagnostics_add_up_to_those_of_all_readings():
+    """The chain rule: a density of two readings is that of one times that of the other, given the first."""
+    both = linear_denkf()
+    filter = Filter(
+        {"transition": both["transition"], **parts(0, "forecast", "mid"), **parts(1, "mid", "belief")},
+        initial=both.initial,
+    )
+    frames = readings(3, 6)
+    out, expected = filter.sequence(frames.copy()), both.sequence(frames.copy())
+    close(out, expected, [MEAN, VAR, *TOTALS], atol=1e-10)
+    for name in ("nis", "log_likelihood"):
+        own = [out["info", place, name] for place in ("a0", "a1")]
+        close({name: sum(own)}, out["info"], [name])
+        assert all((value[:, 1:] != 0).all() for value in own)
+
+
+def test_analyses_side_by_side_may_be_put_together():
+    """Two analyses of one forecast, of whose beliefs a third module takes the middle: nothing is written over."""
+    plain = linear_denkf()
+
+    class Middle(SubModel):
+        def __init__(self):
+            super().__init__(nn.Identity(), [("one", "ensemble"), ("two", "ensemble")], [ENSEMBLE])
+
+        def compute(self, one, two):
+            return (one + two) / 2
+
+    filter = Filter(
+        {
+            "transition": plain["transition"],
+            **parts(0, "forecast", "one"),
+            **parts(1, "forecast", "two"),
+            "middle": Middle(),
+        },
+        initial=plain.initial,
+    )
+    td = filter.initialise(readings())
+    single = [
+        Filter({"transition": plain["transition"], **parts(i, "forecast", "belief")}, initial=plain.initial).step(
+            td.copy()
+        )
+        for i in (0, 1)
+    ]
+    close(filter.step(td), {ENSEMBLE: (single[0][ENSEMBLE] + single[1][ENSEMBLE]) / 2}, [ENSEMBLE])
+
+
+class Scaled(SubModel):
+    """An update that cannot do without its reading, and writes diagnostics."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [ENSEMBLE, "factor"], [ENSEMBLE, MEAN, ("info", "nis")])
+        self.info_key = "info"
+
+    def compute(self, ensemble, factor):
+        scaled = ensemble * factor.unsqueeze(-1)
+        return scaled, scaled.mean(-2), factor.square()
+
+
+def test_a_sum_is_left_out_where_one_of_its_parts_is_missing():
+    plain = linear_denkf()
+    names = ("noise", "transition", "observation", "analysis")
+    filter = Filter({**{name: plain[name] for name in names}, "scale": Scaled()}, initial=plain.initial)
+    td = filter.initialise(readings().set("factor", torch.tensor([2.0])))
+    whole, part, alone = filter.step(td.copy()), filter.step(td.copy(), without=["factor"]), plain.step(td.copy())
+    close(part, alone, [ENSEMBLE, MEAN])
+    close(whole, {ENSEMBLE: 2 * alone[ENSEMBLE], ("info", "nis"): alone["info", "nis"] + 4.0}, [ENSEMBLE, TOTALS[0]])
+    close(part, {("info", "analysis", "nis"): alone["info", "nis"]}, [("info", "analysis", "nis")])
+    assert part.get(("info", "nis"), None) is None
+
+
+def test_a_reading_goes_through_several_sensors():
+    """The raw entry is the reading, however many modules are between it and the analysis; all of them are left out."""
+    plain, (F, _, _, _) = linear_denkf(), linear_system()
+    code = TensorDictModule(nn.Linear(2, 2), ["raw"], ["code"])
+    sensor = TensorDictModule(nn.Tanh(), ["code"], ["observation"])
+    names = ("noise", "transition", "observation", "analysis")
+    filter = Filter({"code": code, "sensor": sensor, **{name: plain[name] for name in names}}, initial=plain.initial)
+    assert filter.structure.readings == ("raw",)
+    td = filter.initialise(TensorDict({}))
+    close(filter.predict(td.copy()), {ENSEMBLE: td[ENSEMBLE] @ F.mT}, [ENSEMBLE])
+    out = filter.step(td.copy().set("raw", torch.randn(2)))
+    close(out, plain.step(td.copy().set("observation", out["observation"])), [ENSEMBLE])
+
+
+def test_a_mask_that_a_module_writes_need_not_be_given():
+    """Readings far off are masked inside the filter; the mask is no input of it."""
+    plain = linear_denkf()
+    near = TensorDictModule(lambda y: y.abs() < 3, ["observation"], ["observed"])
+    names = ("noise", "transition", "observation", "analysis")
+    filter = Filter({"near": near, **{name: plain[name] for name in names}}, initial=plain.initial)
+    assert "observed" not in filter.in_keys
+    assert "observed" in plain.in_keys
+    frames = TensorDict({"observation": 3 * torch.randn(3, 6, 2)}, [3, 6])
+    masked = frames.copy().set("observed", frames["observation"].abs() < 3)
+    close(filter.sequence(frames), plain.sequence(masked), [ENSEMBLE, MEAN, VAR])
