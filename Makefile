@@ -1,5 +1,6 @@
 # `make demo` (watch it work), `make test` (everything CI runs), `make bench` (speed, beside its peers),
-# `make test-nightly` (the tests beside the nightlies of torchrl and tensordict).
+# `make docs` (the site, in docs/_build/html), `make test-nightly` (the tests beside the nightlies of torchrl and
+# tensordict).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -8,7 +9,7 @@ STAMP := $(VENV)/.installed
 NIGHTLY_VENV := .venv-nightly
 NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 
-.PHONY: demo test test-nightly lint layers unit smoke bench clean
+.PHONY: demo test test-nightly lint layers unit smoke bench docs clean
 
 demo: $(STAMP)
 	$(BIN)/python examples/quickstart.py --out runs/quickstart
@@ -55,8 +56,10 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 	$(NIGHTLY_VENV)/bin/python -m pip uninstall --quiet --yes torchrl tensordict
 	touch $@
 
+# A tiny run of every study and example, two at a time; the long ones first.
 smoke: $(STAMP)
-	for example in examples/*.py; do echo "== $$example --smoke" && $(BIN)/python $$example --smoke || exit 1; done
+	{ printf -- '-m benchmarks.%s\n' kitti ur5 lorenz96 arms; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
+		sh -c 'echo "== {} --smoke" && $(BIN)/python {} --smoke || exit 255'
 
 # Ratios hold on a busy machine, absolute times do not.
 bench: $(VENV)/.bench
@@ -66,5 +69,13 @@ $(VENV)/.bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[bench]"
 	touch $@
 
+# Needs no network: formulas are drawn by the reader's browser. A warning is an error.
+docs: $(VENV)/.docs
+	OMP_NUM_THREADS=1 MPLBACKEND=agg $(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(NIGHTLY_VENV) build dist *.egg-info runs
+	rm -rf $(VENV) $(NIGHTLY_VENV) build dist *.egg-info runs docs/_build docs/gallery docs/reference/*.rst

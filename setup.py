@@ -1,17 +1,32 @@
 """Metadata of torch_denkf; the build backend and the tools are configured in pyproject.toml."""
 
+import re
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
+ROOT = Path(__file__).parent
+# Read, not imported: an import would need torch.
+VERSION = re.search(r'^__version__ = "(.+)"$', (ROOT / "torch_denkf" / "__init__.py").read_text(), re.MULTILINE)[1]
+
 setup(
     name="torch_denkf",
-    version="0.1.0",
+    version=VERSION,
     description="Differentiable Bayesian filters for robots as TorchRL parts",
-    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="MIT",
     license_files=["LICENSE"],
+    keywords=["Bayesian filter", "ensemble Kalman filter", "state estimation", "robotics", "TorchRL"],
+    classifiers=[
+        "Development Status :: 3 - Alpha",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        "Programming Language :: Python :: 3.11",
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.11",
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={"torch_denkf": ["py.typed", "**/*.pyi"], "torch_denkf.simulation.ur5": ["assets/*.xml"]},
@@ -40,17 +55,28 @@ setup(
         "examples": ["matplotlib", "tensorboard"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],
-        # The peers of `make bench`, in the versions that benchmarks/results/speed.md was made with.
+        # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
+            "tyro",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",
             "dynamax==1.0.3",
             "jax==0.10.2",
         ],
+        # The site: `make docs`.
+        "docs": [
+            "sphinx>=9.0",
+            "myst-parser>=5.2",
+            "sphinx-gallery>=0.22",
+            "furo>=2025.12",
+            "sphinx-copybutton>=0.5.2",
+            "matplotlib",
+        ],
         "test": [
             "evo",
+            "tyro",
             "pyarrow>=15",
             "av>=14",
             "pytest",

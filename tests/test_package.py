@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import torch_denkf
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -45,6 +47,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
     for pin in ("torch>=2.13", "torchrl>=0.14.1", "tensordict>=0.14.3", "mujoco<4,>=3.17"):
         assert f"Requires-Dist: {pin}\n" in metadata
     assert "Requires-Python: >=3.11\n" in metadata
+    assert f"Version: {torch_denkf.__version__}\n" in metadata
     assert "Name: torch_denkf" in metadata or "Name: torch-denkf" in metadata
 
 

@@ -1,6 +1,6 @@
 """Runs every pair in a process of its own, one after the other, and writes the report.
 
-python -m benchmarks.speed                      # all pairs: benchmarks/results/speed.{md,json}, docs/speed.png
+python -m benchmarks.speed                      # all pairs: results/speed.{md,json}, docs/speed.png
 python -m benchmarks.speed --only against_textbook packaged_step
 """
 
@@ -29,7 +29,7 @@ PAIRS = (
     "against_floor",
     "packaged_step",
 )
-#: Scripts of benchmarks/ with ratios() -> list[dict].
+#: Of this package, and commands of their own: with ratios() -> list[dict].
 SCRIPTS = ("training_step", "transform_cost", "scaling")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
@@ -46,8 +46,7 @@ def in_this_process(name: str, seconds: float, out: Path) -> None:
 
         result = measure()
     elif name in SCRIPTS:
-        sys.path.insert(0, str(ROOT / "benchmarks"))
-        result = importlib.import_module(name).ratios()
+        result = importlib.import_module(f"benchmarks.speed.{name}").ratios()
     else:
         result = [row.as_dict() for row in importlib.import_module(f"benchmarks.speed.{name}").rows(seconds)]
     out.write_text(json.dumps(result))
@@ -81,11 +80,22 @@ def in_own_process(name: str, seconds: float) -> list[dict] | dict:
     return [{"name": name.replace("_", " "), "ratio": None, "target": None, "note": f"not run: {reason.strip()}"}]
 
 
+def smoke() -> None:
+    """The commands of their own, tiny, and a pair that needs no other package."""
+    from benchmarks.speed import against_textbook, scaling, training_step, transform_cost
+
+    for options in (scaling.Scaling, training_step.TrainingStep, transform_cost.TransformCost):
+        options(smoke=True)()
+    os.environ["SPEED_COMPILE"] = "0"
+    for row in against_textbook.rows(0.1):
+        print(row)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=12.0, help="to spend on each comparison (default: 12)")
     parser.add_argument("--only", nargs="+", default=[*PAIRS, *SCRIPTS], help="run these pairs, keep other rows")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="folder of the results")
     parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "speed.png")
     parser.add_argument(
         "--no-compile", action="store_true", help="leave out compiled sequences: minutes each to compile"
@@ -94,9 +104,13 @@ def main() -> None:
         "--plain", action="store_true", help="measure the compiled rows with plain inductor, as a column of its own"
     )
     parser.add_argument("--pair", nargs=2, metavar=("NAME", "JSON"), help="run one pair in this process")
+    parser.add_argument("--smoke", action="store_true", help="a tiny run of some, nothing written: does it run?")
     args = parser.parse_args()
     if args.pair:
         in_this_process(args.pair[0], args.seconds, Path(args.pair[1]))
+        return
+    if args.smoke:
+        smoke()
         return
     if args.no_compile:
         os.environ["SPEED_COMPILE"] = "0"
@@ -105,7 +119,7 @@ def main() -> None:
 
     begun = time.perf_counter()
     machine = in_own_process("machine", args.seconds)
-    names = [n for n in args.only if n in PAIRS or (n in SCRIPTS and (ROOT / "benchmarks" / f"{n}.py").exists())]
+    names = [name for name in args.only if name in PAIRS or name in SCRIPTS]
     command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
     command += " --no-compile" * args.no_compile + " --plain" * args.plain
     known, order = args.out / "speed.json", [*PAIRS, *SCRIPTS]

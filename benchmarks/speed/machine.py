@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import platform
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import torch
+
+from benchmarks.common.arguments import processor
 
 
 def matrix_product(size: int = 768):
@@ -44,10 +48,10 @@ def measure() -> dict:
     }
 
 
-def processor() -> str:
-    """The processor's name."""
-    info = Path("/proc/cpuinfo")
-    for line in info.read_text().splitlines() if info.exists() else []:
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.processor() or platform.machine()
+def in_child(script: str) -> float:
+    """The number that a Python script prints in a process of its own, started in the repository's root."""
+    root = Path(__file__).parents[2]
+    process = subprocess.run(
+        [sys.executable, "-c", script], cwd=root, capture_output=True, text=True, timeout=600, check=True
+    )
+    return float(process.stdout)

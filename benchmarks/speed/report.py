@@ -14,7 +14,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> str:
-    """The page that is committed."""
+    """The page of results."""
     lines = [
         "# Speed, side by side",
         "",

@@ -1,21 +1,11 @@
 """Likelihood and gradient of AD-EnKF: a Kalman filter, torch's own density and finite differences are the oracles."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch.distributions import MultivariateNormal
 
-from tests.filters.factories import linear_denkf, linear_system
-from torch_denkf.functional import gaspari_cohn, kalman_predict, kalman_update
-from torch_denkf.modules import EnsembleAnalysis, GaussianPrior
-from torch_denkf.objectives import DEnKFLoss
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-from ad_enkf import (
+from benchmarks.lorenz96.learned import (
     climate_of,
     forcing_of,
     learn,
@@ -26,6 +16,10 @@ from ad_enkf import (
     simulate,
     tapers,
 )
+from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.functional import gaspari_cohn, kalman_predict, kalman_update
+from torch_denkf.modules import EnsembleAnalysis, GaussianPrior
+from torch_denkf.objectives import DEnKFLoss
 
 
 @pytest.mark.parametrize("scheme", ["etkf", "perturbed"])

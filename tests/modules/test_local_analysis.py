@@ -169,7 +169,7 @@ def lorenz_run(variables, batch, steps):
 
 
 def test_seven_members_follow_forty_variables(float64):
-    """Readings err by 1.0; long runs err by 0.22 (benchmarks/results/lorenz96.md). Without localisation: 4 and more."""
+    """Readings err by 1.0; long runs err by 0.22 (benchmarks/lorenz96/results/schemes.md). Without localisation: 4 and more."""
     run = lorenz_run(40, batch=4, steps=120)
     with torch.no_grad():
         out = lorenz_filter(40, members=7).sequence(run.clone())

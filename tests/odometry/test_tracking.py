@@ -189,6 +189,8 @@ def test_a_camera_that_does_not_fit_is_noticed(moving):
     strange["image"] = torch.randint(0, 256, strange["image"].shape, dtype=torch.uint8)
     (message,) = messages(strange)
     assert "the road does not look like a plane under this camera" in message
+    (message,) = messages(moving, height=4.5)
+    assert "m between two frames, where the sensor's range ends" in message
 
 
 def test_height_scales_the_path_and_cannot_be_seen(moving):

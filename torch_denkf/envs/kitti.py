@@ -23,19 +23,19 @@ class KITTIReplayEnv(EnvBase):
 
     Emits, at reset and at each step, the row t of the drive exactly as :func:`torch_denkf.data.drive_frames` has it:
 
-    ============ ============ ====================================================================================
-    key          shape        content
-    ============ ============ ====================================================================================
-    ``pixels``   [*B,2C,H,W]  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour;
-                              where the drive has images
-    ``flow``     [*B,3,h,w]   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
-    ``road``     [*B,p,s]     float32, likewise
-    ``observed`` [*B,1]       bool: frames t and t-1 are both there; what is missing is zero in the pixels
-    ``steps``    [*B,1]       int64, where the drive has it: see :func:`torch_denkf.data.bridge_gaps`
-    ``state``    [*B,5]       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
-    ``is_init``  [*B,1]       bool: an episode starts here
-    ``time``     [*B,1]       float64, s, as the drive counts it
-    ============ ============ ====================================================================================
+    ============ ================ ====================================================================================
+    key          shape            content
+    ============ ================ ====================================================================================
+    ``pixels``   ``[*B,2C,H,W]``  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour;
+                                  where the drive has images
+    ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
+    ``road``     ``[*B,p,s]``     float32, likewise
+    ``observed`` ``[*B,1]``       bool: frames t and t-1 are both there; what is missing is zero in the pixels
+    ``steps``    ``[*B,1]``       int64, where the drive has it: see :func:`torch_denkf.data.bridge_gaps`
+    ``state``    ``[*B,5]``       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
+    ``is_init``  ``[*B,1]``       bool: an episode starts here
+    ``time``     ``[*B,1]``       float64, s, as the drive counts it
+    ============ ================ ====================================================================================
 
     An episode shows ``length`` frames, the one at reset included: ``length - 1`` steps, then it is truncated. Rows may
     end at different steps; a reset starts anew only the rows that ``"_reset"`` marks. The difference at reset is that

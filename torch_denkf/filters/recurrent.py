@@ -33,7 +33,7 @@ class LSTMFilter(Filter):
             velocities, and the pose follows by the known motion (:class:`~torch_denkf.modules.UnicyclePose`).
             ``None``: the LSTM estimates the whole state.
         initial: the belief at reset, a mean and a covariance, e.g. :class:`~torch_denkf.modules.GaussianAround`; by
-            default N(``loc``, ``scale``²), which a vehicle does not have.
+            default ``N(loc, scale²)``, which a vehicle does not have.
         loc: mean of what the LSTM estimates, ``[S]``, or ``[2]`` with ``dt``; zero by default.
         scale: its standard deviation; one by default.
         hidden_size: of each layer.

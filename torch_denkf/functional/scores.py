@@ -15,14 +15,14 @@ from torch_denkf.functional._checks import check_ensemble, check_shape
 
 
 def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:
-    """Continuous ranked probability score of each component: E|x − y| − 1/2 E|x − x'|.
+    """Continuous ranked probability score of each component: ``E|x − y| − 1/2 E|x − x'|``.
 
     Sorting makes the double sum over pairs a single one: O(E log E) time, O(E) memory.
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
         target: the truth y, ``[*B, S]``, in the state's units.
-        fair: average |x − x'| over the E (E − 1) pairs of different members, which makes the score an
+        fair: average ``|x − x'|`` over the E (E − 1) pairs of different members, which makes the score an
             unbiased estimate of that of the distribution they come from; otherwise over all E², which is
             the score of the empirical distribution.
 

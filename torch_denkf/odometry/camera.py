@@ -108,16 +108,16 @@ class _Watch:
                 f"{self.pitch:g} the sensor reads {self.pitch + low:g} to {self.pitch + high:g}. Pass "
                 f"pitch={self.pitch + up:.3f}, or correct cy"
             )
+        elif moved >= _FASTEST:
+            self.say(
+                f"the car seems to move {moved:.1f} m between two frames, where the sensor's range ends. Check the "
+                "camera's height, the focal lengths, and the times of the frames"
+            )
         elif correlation < _LEAST_CORRELATION:
             self.say(
                 f"the road does not look like a plane under this camera (correlation {correlation:.2f}; "
                 f"{_LEAST_CORRELATION} or more is usual). Check the calibration, that the images are rectified, and "
                 "that they show the road below their middle"
-            )
-        elif moved >= _FASTEST:
-            self.say(
-                f"the car seems to move {moved:.1f} m between two frames, where the sensor's range ends. Check the "
-                "camera's height, the focal lengths, and the times of the frames"
             )
 
     def say(self, text: str) -> None:

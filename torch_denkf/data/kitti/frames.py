@@ -21,19 +21,19 @@ MOTION_KEYS = ("flow", "road")  # what with_motion adds
 def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     """Frames of a drive by row number.
 
-    ============ ============ ====================================================================================
-    key          shape        content
-    ============ ============ ====================================================================================
-    ``pixels``   [*B,2C,H,W]  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1];
-                              where the drive has ``image``
-    ``flow``     [*B,3,h,w]   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
-    ``road``     [*B,p,s]     float32, likewise
-    ``state``    [*B,5]       float32, see :func:`torch_denkf.data.read_kitti_drive`
-    ``observed`` [*B,1]       bool: both frames are there, so that the difference means something
-    ``steps``    [*B,1]       int64, where the drive has it: steps between the two frames, which then need not be
-                              neighbours, see :func:`torch_denkf.data.bridge_gaps`
-    ``time``     [*B,1]       float64, s
-    ============ ============ ====================================================================================
+    ============ ================ ====================================================================================
+    key          shape            content
+    ============ ================ ====================================================================================
+    ``pixels``   ``[*B,2C,H,W]``  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1];
+                                  where the drive has ``image``
+    ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
+    ``road``     ``[*B,p,s]``     float32, likewise
+    ``state``    ``[*B,5]``       float32, see :func:`torch_denkf.data.read_kitti_drive`
+    ``observed`` ``[*B,1]``       bool: both frames are there, so that the difference means something
+    ``steps``    ``[*B,1]``       int64, where the drive has it: steps between the two frames, which then need not be
+                                  neighbours, see :func:`torch_denkf.data.bridge_gaps`
+    ``time``     ``[*B,1]``       float64, s
+    ============ ================ ====================================================================================
 
     What is missing is zero: both parts of the pixels where frame t is, the difference, the flow and the road where
     frame t-1 is. The first row of a drive has no frame before it and is not observed.

@@ -1,0 +1,1 @@
+"""Studies and measurements, each with its results; run them from the repository's root."""

@@ -1,0 +1,167 @@
+"""The arms: their geometry and controller, and how their readings come about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Binary, Unbounded
+from torchrl.envs import Compose, DoubleToFloat, GrayScale, SerialEnv, ToTensorImage, TransformedEnv
+from torchrl.envs.libs.dm_control import DMControlWrapper
+from torchrl.envs.transforms import Transform
+
+SIDE, NOISE = 64, 0.1  # pixels; rad
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Into [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+@dataclass
+class Arm:
+    """What the study needs to know of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
+
+    domain: str
+    task: str
+    links: tuple[float, ...]  # m
+    dt: float  # s
+    actions: int
+    stiffness: float  # of the controller: action a rad
+    damping: float  # action a rad/s
+
+    @property
+    def joints(self) -> int:
+        return len(self.links)
+
+    def state(self, emitted: TensorDictBase) -> Tensor:
+        if self.domain == "reacher":
+            return self.join(emitted["position"], emitted["velocity"])
+        sin_cos = emitted["arm_pos"][..., : self.joints, :]
+        return torch.cat([sin_cos[..., 1], sin_cos[..., 0], emitted["arm_vel"][..., : self.joints]], -1)
+
+    def join(self, angles: Tensor, velocity: Tensor) -> Tensor:
+        return torch.cat([angles.cos(), angles.sin(), velocity], -1)
+
+    def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Angles in (-pi, pi] and velocities."""
+        cos, sin, velocity = state.split(self.joints, -1)
+        return torch.atan2(sin, cos), velocity
+
+    def tip(self, angles: Tensor) -> Tensor:
+        """Where the chain of links ends, in the plane of motion, m ``[*, 2]``."""
+        turned, links = angles.cumsum(-1), torch.tensor(self.links)
+        return torch.stack([(links * turned.cos()).sum(-1), (links * turned.sin()).sum(-1)], -1)
+
+    def goal(self, emitted: TensorDictBase) -> Tensor:
+        """The joint angles to go to, at the start of an episode."""
+        angles = self.split(self.state(emitted))[0]
+        if self.domain != "reacher":  # upright, away from floor and walls
+            return 1.6 * torch.rand_like(angles) - 0.8
+        a, b = self.links
+        target = self.tip(angles) + emitted["to_target"]
+        square = target.square().sum(-1)
+        wrist = ((square - a * a - b * b) / (2 * a * b)).clamp(-0.93, 1).acos()  # its stop is at 160 degrees
+        shoulder = torch.atan2(target[..., 1], target[..., 0]) - torch.atan2(b * wrist.sin(), a + b * wrist.cos())
+        return torch.stack([shoulder, wrist], -1)
+
+    def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
+        """Proportional to the angles' errors, damped: the policy, whatever its estimate of the state comes from.
+
+        With ``explore`` random actions come on top, the larger the later the arm stands in the batch; an arm at rest
+        has to be learned, too.
+        """
+        angles, velocity = self.split(state)
+        error = torch.cat(
+            [wrap(goal - angles)[..., :1], (goal - angles)[..., 1:]], -1
+        )  # only the first turns all round
+        action = self.stiffness * error - self.damping * velocity
+        if explore:
+            action = action + explore * torch.linspace(0, 1, len(action)).unsqueeze(-1) * torch.randn_like(action)
+        return nn.functional.pad(action, (0, self.actions - self.joints)).clamp(-1, 1)  # the grip stays as it is
+
+
+ARMS = {
+    "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3),
+    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15),
+}
+
+
+class Encoders(Transform):
+    """Writes ``"state"``, the episode's ``"goal"``, ``"reading"`` (cosines, sines of noisy angles) and ``"observed"``.
+
+    The reading of a reset is always there, of the others the share ``missing`` is not.
+    """
+
+    def __init__(self, arm: Arm, missing: float):
+        super().__init__(in_keys=[], out_keys=["state", "goal", "reading", "observed"])
+        self.arm, self.missing = arm, missing
+
+    def _write(self, tensordict: TensorDictBase, goal: Tensor, missing: float) -> TensorDictBase:
+        state = self.arm.state(tensordict)
+        angles = self.arm.split(state)[0]
+        angles = angles + NOISE * torch.randn_like(angles)
+        reading = torch.cat([angles.cos(), angles.sin()], -1)
+        observed = torch.rand(*tensordict.batch_size, 1) >= missing
+        return tensordict.update({"state": state, "goal": goal, "reading": reading, "observed": observed})
+
+    def _step(self, tensordict, next_tensordict):
+        return self._write(next_tensordict, tensordict["goal"], self.missing)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._write(tensordict_reset, self.arm.goal(tensordict_reset), 0.0)
+
+    def transform_observation_spec(self, observation_spec):
+        for key, width in (("state", 3), ("goal", 1), ("reading", 2)):
+            observation_spec[key] = Unbounded((*observation_spec.shape, width * self.arm.joints))
+        observation_spec["observed"] = Binary(shape=(*observation_spec.shape, 1), dtype=torch.bool)
+        return observation_spec
+
+
+class HoldReading(Transform):
+    """Writes ``"held"``: the last reading that was there, and the mean of its differences over the last five or so."""
+
+    def __init__(self, arm: Arm, in_key):
+        super().__init__(in_keys=[in_key], out_keys=["held"])
+        self.arm = arm
+
+    def _reading(self, tensordict: TensorDictBase) -> Tensor:
+        reading = tensordict[self.in_keys[0]]
+        reading = reading.mean(-2) if reading.ndim > tensordict.ndim + 1 else reading  # of a sensor's samples
+        return nn.functional.pad(reading, (0, self.arm.joints))  # at rest
+
+    def _step(self, tensordict, next_tensordict):
+        before, velocity = self.arm.split(tensordict["held"])
+        now = self.arm.split(self._reading(next_tensordict))[0]
+        angles = torch.where(next_tensordict["observed"], now, before)
+        velocity = velocity + 0.2 * (wrap(angles - before) / self.arm.dt - velocity)
+        return next_tensordict.set("held", self.arm.join(angles, velocity))
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset.set("held", self._reading(tensordict_reset))
+
+    def transform_observation_spec(self, observation_spec):
+        observation_spec["held"] = observation_spec["state"].clone()
+        return observation_spec
+
+
+def make_one(arm: Arm, pixels: bool) -> DMControlWrapper:
+    from dm_control import suite
+
+    env = suite.load(arm.domain, arm.task)
+    if not pixels:
+        return DMControlWrapper(env)
+    env.physics.model.vis.quality.offsamples = 0  # shadows and smooth edges cost ten times as much as the rest
+    quick = {"shadow": False, "reflection": False}
+    shape = {"height": SIDE, "width": SIDE, "camera_id": 0, "render_flag_overrides": quick}
+    return DMControlWrapper(env, from_pixels=True, pixels_only=False, render_kwargs=shape)
+
+
+def make_env(arm: Arm, pixels: bool, episodes: int, missing: float = 0.0) -> TransformedEnv:
+    """``episodes`` arms side by side."""
+    images = [ToTensorImage(), GrayScale()] if pixels else []
+    arms = SerialEnv(episodes, partial(make_one, arm, pixels))
+    return TransformedEnv(arms, Compose(DoubleToFloat(), *images, Encoders(arm, missing)))

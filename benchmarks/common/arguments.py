@@ -1,0 +1,62 @@
+"""Options of a study: a dataclass, which tyro reads from the command line."""
+
+from __future__ import annotations
+
+import inspect
+import platform
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+import tyro
+
+T = TypeVar("T")
+CONFIG = (tyro.conf.FlagCreatePairsOff,)  # --smoke, and no --no-smoke
+
+
+def parse(options: type[T], arguments: Sequence[str] | None = None) -> T:
+    """The options of a command line; a field's comment is its help. Sets torch to one thread.
+
+    The matrices of the studies are small: more threads would only wait for each other.
+    """
+    torch.set_num_threads(1)
+    program = f"python -m {options.__module__.rpartition('.')[0]}"
+    return tyro.cli(options, prog=program, args=arguments, config=CONFIG, description=inspect.getdoc(options))
+
+
+def run_one(commands: dict[str, type[Callable[[], None]]], arguments: Sequence[str] | None = None) -> None:
+    """Runs the command that the command line names; ``--smoke`` alone runs all of them, tiny.
+
+    Args:
+        commands: by name, dataclasses of options that can be called and have a field ``smoke``.
+        arguments: by default the command line's.
+    """
+    torch.set_num_threads(1)
+    if list(sys.argv[1:] if arguments is None else arguments) == ["--smoke"]:
+        for name, options in commands.items():
+            print(f"-- {name}", flush=True)
+            options(smoke=True)()
+        return
+    tyro.extras.subcommand_cli_from_dict(commands, args=arguments, config=CONFIG)()
+
+
+def some_of(names: Iterable[str]) -> Any:
+    """The type of an option that takes some of these names."""
+    return tuple[Literal[tuple(names)], ...]
+
+
+def command(study: str) -> str:
+    """The command line that is running, for the record: ``python -m benchmarks.<study> ...``."""
+    return shlex.join(["python", "-m", f"benchmarks.{study}", *sys.argv[1:]])
+
+
+def processor() -> str:
+    """The processor's name, for the record."""
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else []:
+        if line.startswith("model name"):
+            return line.split(":")[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,49 @@
+"""Jobs of a study: side by side, each done once, their rows left on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+from tqdm import tqdm
+
+
+def once(file: Path, rows: Callable[[], list[dict]]) -> None:
+    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+    if file.exists():
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    beside = file.with_name(file.name + ".part")
+    beside.write_text(json.dumps(rows()))
+    beside.replace(file)
+
+
+def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: str) -> None:
+    """Makes all calls, each in one of some fresh processes; raises what a call raised."""
+    if processes < 2:
+        for call in tqdm(calls, desc=title, disable=None):
+            call()
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(call) for call in calls]
+        for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
+            future.result()
+
+
+def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda row: None) -> list[dict]:
+    """All rows of some JSON files.
+
+    Args:
+        files: in the order of their rows.
+        shared: what makes a row the same as another file's, or ``None``; the first file's are kept.
+    """
+    rows: list[dict] = []
+    seen: set[Hashable] = set()
+    for file in files:
+        keyed = [(shared(row), row) for row in json.loads(file.read_text())]
+        rows += [row for key, row in keyed if key not in seen]
+        seen |= {key for key, _ in keyed if key is not None}
+    return rows

@@ -1,0 +1,70 @@
+"""Tables of rows: as CSV, and in Markdown."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A CSV file of rows.
+
+    Args:
+        names: of all columns.
+        text: those that hold text.
+        whole: those that hold whole numbers; all others hold floats, of which five digits are kept.
+        order: sorts the rows.
+    """
+
+    names: Sequence[str]
+    text: Sequence[str]
+    whole: Sequence[str]
+    order: Callable[[dict], tuple]
+
+    def write(self, rows: Iterable[dict], file: Path) -> None:
+        """Writes rows; NaN and what a row lacks stay empty."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, self.names, lineterminator="\n")
+            writer.writeheader()
+            for row in sorted(rows, key=self.order):
+                writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items() if v == v})
+
+    def read(self, file: Path) -> list[dict]:
+        """Rows as :meth:`write` wrote them; what is empty is left out."""
+        with file.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        kinds = {**dict.fromkeys(self.names, float), **dict.fromkeys(self.text, str), **dict.fromkeys(self.whole, int)}
+        return [{key: kinds[key](value) for key, value in row.items() if value != ""} for row in rows]
+
+
+def pick(rows: Iterable[dict], **wanted) -> list[dict]:
+    """Rows with these entries."""
+    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
+
+
+def line(*cells: object) -> str:
+    """A line of a Markdown table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def head(*titles: object) -> list[str]:
+    """The two lines that a Markdown table begins with."""
+    return [line(*titles), "|" + "---|" * len(titles)]
+
+
+def write_page(page: str, file: Path | None) -> None:
+    """Prints a page, and leaves it in a file if one is given."""
+    print("\n" + page)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(page)
+
+
+def report(folder: Path, columns: Columns, rows: Sequence[dict], page: str) -> None:
+    """Leaves the rows as table.csv and a page as table.md, and prints the page."""
+    columns.write(rows, folder / "table.csv")
+    write_page(page, folder / "table.md")

@@ -1,0 +1,53 @@
+"""The training of a filter in stages, and then of its one number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from benchmarks.common.recipes import Recipe
+from torch_denkf.filters import Filter
+from torch_denkf.training import FilterTrainer, Stage, choose_for_coverage, read_checkpoint, write_checkpoint
+
+
+def fit_filter(
+    recipe: Recipe,
+    model: Filter,
+    stages: Callable[[], Sequence[Stage]],
+    coverage: Callable[[], Tensor],
+    *,
+    out: Path,
+    inflations: Sequence[float],
+    notes: dict | None = None,
+    **settings,
+) -> None:
+    """Trains a filter, then chooses its inflation; or reads both from ``out/filter.pt`` where that was done.
+
+    Args:
+        recipe: the model's.
+        model: trained in place; it is left on its best parameters.
+        stages: makes the stages.
+        coverage: of the model's 90 % intervals on validation data.
+        out: checkpoints and logs.
+        inflations: to choose from.
+        notes: plain values and tensors to leave in the file, too.
+        **settings: of :class:`~torch_denkf.training.FilterTrainer`.
+    """
+    file = out / "filter.pt"
+    if file.exists():
+        read_filter(recipe, model, read_checkpoint(file))
+        return
+    trainer = FilterTrainer(model, stages(), out=out, **settings)
+    trainer.fit()
+    inflation = choose_for_coverage(inflations, lambda factor: recipe.set_inflation(model, factor), coverage)
+    if trainer.processes.is_main:
+        write_checkpoint(file, {"model": model.state_dict(), "inflation": inflation, **(notes or {})})
+
+
+def read_filter(recipe: Recipe, model: Filter, saved: dict) -> Filter:
+    """The model with the parameters and the inflation of a ``filter.pt``."""
+    model.load_state_dict(saved["model"])
+    recipe.set_inflation(model, saved["inflation"])
+    return model

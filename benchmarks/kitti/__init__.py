@@ -1,0 +1,1 @@
+"""Visual odometry on KITTI, leaving one drive out after the other."""

@@ -1,0 +1,84 @@
+"""The command line of the study: ``python -m benchmarks.kitti --help``."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import report
+from benchmarks.kitti.folds import Part, with_disturbances
+from benchmarks.kitti.streams import find_streams, prepare, spans
+from benchmarks.kitti.study import Study, evaluate_and_draw, make_jobs, prepare_jobs, rows_of, run_jobs
+from benchmarks.kitti.tables import COLUMNS, markdown
+from benchmarks.kitti.training import Budget, load_filter
+from torch_denkf.data import write_drives
+
+
+def smoke(study: Study) -> Study:
+    """Everything once, on four small drives that are rendered for it."""
+    folder = Path(tempfile.mkdtemp(prefix="kitti-"))
+    names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=60, seed=0))
+    budget = Budget(sensor=6, fine_tuning=2, filter=4, end_to_end=3, length=8)
+    settings = {"size": (50, 150), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
+    return replace(study, root=folder / "kitti", out=folder / "out", sensors=("flow", "image"), **settings)
+
+
+def write_table(study: Study, rows: list[dict], begun: float) -> None:
+    """Leaves rows and their tables in the study's folder."""
+    header = f"`{command('kitti')}`: {(time.time() - begun) / 60:.0f} min, {study.processes} process(es)"
+    report(study.out, COLUMNS, rows, markdown(rows, header))
+
+
+def table(study: Study) -> None:
+    """Trains and tests every filter and sensor on every fold."""
+    begun = time.time()
+    jobs = make_jobs(study)
+    (study.out / "settings.json").write_text(json.dumps(asdict(study), indent=1, default=str))
+    run_jobs(jobs, study.processes)
+    write_table(study, rows_of(study.out), begun)
+
+
+def train(study: Study) -> None:
+    """Trains filters on the folds that leave the --test drives out, without testing them."""
+    jobs = make_jobs(study)
+    prepare_jobs(jobs, study.processes)
+    for job in jobs:
+        base = job.base()
+        for name in study.filters:
+            job.train(name, base)
+            print(f"{job.out(name)}: evaluate --checkpoint {job.out(name)} --test {job.fold.name}")
+
+
+def evaluate(study: Study) -> None:
+    """Tests one trained filter on any drives, those of another folder, too."""
+    begun = time.time()
+    if study.checkpoint is None:
+        raise SystemExit("evaluate needs --checkpoint: a folder that train or table left in --out/folds")
+    recipe, model, name, sensor = load_filter(study.checkpoint)
+    streams = find_streams(study.root, study.size, list(study.test) or None)
+    parts = with_disturbances([Part(stream) for stream in streams])
+    prepare([each for part in parts for each in spans(part.stream, sensor)], study.cache, study.processes)
+    names = {"filter_name": name, "kind": sensor, "seed": 0}
+    rows = evaluate_and_draw(recipe, model, streams, study.cache, study.out / "plots", **names)
+    write_table(study, rows, begun)
+
+
+def main() -> None:
+    """Runs a command."""
+    study = parse(Study)
+    if study.smoke:
+        study = smoke(study)
+    if study.root is None:
+        raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
+    study.out.mkdir(parents=True, exist_ok=True)
+    {"table": table, "train": train, "evaluate": evaluate}[study.command](study)
+    if study.smoke:
+        evaluate(replace(study, checkpoint=next((study.out / "folds").iterdir())))
+
+
+if __name__ == "__main__":
+    main()

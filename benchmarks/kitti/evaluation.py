@@ -1,0 +1,144 @@
+"""Errors of a trained filter on the drive that was left out, beside dead reckoning and its floor."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.common.scores import cost, counted
+from benchmarks.kitti.folds import VELOCITIES, Part
+from benchmarks.kitti.readings import all_frames, lose_frames, read_spans
+from benchmarks.kitti.recipes import REACH, KITTIRecipe
+from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
+from benchmarks.kitti.training import FLOOR, run_filter
+from torch_denkf.filters import Filter
+from torch_denkf.functional import crps_gaussian
+from torch_denkf.metrics import (
+    dead_reckoning,
+    gaussian_nll,
+    interval_coverage,
+    kitti_devkit_error,
+    kitti_endpoint_error,
+    kitti_pathlength_error,
+    nees,
+    spread_skill_ratio,
+    state_errors,
+)
+from torch_denkf.training import hold_last
+
+MASKS = 8  # draws of the missing frames, over which the errors are averaged
+WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
+TIMED = 100  # steps to time a filter on
+
+
+def last_velocities(reading: TensorDict, dt: float) -> Tensor:
+    """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
+
+    A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
+    """
+    steps = reading["steps"]
+
+    def near(row: int, held: Tensor) -> Tensor:
+        return held[:1].double().abs() * steps[row] * dt <= REACH
+
+    mean = reading["sensor", "ensemble"].mean(1) / steps.clamp_min(1)
+    return hold_last(mean, reading["observed"], reading["state"][0, VELOCITIES], near)
+
+
+def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
+    """The states ``[N, 5]`` that velocities lead to from the true first pose."""
+    return torch.cat([dead_reckoning(velocity.double(), truth[0, :3].double(), dt), velocity.double()], -1)
+
+
+def evaluate(
+    recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
+) -> tuple[list[dict], dict[str, TensorDict]]:
+    """All rows of the table for one drive, and its beliefs by condition, for the plots."""
+    clean = read_spans(model["sensor"], Part(stream), cache, kind)
+    readings = {"clean": [all_frames(clean)]}
+    readings["missing"] = [lose_frames(clean, seed=stream.seed() + number) for number in range(MASKS)]
+    for condition in DISTURBANCES:
+        part = Part(replace(stream, condition=condition))
+        readings[condition] = [all_frames(read_spans(model["sensor"], part, cache, kind))]
+    pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
+    out = run_filter(recipe, model, [reading for _, reading in pairs])
+    first = pairs[0][1][:TIMED]
+    costs = cost(model, lambda: run_filter(recipe, model, [first]), len(first))
+    rows, beliefs = defaultdict(list), {}
+    for (condition, reading), belief in zip(pairs, out, strict=True):
+        beliefs.setdefault(condition, belief)
+        truth = clean["state"].double()
+        common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
+        common["blind"] = 1 - float(reading["observed"][1:].float().mean())
+        estimates = {filter_name: belief["belief", "mean"][:, :5].double()}
+        estimates["dead_reckoning"] = integrate(last_velocities(reading, recipe.facts.dt), truth, recipe.facts.dt)
+        if condition == "clean":
+            estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
+        for name, states in estimates.items():
+            scores = {**calibration(belief), **costs} if name == filter_name else {}
+            for row in errors(states, truth):
+                rows[condition, name, row["window"]].append({**common, **scores, "filter": name, **row})
+    return [_mean(group) for group in rows.values()], beliefs
+
+
+def _mean(rows: list[dict]) -> dict:
+    """One row of several that differ in their numbers alone: which frames are missing is chance."""
+    return {
+        key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
+    }
+
+
+def errors(states: Tensor, truth: Tensor) -> list[dict]:
+    """Errors of a path by window; those that know no window stand in each row."""
+    velocity = state_errors(states[1:, VELOCITIES], truth[1:, VELOCITIES])
+    whole = {
+        "rmse_v_m_per_s": float(velocity.rmse[0]),
+        "mae_v_m_per_s": float(velocity.mae[0]),
+        "rmse_theta_dot_deg_per_s": float(velocity.rmse[1].rad2deg()),
+        "mae_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
+    }
+    try:
+        devkit = kitti_devkit_error(states[:, :3], truth[:, :3])
+        whole |= {"devkit_t_rel_percent": float(devkit.translation), "devkit_r_rel_deg_per_m": float(devkit.rotation)}
+    except ValueError:  # shorter than 100 m
+        pass
+    table = []
+    for window in WINDOWS:
+        if window < len(truth):
+            end = kitti_endpoint_error(states[:, :3], truth[:, :3], window=window)
+            length = kitti_pathlength_error(states[:, :3], truth[:, :3], windows=[window])
+            table.append(
+                {
+                    **whole,
+                    "window": window,
+                    "translation_m_per_m": float(end.translation),
+                    "rotation_deg_per_m": float(end.rotation),
+                    "pathlength_m_per_m": float(length.translation),
+                    "pathlength_deg_per_m": float(length.rotation),
+                }
+            )
+    return table
+
+
+def calibration(belief: TensorDict) -> dict[str, float]:
+    """How far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
+    equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
+    members = belief["belief", "ensemble"].shape[1] if equal else None
+    mean, variance, truth = (value.double() for value in counted(belief, VELOCITIES, FLOOR))
+    covered = interval_coverage(mean, variance, truth, level=0.9)
+    covariance = torch.diag_embed(variance)
+    return {
+        "coverage90": float(covered.mean()),
+        "coverage90_v": float(covered[0]),
+        "coverage90_theta_dot": float(covered[1]),
+        "crps_v_m_per_s": float(crps_gaussian(mean, variance, truth)[:, 0].mean()),
+        "nll": float(gaussian_nll(mean, covariance, truth).mean()),
+        "nees": float(nees(mean, covariance, truth).mean),
+        "spread_skill": float(spread_skill_ratio(mean, variance, truth, members).mean()),
+    }

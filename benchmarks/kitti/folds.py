@@ -1,0 +1,190 @@
+"""Who trains, who tunes, who validates and who is tested; and batches of their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.kitti.streams import DISTURBANCES, Stream, mirror, rows
+
+VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
+# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
+UNITS = (0.1, 0.03)
+
+
+@dataclass
+class Statistics:
+    """Means and standard deviations of the training drives alone."""
+
+    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
+    scale: torch.Tensor
+    pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
+    pixel_scale: torch.Tensor
+    dt: float  # s
+
+    @property
+    def unit(self) -> torch.Tensor:
+        """What counts as an error of one, in (m/s, rad/s)."""
+        return self.scale * torch.tensor(UNITS)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a stream, with the share of the batches that it gets."""
+
+    stream: Stream
+    begin: float = 0.0  # shares of its rows
+    end: float = 1.0
+    weight: float = 1.0
+
+    def read(self, cache: Path) -> TensorDict:
+        """The stretch, ``[n]``."""
+        data = self.stream.read(cache)
+        return data[int(self.begin * len(data)) : int(self.end * len(data))]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One drive is left out for the test; it may not be in the other lists.
+
+    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones;
+    see ``SensorTraining.unseen_readings`` for drives that are in both lists.
+    """
+
+    name: str
+    train: list[Part]  # of the sensor
+    tune: list[Part]  # of the filter
+    validation: list[Part]
+    test: list[Stream] = field(default_factory=list)
+
+    def __post_init__(self):
+        tested = {stream.drive for stream in self.test}
+        leaked = {part.stream.drive for part in (*self.train, *self.tune, *self.validation)} & tested
+        if leaked:
+            raise ValueError(f"fold {self.name}: {sorted(leaked)} would be trained and tested on")
+
+    @property
+    def trained(self) -> set[str]:
+        """Drives that the sensor sees."""
+        return {part.stream.drive for part in self.train}
+
+    @property
+    def shared(self) -> set[str]:
+        """Drives for both sensor and filter."""
+        return self.trained & {part.stream.drive for part in self.tune}
+
+
+def with_disturbances(parts: Sequence[Part]) -> list[Part]:
+    """Each part clean, and with half as much weight again in all disturbances together."""
+    disturbed = []
+    for part in parts:
+        disturbed.append(part)
+        for condition in DISTURBANCES:
+            stream = replace(part.stream, condition=condition)
+            disturbed.append(replace(part, stream=stream, weight=0.5 * part.weight / len(DISTURBANCES)))
+    return disturbed
+
+
+def with_spans(parts: Sequence[Part]) -> list[Part]:
+    """Each clean part, and with less weight in pairs of two and of three steps."""
+    longer = [
+        replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
+        for part in parts
+        for steps, weight in ((2, 0.25), (3, 0.12))
+        if part.stream.condition == "clean"
+    ]
+    return [*parts, *longer]
+
+
+def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
+    """The fold that leaves ``test`` out.
+
+    All others train both sensor and filter, see ``SensorTraining.unseen_readings``; rendered drives validate, or,
+    without them, the drive that follows the test drive.
+    """
+    drives = list(dict.fromkeys(stream.drive for stream in streams))
+    of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
+    at = drives.index(test)
+    others = [*drives[at + 1 :], *drives[:at]]
+
+    def parts(names: Sequence[str]) -> list[Part]:
+        return [Part(s, weight=1 / len(names) / len(of[name])) for name in names for s in of[name]]
+
+    if len(others) < 2 + (not held_out):
+        raise ValueError(f"{len(drives)} drives are too few to leave {test} out; add drives, or --rendered ones")
+    own = parts(sorted(others if held_out else others[1:], key=lambda name: -_rows(of[name][0])))
+    if not held_out:
+        checked = parts(others[:1])
+        return Fold(test, with_spans(with_disturbances(own)), *map(with_disturbances, (own, checked)), test=of[test])
+    rendered = [replace(part, weight=1.5 / len(train)) for part in train]
+    checked = [replace(part, weight=1 / len(held_out)) for part in held_out]
+    sensor = with_spans([*with_disturbances(own), *with_disturbances(rendered)])
+    tune = [*own, *(replace(part, weight=0.3 * part.weight) for part in checked)]
+    return Fold(test, sensor, with_disturbances(tune), with_disturbances(checked), test=of[test])
+
+
+def _rows(stream: Stream) -> int:
+    return sum(1 for _ in (Path(stream.root) / "sequences" / stream.drive / stream.camera).glob("*.png"))
+
+
+def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
+    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
+    velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
+    loc, scale = velocity.mean(0), velocity.std(0)
+    loc[1], scale[1] = 0.0, velocity[:, 1].square().mean().sqrt()
+    frames = [rows(part, torch.arange(1, len(part), max(len(part) // 50, 1)), "image")["pixels"] for part in data]
+    frames = torch.cat(frames)
+    dt = torch.stack([part["dt"][0, 0] for part in data])
+    if (dt / dt[0] - 1).abs().max() > 0.01:
+        raise ValueError(f"the drives have frame times of {dt.unique().tolist()} s; a study needs the same")
+    return Statistics(loc, scale, frames.mean((0, 2, 3)), frames.std((0, 2, 3)), float(dt[0]))
+
+
+class FrameSampler:
+    """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
+
+    def __init__(self, parts: Sequence[Part], cache: Path, sensor: str, streams_per_batch: int = 8):
+        parts = [part for part in parts if part.stream.steps == 1 or sensor == "flow"]
+        self.data, self.sensor, self.count = [part.read(cache) for part in parts], sensor, streams_per_batch
+        self.steps = torch.tensor([part.stream.steps for part in parts])
+        self.weight = torch.tensor([part.weight for part in parts])
+
+    def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
+        """Observed frames ``[batch]``, every second one mirrored."""
+        count = batch // self.count
+        return torch.cat(
+            self._draw(generator, self.weight, lambda n: torch.randint(1, n, (count,), generator=generator))
+        )
+
+    def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
+        """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
+        steps = torch.arange(length)
+        chosen = self._draw(
+            generator,
+            self.weight * (self.steps == 1),
+            lambda n: torch.randint(1, n - length + 1, (), generator=generator) + steps,
+        )
+        return with_start(torch.stack(chosen), start_std, generator)
+
+    def _draw(self, generator: torch.Generator, weight: Tensor, index: Callable[[int], Tensor]) -> list[TensorDict]:
+        chosen: list[TensorDict] = []
+        for number in torch.multinomial(weight, self.count, replacement=True, generator=generator).tolist():
+            data = self.data[number]
+            frames = rows(data, index(len(data)), self.sensor)
+            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
+        return chosen
+
+
+def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
+    """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
+    noise = torch.randn(len(windows), 1, 5, generator=generator)
+    windows["start"] = windows["state"] + start_std * noise
+    is_init = torch.zeros(*windows.batch_size, 1, dtype=torch.bool)
+    is_init[:, 0] = True
+    return windows.set("is_init", is_init)

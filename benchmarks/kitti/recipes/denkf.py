@@ -1,0 +1,56 @@
+"""The differentiable ensemble Kalman filter."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from tensordict.nn import TensorDictSequential
+
+from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
+from benchmarks.kitti.sensors import SAMPLES
+from torch_denkf.modules import AroundState, EnsembleAnalysis, MemberGain, StochasticMLP, UnicycleMotion, WithHistory
+
+LAGS = 4  # past steps that an innovation may still correct
+
+
+@register
+class DEnKF(KITTIRecipe):
+    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
+
+    def modules(self):
+        # Errors of speed and of turn rate have nothing to do with each other; 32 members would see correlations.
+        own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + LAGS, 1)])
+        analysis = EnsembleAnalysis(
+            "sensor",
+            taper=(own, torch.eye(2)),
+            forecast_key=("forecast", "clone"),
+            observed_key=("forecast", "observed"),
+            belief_key="analysis",
+        )
+        return OrderedDict(
+            noise=self.noise(),
+            # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
+            transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
+            observation=self.observation(),
+            # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
+            gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, in_key=("forecast", "observation")),
+            analysis=TensorDictSequential(analysis, UnicycleMotion(self.facts.dt, history_key=HISTORY, smooth=True)),
+        )
+
+    def initial(self, std, state_key):
+        return WithHistory(AroundState(std, ensemble_size=SAMPLES, state_key=state_key), LAGS)
+
+    def loss(self, model):
+        return self.ensemble_loss(model)
+
+    def set_inflation(self, model, factor):
+        next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor
+
+
+@register
+class ADEnKF(DEnKF):
+    """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
+
+    def loss(self, model):
+        return self.likelihood_loss(model)

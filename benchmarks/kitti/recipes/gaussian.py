@@ -1,0 +1,74 @@
+"""The baselines that carry mean and covariance: dEKF, dUKF and Backprop-KF."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+
+from benchmarks.kitti.recipes._base import KITTIRecipe, register
+from benchmarks.kitti.streams import LONGEST
+from torch_denkf.modules import (
+    CholeskyNoise,
+    ClonedPrior,
+    ClonedTransition,
+    DiagonalNoise,
+    EKFAnalysis,
+    EKFTransition,
+    GaussianAround,
+    ScaledNoise,
+    SubModel,
+    UKFAnalysis,
+    UKFTransition,
+    UnicycleNoise,
+)
+
+
+class _Gaussian(KITTIRecipe):
+    """Known motion of the pose; its correlation with the velocities carries the corrections.
+
+    Inflation goes into Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply
+    the pose's variance in every step, too, which nothing observes: it would grow without bound.
+    """
+
+    Transition, Analysis = EKFTransition, EKFAnalysis
+
+    def modules(self):
+        motion = ClonedTransition(self.transition(torch.zeros_like))
+        process_noise = ScaledNoise(self.process_noise())
+        return OrderedDict(
+            noise=ScaledNoise(self.noise()),
+            transition=self.Transition(motion, UnicycleNoise(process_noise, self.facts.dt)),
+            analysis=self.Analysis(self.observation(history_key=None), observed_key=("forecast", "observed")),
+        )
+
+    def process_noise(self) -> SubModel:
+        """Q of (v, theta_dot), from their mean; the rest of the state must not count, so its scale is infinite."""
+        size = 5 + 2 * (LONGEST - 1)
+        loc, scale = torch.zeros(size), torch.full((size,), torch.inf)
+        loc[3:5], scale[3:5] = self.facts.loc, self.facts.scale
+        keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
+        return DiagonalNoise(2, r=self.unit, in_features=size, loc=loc, scale=scale, **keys)
+
+    def initial(self, std, state_key):
+        return ClonedPrior(GaussianAround(std, state_key=state_key), LONGEST - 1)
+
+
+@register
+class DEKF(_Gaussian):
+    """Differentiable extended Kalman filter (Kloss et al. 2021), Jacobians through the known motion."""
+
+
+@register
+class DUKF(_Gaussian):
+    """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
+
+    Transition, Analysis = UKFTransition, UKFAnalysis
+
+
+@register
+class BKF(_Gaussian):
+    """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant; the pose's motion is linearised."""
+
+    def process_noise(self):
+        return CholeskyNoise(2, r=self.unit, in_key=("belief", "mean"), out_key=("forecast", "noise"))

@@ -1,0 +1,56 @@
+"""The baselines that carry weighted particles: DPF, dPF-M and dPF-M-lrn."""
+
+from __future__ import annotations
+
+import torch
+
+from benchmarks.common.recipes import Particles
+from benchmarks.kitti.recipes._base import KITTIRecipe, register
+from benchmarks.kitti.streams import LONGEST
+from torch_denkf.modules import AroundState, ClonedPrior, ClonedTransition, DiagonalNoise, NoisyTransition, WithWeights
+
+
+class _Particles(Particles, KITTIRecipe):
+    """Particles move by the known motion with learned noise of their velocities."""
+
+    likelihood_keys = {"observed_key": ("forecast", "observed")}  # noqa: RUF012
+
+    def noisy_motion(self):
+        facts = self.facts
+        noise = DiagonalNoise(
+            2,
+            r=self.unit,
+            in_features=5,
+            # Of the mean velocities alone: an infinite scale hides the pose.
+            loc=torch.cat([torch.zeros(3), facts.loc]),
+            scale=torch.cat([torch.full((3,), torch.inf), facts.scale]),
+            in_key=("belief", "mean"),
+            out_key=("forecast", "noise"),
+        )
+        return ClonedTransition(NoisyTransition(self.transition(torch.zeros_like), noise, [3, 4], before=True))
+
+    def observation(self):
+        return super().observation(history_key=None)
+
+    def initial(self, std, state_key):
+        around = AroundState(std, ensemble_size=self.particles, state_key=state_key)
+        return WithWeights(ClonedPrior(around, LONGEST - 1))
+
+
+@register
+class DPF(_Particles):
+    """Jonschkowski et al. 2018: learned likelihood, hard resampling in every step."""
+
+    resampling, learned, needs_training = "systematic", "scaled", True
+
+
+@register
+class DPF_M(_Particles):
+    """Kloss et al. 2021: Gaussian likelihood, soft resampling."""
+
+
+@register
+class DPF_M_LRN(_Particles):
+    """Kloss et al. 2021 with a learned likelihood."""
+
+    learned, needs_training = "clipped", True

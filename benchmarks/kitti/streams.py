@@ -1,0 +1,128 @@
+"""Drives as the study reads them: one stream for each drive, camera and condition, computed once and kept on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import torch
+from tensordict import TensorDict
+from torchrl.envs.transforms import Transform
+
+from benchmarks.common.jobs import side_by_side
+from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_kitti_drive, with_motion
+from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+
+SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
+LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing
+MISSING = 0.3  # share of frames that do not arrive, and of black ones, as in the paper
+
+#: What happens to every image of a drive. "missing" needs no images of its own: it is a mask.
+DISTURBANCES = {
+    "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=["image"], generator=generator),
+    "blur": lambda generator: Blur(in_keys=["image"], generator=generator),
+    "brightness": lambda generator: Brightness(in_keys=["image"], generator=generator),
+    "black": lambda generator: BlackFrames(MISSING, in_keys=["image"], generator=generator),
+    "box": lambda generator: OccludingBox(in_keys=["image"], generator=generator),
+}
+CONDITIONS = ("clean", *DISTURBANCES, "missing")
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One camera's images of one drive under one condition."""
+
+    root: str
+    drive: str
+    camera: str
+    condition: str = "clean"
+    size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
+    pitch: float = 0.0  # rad: the camera is taken to be turned so far up, which makes the sensor find out
+    steps: int = 1  # between the two frames of a pair
+
+    @property
+    def name(self) -> str:
+        """Drive and camera."""
+        return f"{self.drive}/{self.camera}"
+
+    def seed(self) -> int:
+        """Random numbers of the condition: its own, the same each time."""
+        what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.steps)
+        return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
+
+    def read(self, cache: Path) -> TensorDict:
+        """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
+        folder = cache / f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
+        if not folder.exists():
+            beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
+            self._compute().memmap(beside / "stream")
+            # Renamed when whole: a kill leaves no half stream, and of two processes the first one wins.
+            with contextlib.suppress(OSError):
+                (beside / "stream").rename(folder)
+            shutil.rmtree(beside, ignore_errors=True)
+        return TensorDict.load_memmap(folder)
+
+    def _compute(self) -> TensorDict:
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        drive = read_kitti_drive(self.root, self.drive, camera=self.camera, size=self.size, colour=False, cache=None)
+        if self.pitch:
+            drive["calibration"][:, 3] += self.pitch * drive["calibration"][:, 1]
+        if self.condition != "clean":
+            disturb: Transform = DISTURBANCES[self.condition](torch.Generator().manual_seed(self.seed()))
+            drive = disturb(drive)
+        valid = drive["frame_valid"]
+        paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
+        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None)
+        small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
+        return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
+
+
+def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:
+    """Every camera of every drive below ``root`` that has images and poses."""
+    found = drives or list_kitti_drives(root)
+    if not found:
+        raise FileNotFoundError(f"no drive below {root} has both images and poses")
+    streams = []
+    for drive in found:
+        folder = Path(root) / "sequences" / drive
+        cameras = [camera for camera in ("image_2", "image_3") if any((folder / camera).glob("*.png"))]
+        cameras = cameras or [camera for camera in ("image_0", "image_1") if any((folder / camera).glob("*.png"))]
+        streams += [Stream(str(root), drive, camera, size=tuple(size)) for camera in cameras]
+    return streams
+
+
+def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
+    """Computes what is not on disk yet, drives side by side."""
+    cache.mkdir(parents=True, exist_ok=True)
+    side_by_side([partial(_prepare, stream, cache) for stream in streams], processes, "flow of all drives")
+
+
+def _prepare(stream: Stream, cache: Path) -> None:
+    stream.read(cache)
+
+
+def spans(stream: Stream, sensor: str) -> list[Stream]:
+    """The same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
+    longest = LONGEST if sensor == "flow" and stream.condition == "clean" else 1
+    return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
+
+
+def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
+    """Rows of a stream as the sensor reads them, and what it should read: the velocities of all steps of the pair."""
+    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road"), index)
+    lags = torch.arange(LONGEST)
+    velocity = stream["state"][(index.unsqueeze(-1) - lags).clamp_min(0)][..., 3:]
+    return frames.set("target_observation", (velocity * (lags < frames["steps"]).unsqueeze(-1)).sum(-2))
+
+
+def mirror(frames: TensorDict) -> TensorDict:
+    """What a mirrored world would have shown: sideways motion and turns change sign."""
+    mirrored = mirror_drive(frames)
+    return mirrored.set("target_observation", frames["target_observation"] * torch.tensor([1.0, -1.0]))

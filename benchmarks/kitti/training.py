@@ -1,0 +1,159 @@
+"""The stages of a filter: on the frozen sensor's readings, then end to end; then its one number is chosen."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from benchmarks.common.scores import SensorLoss, belief_crps, coverage
+from benchmarks.common.training import fit_filter, read_filter
+from benchmarks.kitti.folds import VELOCITIES, Fold, FrameSampler, Statistics
+from benchmarks.kitti.readings import ReadingSampler, all_frames, lose_frames, read_spans
+from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
+from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
+from torch_denkf.filters import Filter
+from torch_denkf.training import Stage, parameters_without, read_checkpoint
+
+INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4)
+FLOOR = 1e-8  # of the variances of v and theta_dot
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Updates of each stage; steps of the filter's windows."""
+
+    sensor: int = 3000  # updates of the sensor
+    fine_tuning: int = 300  # updates of a sensor that comes trained on rendered drives
+    filter: int = 300  # updates of a filter on readings
+    end_to_end: int = 40  # updates of sensor and filter together
+    length: int = 24  # steps of the filter's windows
+
+
+@torch.no_grad()
+def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
+    """Filters readings of one length side by side, ``[K, N]``, each from its true first state."""
+    batch = torch.stack([reading.copy() for reading in readings])
+    batch["is_init"] = torch.zeros(*batch.batch_size, 1, dtype=torch.bool)
+    batch["is_init"][:, 0] = True
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return recipe.part(model, sensor=False).sequence(batch)
+
+
+def run_all(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
+    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    groups = defaultdict(list)
+    for seed, reading in enumerate(readings):
+        groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
+    return [run_filter(recipe, model, group) for group in groups.values()]
+
+
+def filter_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
+    """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
+    scores = [belief_crps(out, VELOCITIES, recipe.unit, FLOOR).mean((1, 2)) for out in run_all(recipe, model, readings)]
+    return {"crps": float(torch.cat(scores).mean())}
+
+
+def gain_error(fold: Fold, base: SensorOfFold) -> float:
+    """How far off a sensor's speed is over a whole drive that it has not seen: root mean square of the logarithm."""
+    logarithms = []
+    for part, (first, last, _) in zip(fold.tune, base.readings[::2], strict=True):
+        if part.stream.condition == "clean":
+            drive = all_frames(torch.cat([first, last]))[1:]
+            read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
+            logarithms.append((read.sum() / driven.sum()).clamp(0.5, 2.0).log())
+    return float(torch.stack(logarithms).square().mean().sqrt())
+
+
+class EndToEndLoss(nn.Module):
+    """The filter's objective, and the sensor's own beside it."""
+
+    def __init__(self, objective: nn.Module, sensor: SensorLoss):
+        super().__init__()
+        self.objective, self.sensor = objective, sensor
+
+    def forward(self, frames: TensorDict) -> dict[str, Tensor]:
+        """All terms."""
+        own = {f"loss_sensor_{name[5:]}": 0.5 * value for name, value in self.sensor(frames.copy()).items()}
+        return {**self.objective(frames), **own}
+
+
+def train_filter(
+    fold: Fold,
+    filter_name: str,
+    base: SensorOfFold,
+    *,
+    out: Path,
+    cache: Path,
+    seed: int,
+    budget: Budget,
+    loggers: Sequence[str] = ("csv",),
+) -> tuple[KITTIRecipe, Filter]:
+    """Trains one filter on a fold, or goes on where it was broken off; the model at the end is the best one."""
+    torch.manual_seed(seed)
+    facts, kind = base.facts, base.kind
+    sensor = SENSORS[kind](facts)
+    sensor.load_state_dict(base.sensor.state_dict())  # a copy of the fold's, because the last stage trains it
+    recipe = FILTERS[filter_name](sensor, facts)
+    model = recipe.build()
+    # How wrong the first velocity of a training window is; its pose is right.
+    start_std = torch.cat([torch.zeros(3), 0.2 * facts.scale])
+
+    def objective(with_sensor: bool) -> nn.Module:
+        return recipe.loss(recipe.part(model, sensor=with_sensor, start_std=start_std))
+
+    def stages() -> list[Stage]:
+        readings, weights = [tune for tune, _, _ in base.readings], [share for *_, share in base.readings]
+        windows = ReadingSampler(readings, weights, budget.length, gain_error(fold, base))
+        frames = FrameSampler(fold.train, cache, kind)
+        third = max(budget.end_to_end // 3, 1)
+        return [
+            Stage(
+                "filter",
+                objective(with_sensor=False),
+                lambda generator, _: windows.windows(generator, start_std),
+                budget.filter,
+                lr=5e-3,
+                validate=lambda: filter_error(recipe, model, base.validation),
+            ),
+            Stage(
+                "end_to_end",
+                EndToEndLoss(objective(with_sensor=True), sensor_loss(sensor, facts.unit)),
+                lambda generator, length: frames.windows(generator, length, start_std),
+                budget.end_to_end,
+                # The noise model knows how wrong the sensor is on new drives; on those it has seen it would forget.
+                parameters=parameters_without(model, {"noise"} & set(model.module.keys())),
+                lr=1e-4,
+                lengths={0: 4, third: 8, 2 * third: 16},
+                validate=lambda: filter_error(
+                    recipe, model, [read_spans(sensor, part, cache, kind) for part in fold.validation]
+                ),
+            ),
+        ]
+
+    def covered() -> Tensor:
+        runs = run_all(recipe, model, base.validation)
+        return torch.stack([coverage(out, VELOCITIES, FLOOR) for out in runs]).mean(0)
+
+    settings = {"validate_every": max(budget.filter // 3, 1), "save_every": 200, "loggers": loggers, "seed": seed}
+    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts)}
+    fit_filter(recipe, model, stages, covered, out=out, inflations=INFLATIONS, notes=notes, **settings)
+    return recipe, model
+
+
+def load_filter(folder: Path) -> tuple[KITTIRecipe, Filter, str, str]:
+    """A recipe, its trained filter, and the names of filter and sensor.
+
+    Raises:
+        FileNotFoundError: if no training was finished in the folder.
+    """
+    saved = read_checkpoint(folder / "filter.pt")
+    facts = Statistics(**saved["facts"])
+    recipe = FILTERS[saved["filter"]](SENSORS[saved["sensor"]](facts), facts)
+    return recipe, read_filter(recipe, recipe.build(), saved), saved["filter"], saved["sensor"]

@@ -1,0 +1,173 @@
+"""Lorenz-96 with unknown forcing and model noise: records of it, the filter that learns them, and the learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.filters import DEnKF
+from torch_denkf.functional import gaspari_cohn
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select
+from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.simulation.lorenz96 import lorenz96_step
+
+FORCING, NOISE, R = 8.0, 0.2, 1.0  # of the true system: F; model noise and observation noise, standard deviations
+START, NOISE_START = 5.0, 1.0  # where learning begins
+SPIN_UP = 500  # steps from a random state to the attractor
+
+
+class Lorenz96(nn.Module):
+    """One step of the system for states ``[*, N]``; its only parameter is the forcing F."""
+
+    def __init__(self, forcing: float) -> None:
+        super().__init__()
+        self.forcing = nn.Parameter(torch.tensor(forcing))
+
+    def forward(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the states 0.05 time units later."""
+        return lorenz96_step(state, forcing=self.forcing)
+
+
+def tapers(dims: Sequence[int], variables: int, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Factors on the covariances of the variables and the observed ones ``[N, O]``, and of the observed ``[O, O]``.
+
+    With few members correlations of variables far apart are noise; AD-EnKF tapers them in gain and likelihood alike.
+
+    Args:
+        dims: the observed variables, of those on the circle.
+        variables: N, on the circle.
+        radius: distance at which correlations have fallen to 5/24; they are zero from twice that on.
+    """
+    observed, places = torch.as_tensor(dims), torch.arange(variables)
+    return tuple(gaspari_cohn(on_circle(first, observed, variables), radius * 0.3**0.5) for first in (places, observed))
+
+
+def on_circle(first: torch.Tensor, second: torch.Tensor, variables: int) -> torch.Tensor:
+    """Distances ``[len(first), len(second)]`` between places on a circle."""
+    distance = (first.unsqueeze(-1) - second).abs()
+    return torch.minimum(distance, variables - distance)
+
+
+def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> torch.Tensor:
+    """True states ``[records, steps, variables]`` on the attractor."""
+    state = FORCING + torch.randn(records, variables, generator=rng)
+    states = []
+    for _ in range(SPIN_UP + steps):
+        state = lorenz96_step(state, forcing=FORCING) + NOISE * torch.randn(state.shape, generator=rng)
+        states.append(state)
+    return torch.stack(states[SPIN_UP:], 1)
+
+
+def observe(states: torch.Tensor, every: int, rng: torch.Generator) -> TensorDict:
+    """What the filter gets: ``observation`` ``[*B, T, variables / every]``, and nothing else."""
+    seen = states[..., ::every]
+    return TensorDict({"observation": seen + R * torch.randn(seen.shape, generator=rng)}, states.shape[:-1])
+
+
+def make_filter(
+    variables: int,
+    every: int,
+    ensemble_size: int,
+    *,
+    climate: tuple[float, float],
+    radius: float | None,
+    learn_noise: bool = False,
+) -> DEnKF:
+    """An ensemble Kalman filter of the system with a wrong forcing.
+
+    Args:
+        variables: N.
+        every: one variable in so many is observed.
+        ensemble_size: E.
+        climate: mean and standard deviation of one variable, for those that are not observed at the start.
+        radius: of the taper, see :func:`tapers`; ``None`` for none.
+        learn_noise: whether the model noise is a parameter, one variance a variable, and wrong at first.
+    """
+    dims = list(range(0, variables, every))
+    noise = ConstantNoise(
+        [NOISE_START if learn_noise else NOISE] * variables,
+        trainable=learn_noise,
+        in_key=("belief", "ensemble"),
+        out_key=("forecast", "noise"),
+    )
+    mean, std = climate
+    taper = None if radius is None else tapers(dims, variables, radius)
+    return DEnKF(
+        transition=LearnedTransition(Lorenz96(START), residual=False),
+        sensor=None,
+        observation=Select(dims),
+        noise=ConstantNoise([R] * len(dims), in_key="observation"),
+        process_noise=noise,
+        analysis=EnsembleAnalysis("perturbed", taper=taper, sensor_key="observation"),
+        initial=FromSensor(
+            dims, [mean] * variables, [std] * variables, ensemble_size=ensemble_size, sensor_key="observation"
+        ),
+    )
+
+
+def climate_of(record: TensorDict) -> tuple[float, float]:
+    """Mean and standard deviation of a variable, from observations: their variance is the system's plus R."""
+    observation = record["observation"]
+    return observation.mean().item(), (observation.var().item() - R**2) ** 0.5
+
+
+def forcing_of(denkf: DEnKF) -> torch.Tensor:
+    """The parameter F."""
+    return denkf["transition"].module["transition"].module.forcing
+
+
+def noise_of(denkf: DEnKF) -> torch.Tensor:
+    """Standard deviation of the model noise of each variable."""
+    return (0.5 * denkf["transition"].module["noise"].log_variance).exp().detach()
+
+
+def learn(
+    denkf: DEnKF,
+    record: TensorDict,
+    *,
+    updates: int,
+    rng: torch.Generator,
+    batch: int = 8,
+    warm_up: int = 20,
+    window: int = 40,
+    detach_every: int = 10,
+    rate: float = 0.1,
+) -> list[float]:
+    """Maximises the likelihood on windows of the ``record`` ``[records, steps]``; returns F before and after updates.
+
+    A window begins with the belief that the present filter has after ``warm_up`` steps from the window's first
+    observation: the start knows less than the filter does later, and its likelihood says little about F. The choice
+    of the windows is ``rng``'s, the noise of the filter torch's own.
+    """
+    loss = DEnKFLoss.ad_enkf(denkf, detach_every=detach_every)
+    optimiser = torch.optim.Adam(denkf.parameters(), lr=rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates, 0.01 * rate)
+    path = [forcing_of(denkf).item()]
+    for _ in range(updates):
+        rows = torch.randint(record.shape[0], (batch,), generator=rng).tolist()
+        starts = torch.randint(record.shape[1] - warm_up - window, (batch,), generator=rng).tolist()
+        places = zip(rows, starts, strict=True)
+        frames = torch.stack([record[row, start : start + warm_up + window + 1] for row, start in places])
+        with torch.no_grad():
+            warm = denkf.sequence(frames[:, : warm_up + 1].copy()).select(*denkf.belief_keys)
+        frames = frames[:, warm_up:].copy()
+        # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
+        frames.update(warm[:, -1:].expand(batch, window + 1))
+        total = loss(frames)["loss_nll"]
+        optimiser.zero_grad()
+        total.backward()
+        nn.utils.clip_grad_norm_(denkf.parameters(), 10.0)
+        optimiser.step()
+        schedule.step()
+        path.append(forcing_of(denkf).item())
+    return path
+
+
+@torch.no_grad()
+def evaluate(denkf: DEnKF, states: torch.Tensor, record: TensorDict, skip: int) -> float:
+    """Root mean square error of the belief's mean on an unseen record; here alone the true states are used."""
+    mean = denkf.sequence(record.copy())["belief", "mean"]
+    return (mean - states)[:, skip:].square().mean().sqrt().item()

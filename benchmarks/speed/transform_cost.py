@@ -1,0 +1,230 @@
+"""What DEnKFTransform adds to an environment's step at B = 1: a replay of KITTI's layout, and dm_control's reacher.
+
+    python -m benchmarks.speed.transform_cost --out benchmarks/speed/results/transform_cost.md
+
+Steps are taken as a collector takes them, with random actions, ``env.step_and_maybe_reset``. Without the transform,
+with it, and with it and a packaged step (``DEnKFTransform(filter, packaged=load_step(path))``) in turn, processor time
+of one thread; the cost is the difference of neighbouring rounds, its median is reported. No filter here reads images:
+the KITTI filter is Table I's on noisy velocities (the convolutions are in training_step.py), the reacher's
+that of examples/append_to_env.py.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control is imported: nothing is rendered here
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, EnvBase, TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import write_page
+from examples.append_to_env import NOISE, NoisyEncoders, make_filter
+from torch_denkf.data import render_drives
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.envs import KITTIReplayEnv
+from torch_denkf.filters import DEnKF
+from torch_denkf.modules import (
+    AroundState,
+    DiagonalNoise,
+    EnsembleAnalysis,
+    Select,
+    StochasticMLP,
+    UnicycleTransition,
+    VectorSensor,
+)
+from torch_denkf.transforms import DEnKFTransform
+
+TARGET_MS = 0.4
+
+
+class Reading(Transform):
+    """Writes velocities with noise, what a sensor would read, as ``"reading"`` [*B, 2]."""
+
+    def __init__(self):
+        super().__init__(in_keys=["state"], out_keys=["reading"])
+
+    def _apply_transform(self, state: torch.Tensor) -> torch.Tensor:
+        return state[..., 3:] + 0.1 * torch.randn_like(state[..., 3:])
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        """Adds the reading."""
+        observation_spec["reading"] = observation_spec["state"].clone()[..., 3:]
+        return observation_spec
+
+
+def kitti_filter() -> DEnKF:
+    """The README's, with Table I's stochastic head on a reading in the place of the image sensor."""
+    return DEnKF(
+        transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
+        sensor=VectorSensor(2, 2, in_key="reading"),
+        observation=Select([3, 4]),
+        noise=DiagonalNoise(observation_dim=2),
+        analysis=EnsembleAnalysis("sensor"),
+        initial=AroundState([0.0, 0.0, 0.0, 0.3, 0.02]),
+    )
+
+
+def kitti_env(folder: str) -> EnvBase:
+    """A rendered drive of 200 frames, 150x50, held in memory; its frames are emitted, and nothing reads them."""
+    render_drives(folder, names=["00"], frames=200, processes=1, progress=None)
+    return TransformedEnv(KITTIReplayEnv(folder, sequence="00", cache=None), Reading())
+
+
+def reacher_env() -> EnvBase:
+    """The arm with noisy encoders of examples/append_to_env.py."""
+    return TransformedEnv(
+        DMControlEnv("reacher", "easy"),
+        Compose(
+            DoubleToFloat(),
+            NoisyEncoders(NOISE),
+            CatTensors(in_keys=["position", "velocity"], out_key="state", del_keys=False),
+        ),
+    )
+
+
+def cases(folder: str) -> dict[str, tuple]:
+    """Makers of the environment and of its filter."""
+    states = torch.tensor([[0.0, 0.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])  # scales of the transition, rad and rad/s
+    return {
+        "KITTIReplayEnv, Table I's head": (lambda: kitti_env(folder), kitti_filter),
+        "dm_control reacher, learned dynamics": (reacher_env, lambda: make_filter(states)),
+    }
+
+
+class Stepper:
+    """Goes on with an environment, some steps at a time."""
+
+    def __init__(self, env: EnvBase):
+        self.env, self.row = env, env.reset()
+
+    def seconds(self, steps: int) -> float:
+        """Processor time of a step."""
+        env, row = self.env, self.row
+        began = time.process_time()
+        for _ in range(steps):
+            _, row = env.step_and_maybe_reset(env.rand_action(row))
+        self.row = row
+        return (time.process_time() - began) / steps
+
+
+def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
+    """What a step of the environment gives the filter, to export from."""
+    start = env.rand_action(env.reset())
+    frame = env.step(start.copy())["next"].select("reading", "encoder", "observed", strict=False)
+    return filter.initialise(frame.update(start.select("action", "state", strict=False)))
+
+
+def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
+    """The environment in its three ways."""
+    filter = make_filter()
+    example = example_step(make_env(), filter)
+    path = export_step(filter, example, Path(folder) / f"{id(filter)}.pt2")
+    envs = {"without": make_env(), "filter": make_env(), "packaged": make_env()}
+    envs["filter"].append_transform(DEnKFTransform(filter))
+    envs["packaged"].append_transform(DEnKFTransform(filter, packaged=load_step(path)))
+    return {kind: Stepper(env) for kind, env in envs.items()}
+
+
+def measure(rounds: int = 41, steps: int = 50) -> dict[str, dict[str, list[float]]]:
+    """Seconds a step of every round, by case and by kind."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    out = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, makers in cases(folder).items():
+            candidates = steppers(*makers, folder)
+            seconds: dict[str, list[float]] = {kind: [] for kind in candidates}
+            for turn in range(rounds + 1):  # the first round warms up
+                for kind, stepper in candidates.items():
+                    value = stepper.seconds(steps)
+                    if turn:
+                        seconds[kind].append(value)
+            out[name] = seconds
+    return out
+
+
+def cost_ms(seconds: dict[str, list[float]], kind: str) -> float:
+    """Median over the rounds of what the transform adds to a step."""
+    return 1e3 * median(b - a for a, b in zip(seconds["without"], seconds[kind], strict=True))
+
+
+def ratios(found: dict[str, dict[str, list[float]]] | None = None) -> list[dict]:
+    """Rows for ``make bench``: milliseconds that the transform adds to a step (no ratio but a time)."""
+    rows = []
+    for name, seconds in (measure() if found is None else found).items():
+        rates = {kind: 1 / median(values) for kind, values in seconds.items()}
+        for kind in ("filter", "packaged"):
+            value = cost_ms(seconds, kind)
+            rows.append(
+                {
+                    "name": f"DEnKFTransform ({kind}) on {name}, B=1: ms it adds to a step",
+                    "ratio": value,
+                    "target": TARGET_MS,
+                    "met": value <= TARGET_MS,
+                    "ours_us": 1e6 * median(seconds[kind]),
+                    "theirs_us": 1e6 * median(seconds["without"]),
+                    "note": f"not a ratio; {rates['without']:,.0f} steps a second without, {rates[kind]:,.0f} with",
+                }
+            )
+    return rows
+
+
+def table(found: dict[str, dict[str, list[float]]], command: str, elapsed: float) -> str:
+    """The Markdown page."""
+    lines = [
+        "# What DEnKFTransform costs",
+        "",
+        "One environment, E = 32, one thread, processor time, no image read; medians over rounds of all three kinds in",
+        "turn. A step is `env.step_and_maybe_reset(env.rand_action(...))`. Filter: `DEnKFTransform(filter)`; packaged:",
+        "`DEnKFTransform(filter, packaged=load_step(export_step(filter, example, path)))`.",
+        "Quietest: between the fastest rounds of either kind, which other work disturbed least.",
+        "",
+        "| environment and filter | step | steps/s without | with | added, ms a step | quietest | target | met |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    rows = iter(ratios(found))
+    for name, seconds in found.items():
+        for kind in ("filter", "packaged"):
+            row = next(rows)
+            rates = " | ".join(f"{1 / median(seconds[key]):,.0f}" for key in ("without", kind))
+            met = "yes" if row["met"] else "**no**"
+            least = 1e3 * (min(seconds[kind]) - min(seconds["without"]))
+            lines.append(f"| {name} | {kind} | {rates} | {row['ratio']:.2f} | {least:.2f} | {TARGET_MS} | {met} |")
+    load = f"{os.cpu_count()} cores, load {os.getloadavg()[2]:.1f}"
+    lines += [
+        "",
+        "Where other work shares the cores, caches are cold at every turn, and all of these times grow, also as",
+        f"processor time: {load}. `{command}`: {elapsed:.0f} s; torch {torch.__version__}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+@dataclass
+class TransformCost:
+    """What DEnKFTransform adds to an environment's step at B = 1."""
+
+    rounds: int = 41  # measurements of each
+    out: Path | None = None  # write the table to this Markdown file
+    smoke: bool = False  # one round of few steps: does it run?
+
+    def __call__(self) -> None:
+        """Measures and prints."""
+        began = time.perf_counter()
+        found = measure(1, 5) if self.smoke else measure(self.rounds)
+        write_page(table(found, command("speed.transform_cost"), time.perf_counter() - began), self.out)
+
+
+if __name__ == "__main__":
+    parse(TransformCost)()

@@ -1,0 +1,130 @@
+"""The collections of the study, and who trains, tunes, validates and is tested; by demo, never within one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.envs import collect_ur5_demos
+
+STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
+JOINTS = 7
+
+
+@dataclass(frozen=True)
+class Collections:
+    """Demos of the study: few frames of many in the simulator, whole sequences of some in both domains.
+
+    Demo i of the first two collections is the same episode. Those that the replay's hash puts on the test side are
+    tested on; of the others, the first numbers are sequences for the filter, which the sensor never sees, so that the
+    filter learns how wrong its sensor is on new demos; all the rest are the sensor's.
+    """
+
+    root: Path = Path("runs/ur5-demos")  # folder of the demos
+    out: Path = Path("runs/ur5")  # checkpoints, logs, table, beliefs, decoded pictures
+    size: int = 224  # side of the pictures in pixels
+    demos: int = 2000  # in the simulator, few frames each
+    frames: int = 16  # drawn at random steps of each
+    sequences: int = 220  # of these demos, whole
+    tune: int = 80  # of these, at most so many train the filters
+    validation: int = 16  # and at most so many decide
+    real: int = 130  # demos of real_like, whole
+    real_train: int = 20  # of these, on the train side
+    steps: int = 350  # of a sequence
+
+    def collect(self, processes: int = 1, *, real: bool = True) -> None:
+        """Collects what is missing, of ``real_like`` only if asked to."""
+        common = {"size": (self.size, self.size), "processes": processes, "max_steps": self.steps}
+        collect_ur5_demos(self.root / "sim-frames", self.demos, frames=self.frames, **common)
+        collect_ur5_demos(self.root / "sim-sequences", self.sequences, **common)
+        if real:
+            collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
+
+    def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
+        """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
+        return UR5ExperienceReplay(self.root / name, split=split, cache=self.out / "cache", **kwargs)
+
+
+def sequences_of(data: UR5ExperienceReplay, chosen: Callable[[int], bool]) -> tuple[Tensor, Tensor]:
+    """States ``[N, T, 10]`` and actions ``[N, T, 7]`` of some demos: they need no pictures."""
+    rows = [data.storage[e.start : e.start + e.length] for e in data.episodes if chosen(e.demo)]
+    return tuple(torch.stack([row[key] for row in rows]) for key in ("state", "action"))
+
+
+class FramePool:
+    """Single frames with a picture, of chosen demos, in memory.
+
+    Args:
+        data: a replay with ``frames_only``.
+        chosen: numbers of the demos.
+    """
+
+    def __init__(self, data: UR5ExperienceReplay, chosen: set[int]):
+        wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
+        rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
+        if not len(rows):
+            raise ValueError(f"none of the {len(data.episodes)} demos in {data.root} is chosen; collect more")
+        parts = [data[index] for index in rows.split(512)]
+        self.pixels = torch.cat([(part["pixels"] * 255).round().to(torch.uint8) for part in parts])
+        self.state = torch.cat([part["state"] for part in parts])
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def rows(self, index: Tensor) -> TensorDict:
+        """Frames with float pixels, ``[n]``."""
+        pixels = self.pixels[index].float() / 255
+        return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
+
+    def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
+        """Random frames ``[batch]``."""
+        return self.rows(torch.randint(len(self), (batch,), generator=generator))
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Numbers of demos by what they are for."""
+
+    sensor: set[int]  # trains the sensor
+    tune: list[int]  # sequences that train the filter, unseen by the sensor
+    validation: list[int]  # sequences to choose by, unseen by both
+    test: list[int]
+
+    def __post_init__(self):
+        tested = set(self.test)
+        for name in ("sensor", "tune", "validation"):
+            leaked = tested & set(getattr(self, name))
+            if leaked:
+                raise ValueError(f"demos {sorted(leaked)} would be tested on and used as {name}")
+        if self.sensor & {*self.tune, *self.validation}:
+            raise ValueError("the filter must learn from demos that its sensor has not seen")
+
+
+def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
+    """Of a collection's demos those of one side, below ``end``: the folder may hold more than the study asks for."""
+    return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
+
+
+def sim_roles(collections: Collections) -> Roles:
+    """Roles in the simulator."""
+    frames = collections.replay("sim-frames", "train", frames_only=True)
+    sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
+    test = _numbers(collections, "sim-sequences", "test", collections.sequences)
+    held = min(max(len(sequences) // 7, 1), collections.validation)
+    sensor = {e.demo for e in frames.episodes if e.demo >= collections.sequences}
+    return Roles(sensor, sequences[:-held][: collections.tune], sequences[-held:], test)
+
+
+def real_roles(collections: Collections) -> Roles:
+    """Roles in ``real_like``: of the few demos on the train side, two thirds train the sensor."""
+    train = _numbers(collections, "real_like-sequences", "train", collections.real)[: collections.real_train]
+    test = _numbers(collections, "real_like-sequences", "test", collections.real)
+    own = max(len(train) * 7 // 10, 1)
+    held = max((len(train) - own) // 3, 1)
+    return Roles(set(train[:own]), train[own:-held], train[-held:], test)

@@ -1,0 +1,266 @@
+"""Sensors by name, and their training on single frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import NestedKey, TensorDict
+from torch import Tensor, nn
+
+from benchmarks.common.scores import SensorLoss
+from benchmarks.ur5.demos import STATE, FramePool
+from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk
+from torch_denkf.functional import crps_ensemble
+from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.training import Stage, train_part
+from torch_denkf.transforms import Brightness, SaltAndPepper
+
+SAMPLES = 32  # of a sensor while it is trained
+MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
+WRIST = 5  # J6, which turns the gripper
+NEAR = ("sensor", "near")  # readings as states, see NearForecast
+# What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.
+JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
+
+
+class TurnedWrist(nn.Module):
+    """What the better sensor reads: J6 by twice its angle, for a gripper looks the same after half a turn.
+
+    A network that must name J6 itself hedges between two answers. Half of (cos, sin) of 2 J6 has one answer, and turns
+    by one radian a radian. Which of the two it is the belief knows from where the arm was.
+    """
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Readings ``[*, 11]`` of states ``[*, 10 or more]``: J1..J5, cos and sin, the opening, x, y, z."""
+        twice = 2 * state[..., WRIST : WRIST + 1]
+        parts = [state[..., :WRIST], 0.5 * twice.cos(), 0.5 * twice.sin(), state[..., WRIST + 1 : STATE]]
+        return torch.cat(parts, -1)
+
+
+def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
+    """States ``[*, 10]`` of readings ``[*, 11]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
+    angle = torch.atan2(reading[..., WRIST + 1], reading[..., WRIST]) / 2
+    angle = angle + torch.pi * ((near - angle) / torch.pi).round()
+    return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 2 :]], -1)
+
+
+@dataclass
+class Statistics:
+    """Means and standard deviations of the training demos alone."""
+
+    loc: Tensor  # of the state, [10]
+    scale: Tensor
+    rate: Tensor  # root mean square of a joint's change in a step, [7] rad
+    acceleration: Tensor  # of the change's change
+    pixel_loc: Tensor
+    pixel_scale: Tensor
+    size: int
+
+    @classmethod
+    def of(cls, states: Tensor, pool: FramePool) -> Statistics:
+        """Of sequences ``[N, T, 10]`` and of pictures."""
+        flat, rate = states.flatten(0, -2), states[..., :7].diff(dim=-2)
+        pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
+        return cls(
+            flat.mean(0),
+            flat.std(0),
+            rate.square().mean((0, 1)).sqrt(),
+            rate.diff(dim=-2).square().mean((0, 1)).sqrt(),
+            pixels.mean((0, 2, 3)),
+            pixels.std((0, 2, 3)),
+            pixels.shape[-1],
+        )
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A sensor, what it should read of a true state, and what state a reading says."""
+
+    name: str
+    build: Callable[[Statistics, int], ImageSensor]
+    observe: Callable[[Tensor], Tensor]
+    dim: int
+    state_of: Callable[[Tensor, Tensor], Tensor]  # of a reading, and of a J6 that is near
+    coarse: str | None = None  # a preset that is trained first, and whose trunk becomes this one's coarse part
+
+
+def unit_of(dim: int) -> Tensor:
+    """Units of a reading's components: the last three are a place."""
+    return torch.cat([torch.full((dim - 3,), JOINT_UNIT), torch.full((3,), PLACE_UNIT)])
+
+
+def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of what :class:`TurnedWrist` reads."""
+    loc, scale = facts.loc, facts.scale
+    middle = torch.tensor([0.0, 0.0]), torch.tensor([0.35, 0.35])
+    return tuple(
+        torch.cat([part[:WRIST], two, part[WRIST + 1 :]]) for part, two in zip((loc, scale), middle, strict=True)
+    )
+
+
+def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
+    """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
+    head = {"num_cells": (128, 64), "layer": "dropout", "rate": 0.05}
+    return _sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
+
+
+def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
+    """The same with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
+    head = {"num_cells": (128, 64), "layer": "flipout"}
+    return _sensor(facts, GlimpseTrunk(keypoint_trunk(), facts.size), samples, *_moments(facts), **head)
+
+
+def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
+    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
+    return _sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
+
+
+def _sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
+    return ImageSensor(
+        len(loc),
+        image_shape=(3, facts.size, facts.size),
+        trunk=trunk,
+        ensemble_size=samples,
+        loc=loc,
+        scale=scale,
+        pixel_loc=facts.pixel_loc,
+        pixel_scale=facts.pixel_scale,
+        encoding_key=("sensor", "encoding"),
+        **head,
+    )
+
+
+_PRESETS = (
+    Preset("keypoints", keypoint_sensor, TurnedWrist(), 11, wrist_of),
+    Preset("glimpse", glimpse_sensor, TurnedWrist(), 11, wrist_of, coarse="keypoints"),
+    Preset("paper", paper_sensor, lambda state: state[..., :STATE], STATE, lambda reading, near: reading),
+)
+SENSORS = {preset.name: preset for preset in _PRESETS}
+
+
+def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, count: int = 1500) -> None:
+    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper."""
+    trunk = sensor.module["trunk"]
+    trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
+    trunk.coarse.requires_grad_(False)
+    rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
+    trunk.aim(sensor._prepare(rows["pixels"]), rows["state"][:, 7:])
+
+
+class NearForecast(SubModel):
+    """The sensor's samples as states; of the J6 half a turn apart those next to the forecast's mean.
+
+    What a turned gripper looks like says which two angles are possible, and the forecast which of them it is. All
+    members take the same, so that an ensemble does not split. (Members that compare cosines each for itself do split:
+    those a little more than a quarter of a turn off are drawn to the other side, and the mean lies between.)
+
+    Args:
+        preset: whose ``state_of`` turns readings into states.
+        forecast_key: the forecast's ensemble ``[*B, E, S]``, or mean ``[*B, S]``.
+        log_weight_key: optional log-weights of the ensemble ``[*B, E]``.
+    """
+
+    def __init__(
+        self,
+        preset: Preset,
+        forecast_key: NestedKey = ("forecast", "ensemble"),
+        log_weight_key: NestedKey = ("forecast", "log_weight"),
+    ):
+        super().__init__(nn.Identity(), [("sensor", "ensemble"), forecast_key], [NEAR], optional_keys=[log_weight_key])
+        self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
+
+    def compute(self, samples, forecast, log_weights=None, *, batch_size):
+        """The states ``[*B, E, 10]``."""
+        angle = forecast[..., WRIST]
+        if angle.ndim > len(batch_size):
+            angle = angle.mean(-1) if log_weights is None else (log_weights.exp() * angle).sum(-1)
+        near = angle.detach().unsqueeze(-1).expand(samples.shape[:-1])
+        states = self.preset.state_of(samples, near)
+        if self.factor != 1.0:
+            states = torch.lerp(states.mean(-2, keepdim=True), states, self.factor)
+        return states
+
+
+class BlackIsMissing(SubModel):
+    """Marks a frame that is black all over as not observed: no scene is, so that the camera says itself that it fails.
+
+    Put it in front of the sensor.
+
+    Args:
+        threshold: a frame none of whose pixels is brighter, as a share of white, is black.
+    """
+
+    def __init__(self, threshold: float = 0.02):
+        super().__init__(nn.Identity(), ["pixels"], ["observed"], optional_keys=["observed"])
+        self.threshold = threshold
+
+    def compute(self, pixels, before=None):
+        """The mask ``[*B, 1]``; what was not observed before stays so."""
+        white = 1.0 if pixels.is_floating_point() else 255
+        seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
+        return seen if before is None else seen & before
+
+
+def disturb(frames: TensorDict, generator: torch.Generator) -> TensorDict:
+    """What a camera does to training frames: a third get salt and pepper, a third another exposure."""
+    seed = int(torch.randint(2**31, (), generator=generator))
+    own = torch.Generator().manual_seed(seed)
+    frames = Brightness((0.85, 1.15), (-0.03, 0.03), p=0.33, generator=own)(frames)
+    return SaltAndPepper(p=0.33, generator=own)(frames)
+
+
+@torch.no_grad()
+def sensor_error(sensor: ImageSensor, preset: Preset, pool: FramePool) -> dict[str, float]:
+    """CRPS in the same units, and mean absolute errors in degrees and cm."""
+    scores, joints, places = [], [], []
+    for index in torch.arange(len(pool)).split(256):
+        frames = pool.rows(index)
+        samples = sensor(frames)["sensor", "ensemble"]
+        truth = frames["state"]
+        scores.append(crps_ensemble(samples, preset.observe(truth)) / unit_of(preset.dim))
+        error = (preset.state_of(samples.mean(1), truth[:, WRIST]) - truth).abs()
+        joints.append(error[:, :7].rad2deg())
+        places.append(100 * error[:, 7:])
+    return {
+        "crps": float(torch.cat(scores).mean()),
+        "joint_mae_deg": float(torch.cat(joints).mean()),
+        "ee_mae_cm": float(torch.cat(places).mean()),
+    }
+
+
+def train_sensor(
+    sensor: ImageSensor,
+    preset: Preset,
+    train: FramePool,
+    held_out: FramePool,
+    *,
+    out: Path,
+    seed: int,
+    updates: int,
+    lr: float = 2e-3,
+    batch: int = 64,
+) -> ImageSensor:
+    """Trains a sensor, or goes on where that was broken off, or reads it where it was done."""
+    terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
+    stage = Stage(
+        "sensor",
+        SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms),
+        lambda generator, _: disturb(train.sample(generator, batch), generator),
+        updates,
+        lr=lr,
+        weight_decay=0.02,
+    )
+    return train_part(
+        sensor,
+        stage,
+        out=out,
+        validate=lambda: sensor_error(sensor, preset, held_out),
+        monitor="crps",
+        validate_every=max(updates // 8, 1),
+        save_every=200,
+        seed=seed,
+        device="cpu",
+    ).eval()

@@ -1,0 +1,238 @@
+"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from tyro.conf import OmitArgPrefixes, Positional
+
+from benchmarks.common.arguments import some_of
+from benchmarks.common.jobs import once, read_rows
+from benchmarks.ur5.demos import Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
+from benchmarks.ur5.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
+from benchmarks.ur5.motion import ArmMotion, train_motion
+from benchmarks.ur5.readings import read_all, read_codes
+from benchmarks.ur5.recipes import FILTERS, UR5Recipe
+from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
+from benchmarks.ur5.training import Budget, train_filter
+from torch_denkf.filters import Filter
+from torch_denkf.modules import ImageSensor
+from torch_denkf.training import read_checkpoint, write_checkpoint
+
+TRAININGS = ("sim", "real_like", "fine_tuned")
+SALTED = 3  # every third tuning demo is read with salt and pepper, too
+PICTURED = 3  # test demos whose beliefs are left for the plots
+SINGLE = ("dekf", "dukf", "bkf", "lstm")  # no ensemble
+
+
+@dataclass(frozen=True)
+class Study(Collections):
+    """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
+
+    collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
+    left in --out. What was broken off goes on where it stopped. See benchmarks/ur5/README.md.
+    """
+
+    command: Positional[Literal["collect", "table", "pictures"]] = "table"
+    filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
+    sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
+    trainings: some_of(TRAININGS) = TRAININGS
+    seeds: tuple[int, ...] = (0,)
+    sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512, 1024)  # of the ensemble, for one row each
+    processes: int = 1  # that collect
+    budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
+    smoke: bool = False  # a tiny run of everything
+
+
+class Base:
+    """What all filters of a sensor, a training and a seed share: sensor, statistics, motions, features of demos.
+
+    Args:
+        study: the study.
+        kind: name of the sensor.
+        training: ``"sim"``, ``"real_like"`` (a few demos there alone) or ``"fine_tuned"`` (first the one, then the
+            other).
+        seed: of all random numbers.
+    """
+
+    def __init__(self, study: Study, kind: str, training: str, seed: int):
+        self.study, self.kind, self.training, self.seed = study, kind, training, seed
+        self.preset = SENSORS[kind]
+        self.domain = "sim" if training == "sim" else "real_like"
+        self.name = f"{training}-{kind}-{seed}"
+        self.parent = Base(study, kind, "sim", seed) if training == "fine_tuned" else None
+        self.roles: Roles = sim_roles(study) if training == "sim" else real_roles(study)
+        self.states, self.actions = self._truth()
+        self.sensor, self.facts = self._sensor()
+        self._motions: dict[bool, ArmMotion] = {}
+
+    def _truth(self) -> tuple[Tensor, Tensor]:
+        """States and actions of the demos that the sensor may see."""
+        study, roles = self.study, self.roles
+        if self.training == "sim":
+            return sequences_of(study.replay("sim-frames", "train"), lambda demo: demo >= study.sequences)
+        chosen = {*roles.sensor, *roles.tune, *roles.validation}
+        return sequences_of(study.replay("real_like-sequences", "train"), chosen.__contains__)
+
+    def _sensor(self) -> tuple[ImageSensor, Statistics]:
+        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        out = self.study.out / "sensors" / self.name
+        if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
+            facts = Statistics(**read_checkpoint(out / "facts.pt"))
+            sensor = self.preset.build(facts, SAMPLES)
+            sensor.load_state_dict(read_checkpoint(out / "sensor.pt")["sensor"])
+            return sensor.eval(), facts
+        sensor, facts = self._train_sensor(out)
+        write_checkpoint(out / "facts.pt", vars(facts))
+        return sensor, facts
+
+    def _train_sensor(self, out: Path) -> tuple[ImageSensor, Statistics]:
+        study, roles, budget = self.study, self.roles, self.study.budget
+        name = "sim-frames" if self.training == "sim" else "real_like-sequences"
+        data = study.replay(name, "train", frames_only=True)
+        held_out = set(sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation)
+        pool, checked = FramePool(data, roles.sensor), FramePool(data, held_out)
+        torch.manual_seed(self.seed)
+        # In the other domain as many as fine-tuning gets, of a third of the pictures.
+        updates, lr = budget.sensor if self.training == "sim" else budget.fine_tuning, 2e-3
+        if self.parent is not None:
+            facts, sensor, lr = self.parent.facts, deepcopy(self.parent.sensor), 1e-3
+            sensor.requires_grad_(True)  # the coarse part of a second look, too: the camera stands elsewhere
+        else:
+            facts = Statistics.of(self.states, pool)
+            sensor = self.preset.build(facts, SAMPLES)
+        if self.parent is None and self.preset.coarse is not None:
+            coarse = SENSORS[self.preset.coarse]
+            first, folder = coarse.build(facts, SAMPLES), out.with_name(out.name.replace(self.kind, coarse.name))
+            train_sensor(first, coarse, pool, checked, out=folder, seed=self.seed, updates=updates, lr=lr)
+            adopt(sensor, first, pool)
+            updates, lr = max(updates // 2, 1), 1.5e-3
+        train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
+        return sensor, facts
+
+    def motion(self, actions: bool) -> ArmMotion:
+        """The motion, trained on true states."""
+        if self.parent is not None:
+            return self.parent.motion(actions)
+        if actions not in self._motions:
+            torch.manual_seed(self.seed)
+            motion = ArmMotion(self.facts, actions)
+            out = self.study.out / "motions" / f"{self.training}{'-actions' * actions}-{self.seed}"
+            self._motions[actions] = train_motion(
+                motion, self.states, self.actions, out=out, seed=self.seed, updates=self.study.budget.motion
+            )
+        return self._motions[actions]
+
+    def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
+        """Features of the demos of a role, in a domain of which they may not be."""
+        domain = self.domain if domain is None else domain
+        demos = getattr(self.roles if domain == self.domain else real_roles(self.study), role)
+        if condition == "salt_and_pepper" and role == "tune":
+            demos = demos[::SALTED]
+        file = self.study.out / "codes" / f"{self.name}-{domain}-{role}-{condition}.pt"
+        data = self.study.replay(f"{domain}-sequences", "test" if role == "test" else "train")
+        return read_codes(self.sensor, data, demos, condition=condition, file=file)
+
+    def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
+        """A filter's recipe, with a sensor of its own."""
+        kind = FILTERS[name]
+        motion, error = self.motion(kind.actions), self.error()
+        return kind(deepcopy(self.sensor), self.preset, self.facts, motion, error, size)
+
+    def error(self) -> Tensor:
+        """Root mean square error of the sensor on the validation demos, ``[10]``."""
+        reading = read_all(self.sensor, self.codes("validation"), MEMBERS)
+        truth = reading["state"]
+        read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
+        return (read - truth).square().mean((0, 1)).sqrt()
+
+    def train(self, name: str) -> tuple[UR5Recipe, Filter, Path]:
+        """Trains a filter, or reads it."""
+        recipe, out = self.recipe(name), self.study.out / "filters" / f"{name}-{self.name}"
+        begin = None if self.parent is None else self.parent.train(name)[1]
+        tune = [self.codes("tune"), self.codes("tune", "salt_and_pepper")]
+        validation = self.codes("validation")
+        model = train_filter(recipe, tune, validation, out=out, seed=self.seed, budget=self.study.budget, begin=begin)
+        return recipe, model, out
+
+    def readings(self, sensor: ImageSensor, domain: str) -> dict[str, TensorDict]:
+        """What a sensor reads of the test demos, in all conditions."""
+        clean, salted = (self.codes("test", condition, domain) for condition in ("clean", "salt_and_pepper"))
+        return conditions_of(read_all(sensor, clean, MEMBERS), read_all(sensor, salted, MEMBERS))
+
+
+def run_all(study: Study) -> None:
+    """Trains and tests everything: all filters with the first sensor in the simulator, the DEnKF everywhere."""
+    for seed in study.seeds:
+        for kind in study.sensors:
+            first = kind == study.sensors[0]
+            trainings = [name for name in study.trainings if first or name == "sim"]
+            for training in trainings:
+                chosen = [name for name in study.filters if name == "denkf" or (first and training == "sim")]
+                run_jobs(study, chosen, kind, training, seed, changed=first and len(trainings) > 1)
+
+
+def run_jobs(
+    study: Study, filters: Sequence[str], kind: str, training: str, seed: int, *, changed: bool = False
+) -> None:
+    """Trains and tests what is not done already; leaves rows in ``--out/rows``.
+
+    Args:
+        study: the study.
+        filters: names.
+        kind: name of the sensor.
+        training: see :class:`Base`.
+        seed: of all random numbers.
+        changed: whether DEnKF of the simulator is tested on the changed domain, too, as it is.
+    """
+    base, folder = Base(study, kind, training, seed), study.out / "rows"
+    names = {"sensor": kind, "training": training, "seed": seed}
+    for domain in ("sim", "real_like") if training == "sim" and changed else (base.domain,):
+        own = {**names, "domain": domain}
+        once(folder / f"sensor-{base.name}-{domain}.json", partial(_sensor, base, own))
+        for name in filters if domain == base.domain else set(filters) & {"denkf"}:
+            size = 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
+            rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": size})
+            once(folder / f"{name}-{base.name}-{domain}.json", rows)
+    if "denkf" in filters and changed and training == "sim":
+        once(folder / f"sizes-{base.name}.json", partial(_sizes, base, {**names, "domain": "sim", "filter": "denkf"}))
+
+
+def _sensor(base: Base, names: dict) -> list[dict]:
+    return sensor_rows(base.preset, base.readings(base.sensor, names["domain"]), names)
+
+
+def _filter(base: Base, names: dict) -> list[dict]:
+    recipe, model, _ = base.train(names["filter"])
+    domain = names["domain"]
+    readings = base.readings(recipe.sensor, domain)
+    rows = filter_rows(recipe, model, readings, names)
+    own = read_all(recipe.sensor, base.codes("validation"), MEMBERS)
+    rows[0]["validation_crps"] = validation_crps(recipe, model, own)
+    pictured = domain == "sim" or base.training == "fine_tuned"
+    if names["filter"] == "denkf" and pictured:
+        data = base.study.replay(f"{domain}-sequences", "test")
+        demos, folder = base.roles.test[:PICTURED], base.study.out / "beliefs"
+        save_beliefs(recipe, model, readings, data, demos, folder, f"denkf-{base.kind}-{domain}")
+    return rows
+
+
+def _sizes(base: Base, names: dict) -> list[dict]:
+    recipe, _, out = base.train(names["filter"])
+    sizes = [size for size in base.study.sizes if size != MEMBERS]  # that one is in the table
+    make = partial(base.recipe, names["filter"])
+    saved, validation = read_checkpoint(out / "filter.pt"), base.codes("validation")
+    return size_rows(make, recipe.sensor, base.codes("test"), sizes, saved, names, validation)
+
+
+def rows_of(out: Path) -> list[dict]:
+    """All rows that a study's folder holds."""
+    return read_rows(sorted((out / "rows").glob("*.json")))

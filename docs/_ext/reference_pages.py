@@ -1,0 +1,120 @@
+"""Writes one reference page for each package of torch_denkf that names its public things in ``__all__``."""
+
+import importlib
+import inspect
+import pkgutil
+import re
+from pathlib import Path
+
+import torch_denkf
+
+OWN_METHODS = {
+    "DEnKFTransform": """
+        ``DEnKFTransform`` inherits about seventy public methods of torchrl's ``Transform``. Its own methods are:
+
+        =================================  =============================================================================
+        method                             what it does, and who calls it
+        =================================  =============================================================================
+        ``__init__``                       takes the filter; finds out what it reads, carries and writes
+        ``forward``                        filters a sequence ``[*B, T]``: called by a replay buffer, or by you
+        ``transform_observation_spec``     adds the belief to what the environment says it emits
+        ``transform_input_spec``           adds what is carried to the state that the environment takes
+        ``_reset``                         writes the initial belief in the rows that reset; called by ``env.reset``
+        ``_reset_on_native_autoreset``     the same, in environments that reset themselves
+        ``_reset_mask``                    which rows reset, where groups of agents have masks of their own
+        ``_step``                          one step of the filter; called by ``env.step``
+        ``_trial``                         a step on zeros, whose results tell the shapes of the specs
+        ``_add_specs``                     the specs of what that trial wrote
+        ``_post_step_mdp_hooks``           with ``store_ensemble=False``, leaves the ensemble out of what is stored
+        ``_check_batched_worker_compat``   refuses ``store_ensemble=False`` inside a worker process
+        ``_assert_finite``                 names the input, or the filter, where a belief is not finite
+        =================================  =============================================================================
+        """,
+}
+
+
+def packages():
+    """The packages with public names."""
+    found = {}
+    for _, name, is_package in pkgutil.iter_modules(torch_denkf.__path__):
+        package = importlib.import_module(f"torch_denkf.{name}") if is_package and name[0] != "_" else None
+        if getattr(package, "__all__", None):
+            found[name] = package
+    return found
+
+
+def directive(package, name):
+    """The directive that describes one public name."""
+    value = getattr(package, name)
+    if inspect.isclass(value) or inspect.isroutine(value):
+        return f".. auto{'class' if inspect.isclass(value) else 'function'}:: {package.__name__}.{name}"
+    shown = f"array of {len(value)}" if hasattr(value, "__array__") else repr(value).replace("typing.", "")
+    return f".. py:data:: {name}\n   :module: {package.__name__}\n   :value: {shown}\n\n   {comment(package, name)}"
+
+
+def comment(package, name):
+    """What stands behind a constant in the source."""
+    for file in Path(package.__file__).parent.rglob("*.py"):
+        found = re.search(rf"^{name} = .*?  # (.+)$", file.read_text(), re.MULTILINE)
+        if found:
+            return found[1]
+    return ""
+
+
+def page(name, package):
+    """The reStructuredText of a package's page."""
+    title = f"torch_denkf.{name}"
+    names = list(package.__all__)
+    parts = [
+        title,
+        "=" * len(title),
+        "",
+        f".. automodule:: {title}\n   :no-members:\n",
+        f".. currentmodule:: {title}\n",
+        ".. autosummary::\n   :nosignatures:\n",
+        *(f"   {public}" for public in names),
+        "",
+    ]
+    for public in names:
+        parts += ["", public, "-" * len(public), "", directive(package, public), ""]
+        if public in OWN_METHODS:
+            parts += [inspect.cleandoc(OWN_METHODS[public]), ""]
+    return "\n".join(parts)
+
+
+def write(app):
+    """Writes the pages that changed."""
+    for name, package in packages().items():
+        path, text = Path(app.srcdir) / "reference" / f"{name}.rst", page(name, package)
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+
+
+def skip(app, what, name, obj, would_skip, options):
+    """Leaves out the fields of named tuples, which their class describes, and the losses' alias of their keys."""
+    return True if type(obj).__name__ == "_tuplegetter" or name == "default_keys" else None
+
+
+def describe_constant(app, what, name, obj, options, lines):
+    """Shows the source's comment in the place of what the constant's type says about itself."""
+    if what == "data":
+        package, _, constant = name.rpartition(".")
+        lines[:] = [comment(importlib.import_module(package), constant)]
+
+
+def own_signature(app, what, name, obj, options, signature, annotation):
+    """Shows the arguments of ``__init__`` where a metaclass hides them."""
+    if what == "class" and signature == "(*args, **kwargs)":
+        parameters = list(inspect.signature(inspect.unwrap(obj.__init__)).parameters.values())[1:]
+        bare = [parameter.replace(annotation=parameter.empty) for parameter in parameters]
+        return str(inspect.Signature(bare)), annotation
+    return None
+
+
+def setup(app):
+    """Registers the extension."""
+    app.connect("builder-inited", write)
+    app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", describe_constant)
+    app.connect("autodoc-process-signature", own_signature)
+    return {"parallel_read_safe": True}

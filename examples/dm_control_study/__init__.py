@@ -1,1 +1,0 @@
-"""What examples/dm_control_arms.py is made of."""

@@ -1,0 +1,277 @@
+"""The parts of the KITTI study that a wrong table could come from."""
+
+import json
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from benchmarks.common.tables import pick
+from benchmarks.kitti.evaluation import errors, integrate, last_velocities
+from benchmarks.kitti.folds import Fold, Part, Statistics, make_fold, with_disturbances
+from benchmarks.kitti.readings import ReadingSampler, all_frames, lose_frames, take_spans
+from benchmarks.kitti.recipes import FILTERS
+from benchmarks.kitti.sensors import SENSORS, SensorOfFold
+from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
+from benchmarks.kitti.study import rows_of
+from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
+from benchmarks.kitti.training import gain_error, run_filter
+from torch_denkf.metrics import dead_reckoning
+
+
+def streams(*drives, cameras=("image_0",)):
+    return [Stream("root", drive, camera) for drive in drives for camera in cameras]
+
+
+@pytest.fixture(autouse=True)
+def rows_of_drives(monkeypatch):
+    monkeypatch.setattr("benchmarks.kitti.folds._rows", lambda stream: 100)
+
+
+@pytest.mark.parametrize("rendered", [0, 4])
+@pytest.mark.parametrize("test", ["a", "c", "f"])
+def test_no_fold_trains_on_its_test_drive_in_any_condition_or_camera(test, rendered):
+    found = streams(*"abcdef", cameras=("image_0", "image_1"))
+    parts = [Part(stream) for stream in streams(*[f"r{i}" for i in range(rendered)])]
+    fold = make_fold(test, found, parts[1:], parts[:1])
+    others = [*fold.train, *fold.tune, *fold.validation]
+    assert {stream.drive for stream in fold.test} == {test}
+    assert len(fold.test) == 2  # both cameras
+    assert test not in {part.stream.drive for part in others}
+    assert {part.stream.condition for part in fold.train} == {"clean", *DISTURBANCES}
+    roles = [{part.stream.drive for part in role} for role in (fold.train, fold.tune, fold.validation)]
+    if not rendered:  # the checkpoint is chosen on a drive of its own; the others are read by sensors that stand in
+        assert roles[0] == roles[1] == fold.shared
+        assert not roles[0] & roles[2]
+        assert set.union(*roles) == set("abcdef") - {test}
+
+
+def test_a_fold_that_leaks_is_refused():
+    part = Part(Stream("root", "a", "image_0", condition="blur"))
+    with pytest.raises(ValueError, match=r"\['a'\] would be trained and tested on"):
+        Fold("a", [part], [], [], test=streams("a"))
+
+
+def test_too_few_drives_are_refused():
+    with pytest.raises(ValueError, match="too few"):
+        make_fold("a", streams("a", "b"), [], [])
+
+
+def test_disturbances_together_weigh_half_as_much_as_the_clean_stream():
+    parts = with_disturbances([Part(*streams("a"), weight=2.0)])
+    assert sum(part.weight for part in parts if part.stream.condition == "clean") == 2.0
+    assert sum(part.weight for part in parts if part.stream.condition != "clean") == pytest.approx(1.0)
+
+
+def readings(values, observed=True, longest=1):
+    """Of two members, half a unit beside the values; of pairs of n steps n times as much, as at a constant speed."""
+    values = torch.as_tensor(values)
+    samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]
+    spans = torch.stack([n * samples for n in range(1, LONGEST + 1)], 1)
+    there = torch.as_tensor(observed).expand(len(values))[:, None, None] & (torch.arange(LONGEST) < longest)[:, None]
+    entries = {"observed": there, "ensemble": spans, "encoding": torch.zeros(len(values), LONGEST, 1)}
+    state = torch.tensor([[0.0, 0.0, 0.0, 7.0, 0.7]]).repeat(len(values), 1)
+    spans = TensorDict(entries, batch_size=[len(values), LONGEST])
+    return TensorDict({"state": state, "spans": spans}, [len(values)])
+
+
+def test_dead_reckoning_holds_the_last_reading_and_before_the_first_the_true_start():
+    values = [[9.0, 9.0], [1.0, 0.1], [9.0, 9.0], [2.0, 0.2], [9.0, 9.0]]
+    read = all_frames(readings(values, [False, True, False, True, False]))
+    expected = torch.tensor([[7.0, 0.7], [1.0, 0.1], [1.0, 0.1], [2.0, 0.2], [2.0, 0.2]])
+    torch.testing.assert_close(last_velocities(read, 0.1), expected)
+
+
+def test_dead_reckoning_takes_the_mean_over_a_gap_unless_it_is_too_wide():
+    read = readings([[7.0, 0.7], [6.0, 0.1], [9.0, 9.0], [8.0, 0.2], [9.0, 9.0], [30.0, 0.3]], longest=3)
+    out = take_spans(read, torch.tensor([0, 1, 0, 2, 0, 2]))
+    torch.testing.assert_close(out["sensor", "ensemble"].mean(1)[3], torch.tensor([16.0, 0.4]))
+    path = last_velocities(out, 0.1)
+    torch.testing.assert_close(path[3:5], torch.tensor([[8.0, 0.2]] * 2))  # 2 x 0.6 m are within reach
+    torch.testing.assert_close(path[5], torch.tensor([30.0, 0.3]))  # held 8 m/s over 0.2 s: within reach, as it knows
+    torch.testing.assert_close(last_velocities(out, 0.3)[3:], torch.tensor([[6.0, 0.1]] * 3))  # 2 x 1.8 m are not
+
+
+@pytest.mark.parametrize("longest", [1, LONGEST])
+def test_a_lost_frame_blinds_its_own_pair_and_those_that_cannot_bridge_it(longest):
+    read = readings([[0.0, 0.0]] * 4000, longest=longest)
+    lost = lose_frames(read, seed=3)
+    kept = torch.rand(4000, generator=torch.Generator().manual_seed(3)) >= 0.3
+    seen = lost["observed"].squeeze(-1)
+    for row in range(1, 4000):
+        back = next((n for n in range(1, longest + 1) if row >= n and kept[row - n]), 0)
+        assert bool(seen[row]) == bool(kept[row] and back)
+        if seen[row]:
+            assert int(lost["steps"][row]) == back
+    # 0.7 x 0.7 of neighbours; over gaps of up to two 0.7 x (1 - 0.3^3); standard error 0.01
+    assert float(seen.float().mean()) == pytest.approx(0.7**2 if longest == 1 else 0.7 * (1 - 0.3**3), abs=0.03)
+    assert bool(read["spans", "observed"][:, 0].all())  # the original is left as it was
+
+
+def test_errors_of_a_path_that_is_a_tenth_too_fast():
+    truth = torch.zeros(121, 5, dtype=torch.float64)
+    truth[:, 3] = 10.0
+    truth[:, 0] = torch.arange(121) * 1.0
+    states = integrate(truth[:, 3:] * 1.1, truth, 0.1)
+    table = errors(states, truth)
+    assert [row["window"] for row in table] == [50, 100]
+    for row in table:
+        assert row["translation_m_per_m"] == pytest.approx(0.1)
+        assert row["pathlength_m_per_m"] == pytest.approx(0.1)
+        assert row["rotation_deg_per_m"] == pytest.approx(0.0)
+        assert row["rmse_v_m_per_s"] == pytest.approx(1.0)
+        assert row["devkit_t_rel_percent"] == pytest.approx(10.1, abs=0.15)  # a segment ends behind 100 m, by a frame
+
+
+def test_gain_error_is_that_of_clean_unseen_drives():
+    """Drives at 7 m/s read as 7 e^0.03 and 7 e^-0.04; what a disturbed one reads does not count."""
+    parts = with_disturbances([Part(stream) for stream in streams("a", "b")])
+    fold = Fold("t", [], parts, [])
+    base = SensorOfFold("flow", None, None, [])
+    for part in parts:
+        off = {"a": 0.03, "b": -0.04}[part.stream.drive] if part.stream.condition == "clean" else 0.5
+        read = readings([[7.0 * math.exp(off), 0.0]] * 20)
+        base.readings += [(read[:12], read[12:], 1.0)] * 2  # as they are, and mirrored
+    assert gain_error(fold, base) == pytest.approx(((0.03**2 + 0.04**2) / 2) ** 0.5, rel=1e-4)
+
+
+def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
+    data = readings(torch.tensor([[8.0, 0.1]]).repeat(60, 1), longest=LONGEST)
+    data["state"] = torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1]).repeat(60, 1)
+    windows = ReadingSampler([data], [1.0], 8, gain_error=0.0).windows(
+        torch.Generator().manual_seed(0), torch.zeros(5), batch=200
+    )
+    velocity, steps, seen = windows["state"][..., 3:], windows["steps"], windows["observed"].squeeze(-1)
+    assert steps.unique().tolist() == [0, 1, 2, 3]
+    mean = windows["sensor", "ensemble"].mean(2)
+    torch.testing.assert_close(mean[seen], (velocity * steps)[seen])
+    assert data["state"].eq(torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1])).all()  # windows are copies
+    torch.testing.assert_close(windows["start"], windows["state"])  # no wrong start was asked for
+    speed = velocity[:, 0, 0] / 8
+    assert 0.36 < float(speed.min()) < 0.45  # exp(-1) and exp(0.7), and 200 draws come near
+    assert 1.85 < float(speed.max()) < 2.02
+    assert not windows["observed"].all()
+    assert windows["is_init"].sum() == 200
+
+
+def test_windows_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match=r"windows of 50 rows do not fit in readings of \[5\] rows"):
+        ReadingSampler([readings([[0.0, 0.0]] * 5)], [1.0], 50, 0.0)
+
+
+def test_a_mirrored_drive_goes_the_mirrored_way():
+    rng = torch.Generator().manual_seed(0)
+    velocity = torch.rand(30, 2, generator=rng, dtype=torch.float64) + torch.tensor([5.0, -0.5])
+    path = dead_reckoning(velocity, torch.zeros(3, dtype=torch.float64), 0.1)
+    flow, road = torch.randn(30, 3, 25, 79, generator=rng), torch.rand(30, 13, 69, generator=rng)
+    frames = TensorDict({"state": torch.cat([path, velocity], -1), "flow": flow, "road": road}, [30])
+    frames["target_observation"] = 2 * velocity
+    other = mirror(frames)
+    again = dead_reckoning(other["state"][:, 3:], torch.zeros(3, dtype=torch.float64), 0.1)
+    torch.testing.assert_close(again, other["state"][:, :3])
+    torch.testing.assert_close(other["flow"][:, 0], -flow[:, 0].flip(-1))
+    torch.testing.assert_close(other["flow"][:, 1:], flow[:, 1:].flip(-1))
+    torch.testing.assert_close(other["target_observation"], 2 * other["state"][:, 3:])
+    torch.testing.assert_close(mirror(other)["state"], frames["state"])
+
+
+def test_a_pair_should_read_the_velocities_of_all_its_steps():
+    state = torch.randn(10, 5, generator=torch.Generator().manual_seed(0))
+    entries = {"state": state, "flow": torch.zeros(10, 3, 25, 79), "road": torch.zeros(10, 13, 69)}
+    entries |= {"frame_valid": torch.ones(10, 1, dtype=torch.bool), "time": torch.zeros(10, 1)}
+    for steps in (1, 2, 3):
+        stream = TensorDict({**entries, "steps": torch.full((10, 1), steps)}, [10])
+        target = rows(stream, torch.tensor([9, 5]), "flow")["target_observation"]
+        expected = [state[row - steps + 1 : row + 1, 3:].sum(0) for row in (9, 5)]
+        torch.testing.assert_close(target, torch.stack(expected))
+
+
+def row(drive, seed, value, **entries):
+    row = {"filter": "denkf", "sensor": "flow", "condition": "clean", "window": 100, "coverage90": 0.9}
+    return {**row, "drive": drive, "seed": seed, "translation_m_per_m": value, "rotation_deg_per_m": 0.1, **entries}
+
+
+def test_a_drive_counts_once_by_the_median_of_its_seeds_and_the_mean_of_its_cameras():
+    rows = [row("a/image_0", 0, 1.0), row("a/image_1", 0, 3.0), row("a/image_0", 1, 5.0), row("a/image_1", 1, 5.0)]
+    rows += [row("a/image_0", 2, 90.0), row("a/image_1", 2, 90.0), row("b/image_2", 0, 7.0)]
+    assert by_drive(rows, "translation_m_per_m") == {"a": 5.0, "b": 7.0}
+
+
+def test_the_table_survives_its_file(tmp_path):
+    rows = [row("a/image_0", 0, 0.25), row("b/image_0", 0, 0.75, coverage90=float("nan"))]
+    rows += [row("a/image_0", 0, 0.125, filter="floor"), row("b/image_0", 0, 0.125, filter="floor")]
+    COLUMNS.write(rows, tmp_path / "table.csv")
+    again = COLUMNS.read(tmp_path / "table.csv")
+    assert (tmp_path / "table.csv").read_text().splitlines()[0] == ",".join(COLUMNS.names)
+    assert "coverage90" not in pick(again, drive="b/image_0", filter="denkf")[0]
+    assert by_drive([r for r in again if r["filter"] == "denkf"], "translation_m_per_m") == {"a": 0.25, "b": 0.75}
+    text = markdown(again, "header")
+    assert "| clean | denkf | flow | 0.500 ± 0.250 |" in text
+    assert "| clean | floor: true v and theta_dot | truth | 0.125 ± 0.000 |" in text
+
+
+def test_rows_of_several_filters_bring_dead_reckoning_once(tmp_path):
+    for name, value in (("denkf", 1.0), ("dekf", 2.0)):
+        folder = tmp_path / "folds" / f"a-{name}-flow-0"
+        folder.mkdir(parents=True)
+        rows = [row("a/image_0", 0, value, filter=name)]
+        rows += [row("a/image_0", 0, 10 * value, filter=shared) for shared in ("dead_reckoning", "floor")]
+        (folder / "rows.json").write_text(json.dumps(rows))
+    found = {(r["filter"], r["translation_m_per_m"]) for r in rows_of(tmp_path)}
+    assert found == {("denkf", 1.0), ("dekf", 2.0), ("dead_reckoning", 10.0), ("floor", 10.0)}
+
+
+def facts():
+    return Statistics(torch.tensor([9.0, 0.0]), torch.tensor([3.0, 0.1]), torch.zeros(2), torch.ones(2), 0.1)
+
+
+def smooth_drive(count, encoding):
+    """Readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
+    velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
+    path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
+    sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)
+    samples = sums.unsqueeze(2) + 0.02 * torch.randn(count, LONGEST, 32, 2)
+    encoding = torch.zeros(count, LONGEST, encoding)
+    entries = {"observed": torch.ones(count, LONGEST, 1).bool(), "ensemble": samples, "encoding": encoding}
+    state = torch.cat([path, velocity], -1)
+    return TensorDict({"state": state, "spans": TensorDict(entries, batch_size=[count, LONGEST])}, [count])
+
+
+@pytest.mark.parametrize("name", sorted(FILTERS))
+def test_every_recipe_follows_readings_over_gaps_with_one_set_of_parameters(name):
+    """Untrained filters on readings of a known truth: a drive whose speed changes, 30 % of the frames missing."""
+    torch.manual_seed(0)
+    recipe = FILTERS[name](SENSORS["flow"](facts()), facts())
+    model = recipe.build()
+    sensorless = recipe.part(model, sensor=False)
+    own = {id(p) for p in model.parameters()}
+    assert {id(p) for p in sensorless.parameters()} <= own
+    assert any(True for _ in sensorless.parameters())
+    read = smooth_drive(60, recipe.encoding)
+    state = read["state"]
+    with torch.no_grad():
+        out = run_filter(recipe, model, [all_frames(read), lose_frames(read, seed=1)])
+    assert out["belief", "var"][..., :5].isfinite().all()
+    if recipe.needs_training:  # before it, nothing connects its readings with its state
+        return
+    end = (out["belief", "mean"][:, -1, :2] - state[-1, :2]).norm(dim=-1)
+    assert (end < 0.1 * 8 * 0.1 * len(state)).all(), end  # a tenth of the way
+
+
+@pytest.mark.parametrize("name", ["dekf", "dukf", "bkf"])
+def test_inflation_of_the_gaussian_filters_widens_the_velocities_and_leaves_pose_and_gain_finite(name):
+    recipe = FILTERS[name](SENSORS["flow"](facts()), facts())
+    model, read = recipe.build(), smooth_drive(300, recipe.encoding)
+    out = []
+    with torch.no_grad():
+        for factor in (1.0, 1.4):
+            recipe.set_inflation(model, factor)
+            out.append(run_filter(recipe, model, [all_frames(read)])["belief"][0])
+    plain, inflated = out
+    settled = slice(100, None)  # the first belief is the same in both
+    ratio = inflated["var"][settled, 3:5] / plain["var"][settled, 3:5]
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 1.4**2), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(inflated["mean"][settled, 3:5], plain["mean"][settled, 3:5], rtol=1e-3, atol=1e-3)
+    # The pose's spread grows with the way, not by 1.4 a step: 1.4**600 would have left float32 behind.
+    assert (inflated["var"][-1, :3] < 2.5 * plain["var"][-1, :3]).all()

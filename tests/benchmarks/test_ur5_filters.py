@@ -1,0 +1,216 @@
+"""Sensors, motion and filters of the UR5 study."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from benchmarks.ur5.evaluation import errors
+from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
+from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, AtRest, BiasedReading, WithBias, with_rates
+from benchmarks.ur5.readings import read_head
+from benchmarks.ur5.recipes import FILTERS
+from benchmarks.ur5.recipes.denkf import localisation
+from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, wrist_of
+from benchmarks.ur5.training import run_filter
+from tests.benchmarks.ur5_for_tests import FACTS, states
+
+# ------------------------------------------------------------------------------------------------------ the wrist
+
+
+def test_a_reading_of_the_turned_wrist_gives_the_state_back_from_any_angle_within_a_quarter_turn():
+    state = states(200)
+    state[:, 5] = torch.linspace(-5, 5, 200)
+    reading = TurnedWrist()(state)
+    torch.testing.assert_close(wrist_of(reading, state[:, 5] + 1.5), state, atol=1e-5, rtol=0)
+    other = wrist_of(reading, state[:, 5] + math.pi)  # half a turn on it looks the same
+    torch.testing.assert_close(other[:, 5], state[:, 5] + math.pi, atol=1e-5, rtol=0)
+
+
+def test_a_radian_of_the_wrist_is_a_unit_of_its_reading():
+    state = states(3).double().requires_grad_()
+    reading = TurnedWrist()(state)
+    slope = torch.stack([torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6)])
+    torch.testing.assert_close(slope.norm(dim=0), torch.ones(3, dtype=torch.double))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_samples_turn_to_the_side_of_the_forecast(weighted):
+    state = states(2)
+    state[:, 5] = torch.tensor([1.0, 1.0])
+    samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
+    forecast = torch.zeros(2, 3, SIZE)
+    forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
+    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
+    if weighted:  # all weight on the first particle, which is near 1 in both rows
+        td["forecast", "log_weight"] = torch.tensor([1.0, 1e-9, 1e-9]).log().expand(2, -1)
+    near = NearForecast(SENSORS["keypoints"])(td)[NEAR]
+    expected = torch.tensor([1.0, 1.0 if weighted else 1.0 + math.pi])
+    torch.testing.assert_close(near[..., 5], expected.unsqueeze(-1).expand(2, 4), atol=1e-5, rtol=0)
+
+
+def test_a_factor_scales_the_samples_around_their_mean():
+    near = NearForecast(SENSORS["paper"])
+    samples = states(2, 5)
+    td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": torch.zeros(2, 3, SIZE)}}, [2])
+    near.factor = 1.5
+    out = near(td)[NEAR]
+    torch.testing.assert_close(out.mean(1), samples.mean(1))
+    torch.testing.assert_close(out.std(1), 1.5 * samples.std(1))
+
+
+# ------------------------------------------------------------------------------------------------------ the motion
+
+
+def test_rates_are_the_joints_changes_and_an_episode_begins_at_rest():
+    sequence = states(2, 5)
+    full = with_rates(sequence)
+    torch.testing.assert_close(full[:, 1:, 10:], sequence[:, 1:, :7] - sequence[:, :-1, :7])
+    assert float(full[:, 0, 10:].abs().max()) == 0.0
+
+
+def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
+    torch.manual_seed(0)
+    motion = ArmMotion(FACTS)
+    state = torch.cat([states(6), 0.01 * torch.randn(6, 7)], -1)
+    moved = motion(state)
+    torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:])
+    torch.testing.assert_close(moved[:, 10:], torch.sigmoid(torch.tensor(4.0)) * state[:, 10:])  # before training
+    expected = motion.place(moved[:, :7]) + 0.5 * (state[:, 7:10] - motion.place(state[:, :7]))
+    torch.testing.assert_close(moved[:, 7:10], expected)
+
+
+def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_fingers_through_an_object():
+    motion = ArmMotion(FACTS, actions=True)
+    motion.pull.data.fill_(1.0)
+    state = torch.cat([states(1), torch.zeros(1, 7)], -1)
+    action = state[:, :7] + 0.02
+    action[:, 6] = state[:, 6] - 0.5
+    moved = motion(torch.cat([state, action], -1))
+    torch.testing.assert_close(moved[:, :6], action[:, :6])
+    torch.testing.assert_close(moved[:, 6], state[:, 6])
+
+
+def test_biases_fade_and_add_to_the_reading():
+    motion = ArmMotion(FACTS)
+    network = WithBias(motion)
+    state = torch.cat([states(3), torch.zeros(3, 7), torch.ones(3, 10)], -1)
+    moved = network(state)
+    torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
+    torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
+    torch.testing.assert_close(BiasedReading()(state), state[:, :10] + 1)
+    torch.testing.assert_close(BiasedReading()(state[:, :SIZE]), state[:, :10])
+
+
+# ------------------------------------------------------------------------------------------------ sensors, filters
+
+
+def test_places_project_as_a_pinhole_has_it():
+    # The camera's target is in the middle; what is 1.58 m behind it, 0.1 m to the left of the arm, is on the right.
+    assert project(torch.tensor([-0.18, 0.02, 0.27])).abs().max() < 1e-6
+    right, low = project(torch.tensor([[-0.18, 0.12, 0.27], [-0.18, 0.02, 0.17]]))
+    depth = math.dist((1.4, 0.0, 0.85), (-0.18, 0.02, 0.27)) * math.tan(math.radians(16.5))
+    assert float(right[0]) == pytest.approx(0.1 / depth, rel=0.02)
+    assert float(low[1]) > 0.15
+    assert abs(float(low[0])) < 0.01
+
+
+def test_a_second_look_is_aimed_at_where_the_coarse_code_says():
+    torch.manual_seed(0)
+    trunk = GlimpseTrunk(torch.nn.Flatten(), 2, 12, 16)
+    images = torch.rand(300, 3, 2, 2)
+    # Places whose projections are linear in the picture.
+    places = torch.tensor([-0.18, 0.02, 0.27]) + torch.tensor([0.0, 0.01, 0.0]) * images[:, :1, 0, 0]
+    assert trunk.aim(images, places) < 0.01
+    assert trunk(torch.rand(2, 3, 2, 2)).shape == (2, 16)
+    assert keypoint_trunk()(torch.rand(2, 3, 32, 32)).shape == (2, 256)
+
+
+def test_the_first_look_gets_a_smaller_picture():
+    trunk, pictures = keypoint_trunk().eval(), torch.rand(2, 3, 224, 224)
+    smaller = torch.nn.functional.interpolate(pictures, (112, 112), mode="area")
+    torch.testing.assert_close(trunk(pictures), trunk(smaller))
+
+
+@pytest.fixture(scope="module")
+def readings():
+    """Three demos of an arm at a constant rate, read without bias: a filter must follow."""
+    torch.manual_seed(0)
+    motion = ArmMotion(FACTS)
+    motion.damping.data.fill_(12.0)  # rates last
+    state = torch.cat([states(3), 0.01 * torch.randn(3, 7)], -1)
+    path = [state]
+    with torch.no_grad():
+        state[:, 7:10] = motion.place(state[:, :7])
+        for _ in range(39):
+            path.append(motion(path[-1]))
+    path = torch.stack(path, 1)
+    sensor = SENSORS["keypoints"].build(FACTS, 32)
+    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 11)
+    encoding = torch.zeros(3, 40, 64)
+    td = TensorDict({"state": path[..., :10], "motion": path, "action": path[..., :7]}, [3, 40])
+    td["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [3, 40])
+    td["observed"] = torch.ones(3, 40, 1, dtype=torch.bool)
+    return sensor, motion, td
+
+
+@pytest.mark.parametrize("name", sorted(FILTERS))
+def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right(name, readings):
+    sensor, motion, td = readings
+    kind = FILTERS[name]
+    own = ArmMotion(FACTS, actions=True) if kind.actions else motion
+    torch.manual_seed(0)
+    recipe = kind(copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, own, ERRORS)
+    model = recipe.build()
+    out = run_filter(recipe, model, td)
+    assert out["belief", "mean"].shape[-1] >= 10
+    assert torch.isfinite(out["belief", "mean"]).all()
+    if name in ("dekf", "dukf", "bkf", "denkf", "adenkf"):  # the others must be trained first
+        scores = errors(out["belief", "mean"][..., :10], td["state"])
+        assert scores["joint_mae_deg"] < 2.0, scores  # the start is 1 to 3 degrees off, in rates, too
+    wide = copy.deepcopy(model)
+    recipe.set_inflation(wide, 1.5)
+    tempered = run_filter(recipe, wide, td)
+    if ("belief", "log_weight") in out.keys(True):  # more of the particles count
+        less, more = (each["belief", "log_weight"][:, 10:].mul(2).logsumexp(-1).mean() for each in (tempered, out))
+        assert less < more
+    if name != "dpf_m_lrn":  # whose likelihood, untrained, does not prefer what is near
+        spread = [float(each["belief", "var"][:, 10:, :10].log().mean()) for each in (out, tempered)]
+        assert spread[1] > spread[0]
+
+
+def test_localisation_keeps_covariances_and_the_gripper_apart():
+    state, reading = localisation(27)
+    assert torch.linalg.eigvalsh(reading).min() > -1e-6  # its product with a covariance is one (Schur)
+    assert torch.equal(state[17:], reading)  # biases
+    assert torch.equal(state[:7], state[10:17])  # rates go with their joints
+    gripper = [6, 16, 23]
+    arm = [index for index in range(27) if index not in gripper]
+    assert (state[arm, 6] == 0).all()
+    assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
+    assert (state[gripper, 6] == 1).all()
+    assert torch.equal(localisation(17)[0], state[:17])
+
+
+def test_a_head_on_features_is_the_sensor_on_pictures():
+    torch.manual_seed(0)
+    sensor = SENSORS["glimpse"].build(FACTS, 5).eval()
+    pixels = torch.rand(2, 3, 32, 32)
+    codes = TensorDict({"code": sensor.module["trunk"](sensor._prepare(pixels))}, [2])
+    sensor.module["head"].sample = False
+    whole = sensor(TensorDict({"pixels": pixels}, [2]))
+    head = sensor.module["head"].forward(codes["code"], sample=False)
+    torch.testing.assert_close(whole["sensor", "ensemble"][:, 0], sensor.loc + sensor.scale * head)
+    sensor.module["head"].sample = True
+    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 11)
+
+
+def test_a_belief_at_rest_is_padded():
+    from torch_denkf.modules import AroundState
+
+    initial = AtRest(AroundState(torch.zeros(27), ensemble_size=3), size=27)
+    state = states(2)
+    belief = initial(TensorDict({"state": state}, [2]))["belief", "mean"]
+    torch.testing.assert_close(belief, torch.cat([state, torch.zeros(2, 17)], -1))

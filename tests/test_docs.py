@@ -1,0 +1,49 @@
+"""The pages: each of their Python blocks runs, by itself, and each file that they name exists.
+
+A reader copies one block, not a page: a block gets a namespace of its own, and must import what it uses. In front of a
+block that cannot run here stands ``<!-- not run: why -->``.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from torch_denkf.transforms import DEnKFTransform
+
+ROOT = Path(__file__).parents[1]
+WITHOUT = ("README.md",)
+PAGES = sorted(path for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")] if "_build" not in path.parts)
+BLOCK = re.compile(r"(?:^<!-- not run: (?P<why>.+?) -->\n+)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
+FILE = re.compile(r"`((?:torch_denkf|tests|examples|benchmarks|docs)/[\w./-]+\.\w+)`")
+
+
+def name(path):
+    return str(path.relative_to(ROOT))
+
+
+def blocks():
+    for path in PAGES:
+        text = path.read_text()
+        for match in BLOCK.finditer(text) if name(path) not in WITHOUT else ():
+            line = text.count("\n", 0, match.start("code"))
+            marks = [pytest.mark.skip(reason=match["why"])] if match["why"] else []
+            yield pytest.param(path, line, match["code"], id=f"{name(path)}:{line}", marks=marks)
+
+
+@pytest.mark.parametrize(("path", "line", "code"), list(blocks()))
+def test_block_runs(path, line, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile("\n" * line + code, str(path), "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("path", [page for page in PAGES if page.is_relative_to(ROOT / "docs")], ids=name)
+def test_named_files_exist(path):
+    assert [file for file in FILE.findall(path.read_text()) if not (ROOT / file).exists()] == []
+
+
+def test_table_of_the_transform_names_its_own_methods():
+    text = (ROOT / "docs" / "_ext" / "reference_pages.py").read_text()
+    named = set(re.findall(r"^ +``(\w+)``  ", text, re.MULTILINE))
+    assert len(named) > 10
+    assert named <= set(vars(DEnKFTransform))

@@ -1,0 +1,97 @@
+"""Oracles: the minimum of a parabola, the standard deviation behind Gaussian errors, readings held by hand."""
+
+import pytest
+import torch
+
+from torch_denkf.metrics import interval_coverage
+from torch_denkf.modules import EnsembleAnalysis
+from torch_denkf.training import choose, choose_for_coverage, hold_last
+
+# ------------------------------------------------------------------------------------------------------- one number
+
+
+@pytest.mark.parametrize(("lowest", "best"), [(0.3, 0.5), (1.2, 1.0), (9.0, 2.0)])
+def test_the_best_candidate_is_returned_and_left_set(lowest, best):
+    tried = []
+    found = choose([0.5, 1.0, 2.0], tried.append, lambda: (tried[-1] - lowest) ** 2)
+    assert found == best
+    assert tried == [0.5, 1.0, 2.0, best]
+
+
+def test_of_equally_good_candidates_the_first_wins():
+    tried = []
+    assert choose([3.0, 1.0, 2.0], tried.append, lambda: 1.0) == 3.0
+
+
+def test_a_setting_that_fails_never_wins():
+    tried = []
+    assert choose([1.0, 2.0], tried.append, lambda: float("nan") if tried[-1] == 1.0 else 5.0) == 2.0
+    with pytest.raises(ValueError, match=r"none of the candidates has a finite error: \{1.0: nan, 2.0: inf\}"):
+        choose([1.0, 2.0], tried.append, lambda: float("nan") if tried[-1] == 1.0 else float("inf"))
+    with pytest.raises(ValueError, match="none of the candidates"):
+        choose([], tried.append, lambda: 0.0)
+
+
+def test_errors_are_taken_without_gradients():
+    assert choose([1.0], lambda value: None, lambda: float(torch.is_grad_enabled()) + 1) == 1.0
+    assert torch.is_grad_enabled()
+
+
+@pytest.mark.parametrize("spread", [0.5, 1.0, 1.5])
+def test_the_factor_that_a_gaussian_was_made_with_is_found(spread):
+    truth = spread * torch.randn(20_000, 2)
+    analysis = EnsembleAnalysis("sensor")
+
+    def coverage():
+        variance = torch.full_like(truth, analysis.inflation**2)
+        return interval_coverage(torch.zeros_like(truth), variance, truth, level=0.9)
+
+    candidates = [0.5, 0.75, 1.0, 1.25, 1.5]
+    assert choose_for_coverage(candidates, lambda factor: setattr(analysis, "inflation", factor), coverage) == spread
+    assert analysis.inflation == spread
+
+
+def test_distances_of_all_dimensions_count():
+    """0.9 on average, but from 0.8 and 1.0: further off than 0.88 in both."""
+    covered = {1.0: torch.tensor([0.8, 1.0]), 2.0: torch.tensor([0.88, 0.88])}
+    now = []
+    assert choose_for_coverage([1.0, 2.0], now.append, lambda: covered[now[-1]]) == 2.0
+    assert choose_for_coverage([1.0, 2.0], now.append, lambda: covered[now[-1]].mean()) == 1.0
+
+
+def test_a_level_that_is_no_share_is_refused():
+    with pytest.raises(ValueError, match="got 90"):
+        choose_for_coverage([1.0], lambda value: None, lambda: torch.tensor(0.9), level=90)
+
+
+# -------------------------------------------------------------------------------------------------------- hold last
+
+
+def test_what_is_not_seen_holds_the_last_reading():
+    values = torch.tensor([[[1.0], [2.0], [3.0], [4.0]]])
+    seen = torch.tensor([[[False], [True], [False], [True]]])
+    assert hold_last(values, seen, torch.tensor([[9.0]])).flatten().tolist() == [9.0, 2.0, 2.0, 4.0]
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_dimensions_are_held_each_by_itself_in_any_batch(batch):
+    values, seen = torch.randn(*batch, 7, 2), torch.rand(*batch, 7, 2) < 0.5
+    start = torch.randn(*batch, 2)
+    held = hold_last(values, seen, start)
+    rows = zip(
+        values.movedim(-2, -1).flatten(0, -2),
+        seen.movedim(-2, -1).flatten(0, -2),
+        start.flatten(),
+        held.movedim(-2, -1).flatten(0, -2),
+        strict=True,
+    )
+    for value, mask, last, found in rows:
+        for now, there, result in zip(value, mask, found, strict=True):
+            last = now if there else last
+            assert result == last
+
+
+def test_readings_that_are_not_accepted_are_not_held():
+    values, seen = torch.tensor([[1.0], [9.0], [2.0]]), torch.ones(3, 1, dtype=torch.bool)
+    held = hold_last(values, seen, torch.zeros(1), lambda step, last: (values[step] - last).abs() < 5)
+    assert held.flatten().tolist() == [1.0, 1.0, 2.0]

@@ -1,0 +1,74 @@
+"""A part that is trained alone: its file, what a second call does, and which parameters a stage leaves out."""
+
+from collections import OrderedDict
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+
+from torch_denkf.training import Stage, parameters_without, read_checkpoint, train_part
+
+
+def line_stage(net, updates=150):
+    def loss(batch):
+        return {"loss": (net(batch["x"]) - (3 * batch["x"] + 1)).square().mean()}
+
+    def sample(generator, _):
+        return TensorDict({"x": torch.rand(32, 1, generator=generator)}, [32])
+
+    return Stage("line", loss, sample, updates, lr=0.2)
+
+
+def test_a_part_is_trained_once_and_then_read(tmp_path):
+    first = nn.Linear(1, 1)
+    assert train_part(first, line_stage(first), out=tmp_path, device="cpu") is first
+    assert first.weight.item() == pytest.approx(3.0, abs=0.05)
+    assert first.bias.item() == pytest.approx(1.0, abs=0.05)
+    saved = read_checkpoint(tmp_path / "line.pt")["line"]
+    assert torch.equal(saved["weight"], first.weight)
+
+    def never(generator, _):
+        raise AssertionError("the part was trained already")
+
+    again = nn.Linear(1, 1)
+    train_part(again, Stage("line", lambda batch: {}, never, 150), out=tmp_path, device="cpu")
+    assert torch.equal(again.weight, first.weight)
+    assert torch.equal(again.bias, first.bias)
+
+
+def test_a_training_that_was_broken_off_ends_as_an_unbroken_one(tmp_path):
+    """Of 20 updates 8 are saved when the training fails in the 11th."""
+    results = {}
+    for name in ("whole", "broken"):
+        torch.manual_seed(0)
+        net = nn.Linear(1, 1)
+        stage, settings = line_stage(net, 20), {"out": tmp_path / name, "device": "cpu", "save_every": 4}
+        if name == "broken":
+            left = [10]
+
+            def fail_once(generator, length, sample=stage.sample, left=left):
+                left[0] -= 1
+                if left[0] == -1:
+                    raise KeyboardInterrupt
+                return sample(generator, length)
+
+            breaking = Stage("line", stage.loss, fail_once, 20, lr=0.2)
+            with pytest.raises(KeyboardInterrupt):
+                train_part(net, breaking, **settings)
+            assert not (tmp_path / name / "line.pt").exists()
+            net.weight.data.zero_()  # as a fresh process would not know it
+        results[name] = train_part(net, stage, **settings).weight.clone()
+    assert torch.equal(results["whole"], results["broken"])
+
+
+def test_modules_that_are_left_out_keep_their_parameters():
+    model = TensorDictSequential(
+        OrderedDict((name, TensorDictModule(nn.Linear(1, 1), ["x"], ["x"])) for name in ("sensor", "noise", "analysis"))
+    )
+    found = parameters_without(model, ["noise"])
+    expected = [*model.module["sensor"].parameters(), *model.module["analysis"].parameters()]
+    assert [id(p) for p in found] == [id(p) for p in expected]
+    with pytest.raises(KeyError, match=r"no module \['noises'\]; it has \['sensor', 'noise', 'analysis'\]"):
+        parameters_without(model, ["noises"])

@@ -1,0 +1,85 @@
+"""A sensor, then a filter, then both: training of one part, and the parameters of some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tensordict.nn import TensorDictSequential
+from torch import nn
+
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
+from torch_denkf.training.stage import Stage
+from torch_denkf.training.trainer import FilterTrainer
+
+__all__ = ["parameters_without", "train_part"]
+
+M = TypeVar("M", bound=nn.Module)
+
+
+def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
+    """Trains one part of a filter by itself, or reads it where that was done before.
+
+    A study trains its sensor like this before it trains filters on what the sensor reads.
+
+    Args:
+        part: e.g. a sensor or a motion model; trained in place.
+        stage: what is fitted; its name names the file ``out/<name>.pt`` with the finished part.
+        out: folder; a training that was broken off goes on from there.
+        **settings: of :class:`FilterTrainer`.
+
+    Returns:
+        the part.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> net, out = nn.Linear(1, 1), mkdtemp()  # to become 2 x
+        >>> loss = lambda batch: {"loss": (net(batch["x"]) - 2 * batch["x"]).square().mean()}
+        >>> sample = lambda generator, length: TensorDict({"x": torch.rand(8, 1, generator=generator)}, [8])
+        >>> trained = train_part(net, Stage("line", loss, sample, updates=200, lr=0.1), out=out, device="cpu")
+        >>> again = train_part(nn.Linear(1, 1), Stage("line", loss, sample, updates=200), out=out)  # reads it
+        >>> torch.equal(trained.weight, again.weight)
+        True
+    """
+    file = Path(out) / f"{stage.name}.pt"
+    if file.exists():
+        part.load_state_dict(read_checkpoint(file)[stage.name])
+        return part
+    trainer = FilterTrainer(nn.ModuleDict({stage.name: part}), [stage], out=out, **settings)
+    trainer.fit()
+    if trainer.processes.is_main:
+        write_checkpoint(file, {stage.name: part.state_dict()})
+    return part
+
+
+def parameters_without(model: TensorDictSequential, names: Iterable[str]) -> list[nn.Parameter]:
+    """Parameters of a filter without those of some of its modules: what a stage trains while these stay as they are.
+
+    Args:
+        model: a filter, or another one with named modules.
+        names: of the modules to leave out, as in ``model[name]``.
+
+    Returns:
+        the parameters, in the model's order.
+
+    Raises:
+        KeyError: if the model has no module of a name.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from collections import OrderedDict
+        >>> line = lambda: TensorDictModule(nn.Linear(1, 1), ["x"], ["x"])
+        >>> model = TensorDictSequential(OrderedDict(sensor=line(), noise=line()))
+        >>> len(parameters_without(model, ["noise"])), len(parameters_without(model, []))
+        (2, 4)
+    """
+    names = list(names)
+    modules = dict(model.module.named_children())
+    strange = sorted(set(names) - modules.keys())
+    if strange:
+        raise KeyError(f"the filter has no module {strange}; it has {list(modules)}.")
+    left_out = {id(parameter) for name in names for parameter in modules[name].parameters()}
+    return [parameter for parameter in model.parameters() if id(parameter) not in left_out]
