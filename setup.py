@@ -46,7 +46,7 @@ setup(
         "tqdm>=4.60",
     ],
     extras_require={
-        # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobotExperienceReplay alone.
+        # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobot and own recordings.
         "lerobot": ["pyarrow>=15", "av>=14"],
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],

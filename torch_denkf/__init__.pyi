@@ -1,9 +1,13 @@
 from .data.kitti.replay import KITTIOdometryExperienceReplay
-from .data.lerobot.replay import LeRobotExperienceReplay
+from .data.lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
+from .data.recordings.frames import Images, Video
+from .data.recordings.replay import Recording, RecordingReplay
+from .data.recordings.tables import Table
 from .data.ur5.replay import UR5ExperienceReplay
 from .deployment import PackagedStep, export_step, load_step
 from .envs.kitti import KITTIReplayEnv
 from .envs.linear import LinearGaussianEnv
+from .envs.replay import ReplayEnv
 from .envs.ur5.expert import UR5Expert
 from .envs.ur5.table import UR5TableEnv
 from .filters import (
@@ -48,12 +52,14 @@ __all__ = [
     "Filter",
     "FilterTrainer",
     "GaussianLoss",
+    "Images",
     "KITTIOdometryExperienceReplay",
     "KITTIReplayEnv",
     "KalmanFilter",
     "LSTMFilter",
     "LastAction",
     "LeRobotExperienceReplay",
+    "LeRobotReplay",
     "LinearGaussianEnv",
     "MissingFrames",
     "MixtureParticleFilter",
@@ -64,14 +70,19 @@ __all__ = [
     "PFM",
     "PackagedStep",
     "ParticleFilter",
+    "Recording",
+    "RecordingReplay",
+    "ReplayEnv",
     "SaltAndPepper",
     "SensorLoss",
     "Stage",
+    "Table",
     "TransitionLoss",
     "UKF",
     "UR5ExperienceReplay",
     "UR5Expert",
     "UR5TableEnv",
+    "Video",
     "export_step",
     "load_step",
 ]

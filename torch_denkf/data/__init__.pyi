@@ -1,3 +1,4 @@
+from .episodes import Episode
 from .kitti.drive import list_kitti_drives, read_kitti_drive
 from .kitti.frames import drive_frames, frames_at, sample_windows
 from .kitti.gaps import bridge_gaps, steps_between
@@ -5,16 +6,30 @@ from .kitti.mirror import mirror_drive
 from .kitti.motion import with_motion
 from .kitti.render import random_drive, render_drives, roadside_scene, write_drives
 from .kitti.replay import KITTIOdometryExperienceReplay
-from .lerobot.replay import LeRobotExperienceReplay
+from .lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
 from .lerobot.rows import recording_from_rows
+from .options import ReplayOptions
+from .recordings.frames import Images, Video
+from .recordings.replay import Recording, RecordingReplay
+from .recordings.tables import Table
+from .replay import EpisodeReplay
 from .systems import lorenz96_step, lorenz96_tendency
 from .trajectories import write_trajectory
 from .ur5.replay import UR5ExperienceReplay
 
 __all__ = [
+    "Episode",
+    "EpisodeReplay",
+    "Images",
     "KITTIOdometryExperienceReplay",
     "LeRobotExperienceReplay",
+    "LeRobotReplay",
+    "Recording",
+    "RecordingReplay",
+    "ReplayOptions",
+    "Table",
     "UR5ExperienceReplay",
+    "Video",
     "bridge_gaps",
     "drive_frames",
     "frames_at",

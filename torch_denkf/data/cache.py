@@ -15,6 +15,22 @@ def _cache_directory() -> Path:
     return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
 
 
+def cache_folder(cache: str | Path | bool | None) -> Path | None:
+    """The folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
+    if cache is None or cache is False:
+        return None
+    return _cache_directory() if cache is True else Path(cache).expanduser()
+
+
+def stamp(file: Path) -> tuple[int, int]:
+    """Time in ns and size in bytes of a file, by which a cache knows it again; (-1, -1) where there is none."""
+    try:
+        status = file.stat()
+    except FileNotFoundError:  # its reader says what is missing
+        return (-1, -1)
+    return (status.st_mtime_ns, status.st_size)
+
+
 def _cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
     """Load a cache entry, or read it into memory and store it."""
     stored = _load(entry)

@@ -1,131 +1,219 @@
-"""What the data sets share: episodes one behind the other, cut into slices, with pixels that are made when sampled."""
+"""The base of all data sets: episodes one behind the other, cut into slices, with pixels that are made when sampled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
-from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
+from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
+from torch_denkf.data.options import ReplayOptions, check_options, sampler_of
+from torch_denkf.data.slices import refuse_short_episodes, slices_of
+from torch_denkf.data.statistics import mean_and_std
 
-def choose_sampler(
-    sampler: Sampler | None, num_slices: int | None, slice_len: int | None, strict_length: bool
-) -> Sampler | None:
-    """A sampler of slices of episodes, if they are asked for, or else the one that was passed.
+__all__ = ["EpisodeReplay"]
 
-    Raises:
-        ValueError: if more than one of ``sampler``, ``num_slices`` and ``slice_len`` is passed.
-    """
-    if num_slices is None and slice_len is None:
-        return sampler
-    if sampler is not None or (num_slices is not None and slice_len is not None):
-        raise ValueError("pass one of num_slices, slice_len and sampler; the sampler may cut slices itself")
-    return SliceSampler(
-        num_slices=num_slices, slice_len=slice_len, traj_key="episode", cache_values=True, strict_length=strict_length
-    )
-
-
-def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
-    """Flags of rows: ``is_init`` where ``first``, truncated and done where ``last``, never terminated; no done at root.
-
-    Args:
-        first: bool ``[n, 1]``: the row begins an episode.
-        last: bool ``[n, 1]``: it ends one.
-
-    Examples:
-        >>> row = torch.arange(3).unsqueeze(-1)
-        >>> flags = episode_flags(row == 0, row == 2)
-        >>> flags["is_init"].flatten(), flags["next"]["truncated"].flatten(), flags["done"].any()
-        (tensor([ True, False, False]), tensor([False, False,  True]), tensor(False))
-    """
-    never = torch.zeros_like(first)
-    done = {"done": last, "truncated": last.clone(), "terminated": never.clone()}
-    return {"is_init": first, **{key: never.clone() for key in done}, "next": TensorDict(done, first.shape[:1])}
-
-
-def whole_episode(count: int) -> dict[str, Any]:
-    """Flags of the rows of one episode, see :func:`episode_flags`."""
-    row = torch.arange(count).unsqueeze(-1)
-    return episode_flags(row == 0, row == count - 1)
+Pictures = Callable[[Tensor], Mapping[str, Tensor]]
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
-    """A read-only replay buffer of episodes that lie one behind the other.
+    """A read-only replay buffer of episodes: the base of all data sets, which share keys, splits and options.
 
-    A subclass sets ``root`` before it calls the constructor, and writes ``_is_downloaded``, ``_say_short`` and
-    ``_not_ours``.
+    ===================== ============ ===========================================================================
+    key                   shape        content
+    ===================== ============ ===========================================================================
+    ``episode``           [n]          int64, a number in ``episodes``
+    ``step``              [n,1]        int64, the row within its episode, from 0
+    ``time``              [n,1]        float64, s since the episode's begin
+    ``state``             [n,S]        float32, the truth, where it is known
+    readings              [n,...]      such as ``pixels`` [n,C,H,W] float32, ``action`` [n,A], ``flow``, ``road``; an
+                                       action is that which was sent in this row and leads to the next
+    ``observed``          [n,1]        bool: the row has a picture; what is missing is zero in ``pixels``
+    ``is_init``           [n,1]        bool: the first row of an episode, or of a slice
+    ``next``: ``done``,   [n,1]        bool: ``truncated`` and ``done`` in the last row of an episode, or of a slice;
+    ``truncated``,                     never ``terminated``. The three at the root are False.
+    ``terminated``
+    ===================== ============ ===========================================================================
+
+    The next observation is the next row's. The buffer stores numbers alone; pixels become float32 when rows are
+    sampled.
+
+    **Samples.** With slices of equal length, ``sample()`` is ``[B, T]``: B slices of T rows, as filters and losses take
+    them. Single rows are ``[n]``. With ``strict_length=False``, where slices may differ in length, they come one behind
+    the other in a flat ``[n]``, and ``is_init`` marks where each begins. ``data[index]`` has the index's shape.
+
+    A stage of :class:`~torch_denkf.training.FilterTrainer` takes ``sample=lambda generator, length: data.sample()``:
+    the trainer seeds what the sampler draws. Leave ``prefetch`` out where a training is to be resumed exactly.
+
+    **Splits** are by episode. A hash of its number or name decides what an episode is for, so that those added later
+    move none. ``"train"`` holds all episodes that are not for tests; with a ``validation_share`` it leaves this share
+    of them out, and ``"validation"`` holds them. Pass the same share to both.
+
+    :class:`~torch_denkf.envs.ReplayEnv` replays any data set as an environment.
 
     Args:
-        rows: what is stored, ``[n]``, with ``"episode"``.
-        episodes: what these rows are, each with a ``length``.
-        frames: adds to sampled rows what is not stored in them.
-        sampler: see :func:`choose_sampler`.
-        batch_size: rows of a sample.
-        writer: by default one that refuses to write.
-        transform: applied to each sample after ``frames``.
-        **kwargs: of torchrl's buffers.
+        rows: numbers of the whole data set, ``[N]``, with ``step`` and ``time``; the rows of an episode follow each
+            other.
+        episodes: all of it, in the order of the rows.
+        for_tests: whether an episode is for tests.
+        pictures: maps numbers of ``rows``, int64 ``[m]``, to what is not stored in them, ``[m, ...]`` each.
+        single: bool ``[N]``: only these rows are offered, each on its own (``is_init`` and done in all).
+        root: the folder that was read; None for data that came from elsewhere.
+        **options:
+            split: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
+            validation_share: of the episodes that are not for tests, in [0, 1); none by default.
+            batch_size: rows of a sample, over all slices.
+            num_slices: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence.
+            slice_len: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
+            strict_length: False lets episodes that are shorter than a slice come as short slices.
+            sampler: by default slices if they are asked for, else single rows at random.
+            writer: by default one that refuses to write.
+            collate_fn: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
+            pin_memory: whether samples are pinned.
+            prefetch: samples to prepare in advance, by threads.
+            transform: applied to each sample after the pixels are made, in the sample's shape. A slice's own begin
+                and end are marked after it.
+            cache: folder of decoded pictures; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``; None
+                or False for none: all pictures are then in memory. Entries may be deleted at any time.
+            progress: whether a bar shows what is decoded.
+
+    Attributes:
+        episodes: what each ``"episode"`` is: an :class:`~torch_denkf.data.Episode` with its name, first row and length.
+        sequential: False where ``single`` rows are offered, which do not follow each other.
 
     Raises:
-        ValueError: if episodes are shorter than the sampler's slices.
+        TypeError: for an option that there is not.
+        KeyError: for rows without ``step`` or ``time``.
+        ValueError: for options out of range or that contradict each other, episodes that do not fit the rows, a split
+            without episodes, and episodes that are shorter than the sampler's slices.
+
+    Examples:
+        >>> import torch
+        >>> step = torch.arange(10).repeat(3).unsqueeze(-1)
+        >>> rows = TensorDict({"step": step, "time": step * 0.1, "state": torch.rand(30, 2)}, [30])
+        >>> episodes = [Episode(name, 10 * k, 10) for k, name in enumerate("abc")]
+        >>> for_tests = lambda episode: episode.name == "b"
+        >>> data = EpisodeReplay(rows, episodes, for_tests=for_tests, num_slices=4, slice_len=5)
+        >>> [(episode.name, episode.start) for episode in data.episodes]
+        [('a', 0), ('c', 10)]
+        >>> data.sample()["state"].shape, data.statistics["state", "mean"].shape
+        (torch.Size([4, 5, 2]), torch.Size([2]))
     """
+
+    #: Readings whose statistics are numbers of the rows.
+    _numbers: Sequence[str] = ("state", "action")
 
     def __init__(
         self,
         rows: TensorDictBase,
-        episodes: Sequence[Any],
-        frames: Transform,
+        episodes: Sequence[Episode],
         *,
-        sampler: Sampler | None,
-        batch_size: int | None,
-        writer: Writer | None,
-        transform: Transform | Callable | None,
-        **kwargs,
+        for_tests: Callable[[Any], bool],
+        pictures: Pictures | None = None,
+        single: Tensor | None = None,
+        root: Path | None = None,
+        **options: Unpack[ReplayOptions],
     ):
-        self.episodes = tuple(episodes)
-        self._check_lengths(sampler, batch_size)
-        self._frames = frames
+        check_options(options)
+        sampler, batch_size = sampler_of(options)
+        self.sequential = single is None
+        if not self.sequential and isinstance(sampler, SliceSampler):
+            raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")
+        self.root: Path | None = root
+        check_rows(rows, episodes)
+        self._all_rows, self._all_episodes = rows, tuple(episodes)
+        self._roles = roles_of(self._all_episodes, for_tests, options.get("validation_share", 0.0))
+        split = options.get("split", "train")
+        chosen = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if split in ("all", role)]
+        if not chosen:
+            raise ValueError(
+                f"none of the {len(self._all_episodes)} episodes {self._source} is in the split {split!r}, as a hash "
+                "of their names has it; pass split='all', or add episodes"
+            )
+        stored, self.episodes = select_episodes(rows, chosen, single)
+        refuse_short_episodes(self.episodes, sampler, batch_size)
+        self._add_pictures = _AddPictures(pictures)
+        writer, transform = options.get("writer"), options.get("transform")
         super().__init__(
-            storage=TensorStorage(rows),
+            storage=TensorStorage(stored),
             sampler=sampler,
+            sample_unit=slices_of(sampler),
             writer=ImmutableDatasetWriter() if writer is None else writer,
             batch_size=batch_size,
-            transform=frames,
-            **kwargs,
+            transform=self._add_pictures,
+            collate_fn=options.get("collate_fn"),
+            pin_memory=options.get("pin_memory", False),
+            prefetch=options.get("prefetch"),
         )
         if transform is not None:
             self.append_transform(transform)
 
-    def _check_lengths(self, sampler: Sampler | None, batch_size: int | None) -> None:
-        """TorchRL's samplers leave short episodes out without a word; here, that is a mistake."""
-        if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
-            return
-        length = sampler.slice_len
-        if length is None:
-            length = None if batch_size is None else batch_size // sampler.num_slices
-        short = [episode for episode in self.episodes if length is not None and episode.length < length]
-        if short:
-            raise ValueError(
-                f"slices have {length} rows, but {self._say_short(short)} pass shorter slices, or strict_length=False "
-                "for slices that may be shorter"
-            )
-
-    def _say_short(self, short: Sequence[Any]) -> str:
-        """Which episodes are shorter than a slice, for a message, up to what to do about it."""
-        raise NotImplementedError
+    @property
+    def _source(self) -> str:
+        return "in memory" if self.root is None else f"in {self.root}"
 
     @property
-    def _not_ours(self) -> str:
-        """Why the data set does not delete its files, for a message."""
-        raise NotImplementedError
+    def _training_index(self) -> Tensor:
+        """Rows of the training episodes, numbered in the whole data set, ``[n]``."""
+        training = [e for e, role in zip(self._all_episodes, self._roles, strict=True) if role == "train"]
+        if not training:
+            raise ValueError(f"none of the episodes {self._source} is in the training split; add episodes")
+        return rows_of(training)
+
+    @cached_property
+    def statistics(self) -> TensorDict:
+        """Means and standard deviations over the **training** episodes, whichever split and rows this data set has.
+
+        They standardise what a network reads and predicts, and tell it nothing about other episodes.
+
+        ========================== ============ ======================================================================
+        key                        shape        of
+        ========================== ============ ======================================================================
+        ``("state", "mean")``      [S]          all rows, likewise ``std``; a joint that never moves has a ``std`` of 0
+        ``("action", "mean")``     [A]          where there are actions, likewise ``std``
+        ``("pixels", "mean")``     [C,1,1]      each channel, over rows whose picture is there, likewise ``std``
+        ========================== ============ ======================================================================
+
+        Standard deviations divide by the number of values. Readings that come with a mask, ``NAME_observed``, count
+        where it is True. The pixels' are computed once, by a pass over all pictures.
+
+        Raises:
+            ValueError: if no episode is in the training split.
+        """
+        index = self._training_index
+        statistics = self._number_statistics(self._all_rows.select(*self._numbers_with_masks, strict=False)[index])
+        pixels = self._picture_statistics(index)
+        if pixels is not None:
+            statistics["pixels"] = pixels
+        return TensorDict(statistics).float()
+
+    @property
+    def _numbers_with_masks(self) -> list[str]:
+        return [key for name in self._numbers for key in (name, f"{name}_observed")]
+
+    def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
+        """Statistics of numbers of the training rows."""
+        statistics = {}
+        for key in self._numbers:
+            if key in rows:
+                mask = rows.get(f"{key}_observed", None)
+                statistics[key] = mean_and_std(rows[key] if mask is None else rows[key][mask.squeeze(-1)])
+        return statistics
+
+    def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
+        """Statistics of the pixels of some rows of the whole data set; None without pictures."""
+        return None
+
+    def _is_downloaded(self) -> bool:
+        return self.root is None or self.root.is_dir()
 
     @property
     def data_path(self) -> Path | None:
@@ -143,12 +231,45 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         Raises:
             RuntimeError: always.
         """
-        raise RuntimeError(self._not_ours)
+        raise RuntimeError(f"the recordings {self._source} were not written by this data set; delete them by hand")
+
+    def __getstate__(self) -> dict[str, Any]:
+        # TorchRL shares a storage's counters with processes that it spawns, which fails inside of what it pickles for
+        # workers of environments. Nothing is written here, so that each process may have a storage of its own.
+        writer = copy(self._writer)
+        writer.register_storage(None)
+        return {**super().__getstate__(), "_storage": self._storage.get(slice(None)), "_writer": writer}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        storage = TensorStorage(state["_storage"])
+        state["_writer"].register_storage(storage)
+        super().__setstate__({**state, "_storage": storage})
 
     def preprocess(self, fn: Callable[[TensorDictBase], TensorDictBase], *args, **kwargs) -> TensorStorage:
         """TorchRL's ``preprocess``: ``fn`` sees rows with their pixels, and what it returns is stored in ``dest``."""
-        return super().preprocess(partial(_then, self._frames, fn), *args, **kwargs)
+        return super().preprocess(partial(_then, self._add_pictures, fn), *args, **kwargs)
 
 
 def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBase:
     return fn(first(rows))
+
+
+class _AddPictures(Transform):
+    """Adds to rows of the buffer what is not stored in them.
+
+    Args:
+        pictures: see :class:`EpisodeReplay`.
+    """
+
+    def __init__(self, pictures: Pictures | None):
+        super().__init__()
+        self.pictures = pictures
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The same rows, with pictures."""
+        tensordict = tensordict.copy()  # data[:] hands out the storage itself
+        row = tensordict.pop(ROW)
+        if self.pictures is not None:
+            for key, value in self.pictures(row.reshape(-1)).items():
+                tensordict.set(key, value.reshape(*tensordict.batch_size, *value.shape[1:]))
+        return tensordict

@@ -1,7 +1,16 @@
 from .kitti import KITTIReplayEnv
 from .linear import LinearGaussianEnv
+from .replay import RecordedPolicy, ReplayEnv
 from .ur5.collect import collect_ur5_demos
 from .ur5.expert import UR5Expert
 from .ur5.table import UR5TableEnv
 
-__all__ = ["KITTIReplayEnv", "LinearGaussianEnv", "UR5Expert", "UR5TableEnv", "collect_ur5_demos"]
+__all__ = [
+    "KITTIReplayEnv",
+    "LinearGaussianEnv",
+    "RecordedPolicy",
+    "ReplayEnv",
+    "UR5Expert",
+    "UR5TableEnv",
+    "collect_ur5_demos",
+]

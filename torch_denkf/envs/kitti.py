@@ -9,16 +9,16 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded
 
 from torch_denkf.data.kitti.drive import read_kitti_drive
-from torch_denkf.data.kitti.frames import MOTION_KEYS, frames_at
+from torch_denkf.data.kitti.frames import frames_at
+from torch_denkf.envs.rows import RowsEnv
 
 __all__ = ["KITTIReplayEnv"]
 
 
-class KITTIReplayEnv(EnvBase):
+class KITTIReplayEnv(RowsEnv):
     """Replays sub-sequences of one KITTI drive, one for each element of the batch, in lockstep.
 
     Emits, at reset and at each step, the row t of the drive exactly as :func:`torch_denkf.data.drive_frames` has it:
@@ -101,17 +101,14 @@ class KITTIReplayEnv(EnvBase):
             raise TypeError("name the sequence to replay, such as sequence='09'; list_kitti_drives(folder) lists them")
         else:
             drive = read_kitti_drive(drive, sequence, camera=camera, size=size, colour=colour, cache=cache)
-        super().__init__(batch_size=torch.Size(batch_size), device=device)
+        super().__init__(batch_size, seed, device)
         self.drive = drive if device is None else drive.to(device)
         self.dt = float(drive["dt"][0])  # s
-        self._set_episodes(start, length)
-        self._set_specs()
-        self.rng = torch.Generator()
-        self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
-        self._first = self._starts.clone()
-        self._now = self._starts.clone()
+        self._set_stretches(start, length)
+        shape = frames_at(self.drive, self._starts).get("pixels", torch.zeros(0)).shape
+        self._set_specs(self._starts, pixels=Bounded(low=-1.0, high=1.0, shape=shape, dtype=torch.float32))
 
-    def _set_episodes(self, start, length) -> None:
+    def _set_stretches(self, start, length) -> None:
         rows, where = self.drive.batch_size[0], self.drive["state"].device
         self._random = isinstance(start, str)
         if self._random and start != "random":
@@ -127,53 +124,9 @@ class KITTIReplayEnv(EnvBase):
             )
         self._starts, self._lengths, self._rows = begin, frames, rows
 
-    def _set_specs(self) -> None:
-        shape, emitted = self.batch_size, frames_at(self.drive, self._starts)
-        flag = Binary(shape=(*shape, 1), dtype=torch.bool)
-        seen = {key: Unbounded(emitted[key].shape, dtype=torch.float32) for key in MOTION_KEYS if key in emitted}
-        if "pixels" in emitted:
-            seen["pixels"] = Bounded(low=-1.0, high=1.0, shape=emitted["pixels"].shape, dtype=torch.float32)
-        if "steps" in emitted:
-            seen["steps"] = Unbounded((*shape, 1), dtype=torch.int64)
-        self.observation_spec = Composite(
-            **seen,
-            observed=flag.clone(),
-            state=Unbounded((*shape, 5), dtype=torch.float32),
-            is_init=flag.clone(),
-            time=Unbounded((*shape, 1), dtype=torch.float64),
-            shape=shape,
-        )
-        self.action_spec = Unbounded((*shape, 0), dtype=torch.float32)
-        self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32)
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
+    def _rows_at(self, row: Tensor) -> TensorDict:
+        return frames_at(self.drive, row)
 
-    def _set_seed(self, seed: int | None) -> None:
-        self.rng.manual_seed(0 if seed is None else seed)
-
-    def _begin(self) -> Tensor:
-        if not self._random:
-            return self._starts
-        draw = torch.rand(self.batch_size, generator=self.rng, dtype=torch.float64).to(self._starts.device)
-        last = self._rows - self._lengths
-        return (draw * (last + 1)).long().minimum(last)
-
-    def _emit(self) -> TensorDict:
-        out = frames_at(self.drive, self._now)
-        truncated = (self._now >= self._first + self._lengths - 1).unsqueeze(-1)
-        is_init = (self._now == self._first).unsqueeze(-1)
-        flags = {"done": truncated, "truncated": truncated.clone(), "terminated": torch.zeros_like(truncated)}
-        return out.update({"is_init": is_init, **flags})
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            mask = torch.ones(*self.batch_size, 1, dtype=torch.bool)
-        mask = mask.to(self._starts.device).reshape(self.batch_size)
-        self._first = torch.where(mask, self._begin(), self._first)
-        self._now = torch.where(mask, self._first, self._now)
-        return self._emit()
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        # A row that is stepped after its end stays there, truncated.
-        self._now = torch.minimum(self._now + 1, self._first + self._lengths - 1)
-        return self._emit().set("reward", torch.zeros(*self.batch_size, 1, device=self._now.device))
+    def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
+        first = self._draw(self._rows - self._lengths + 1) if self._random else self._starts
+        return first, first + self._lengths - 1

@@ -12,7 +12,7 @@ from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
 import torch_denkf.data.kitti.drive as kitti_module
-from tests.data.replay_for_tests import check_slices, counting_bars, ways_to_slice
+from tests.data import replay_for_tests as shared
 from torch_denkf.data import (
     KITTIOdometryExperienceReplay,
     drive_frames,
@@ -64,12 +64,10 @@ def test_all_rows(root):
     ]
     assert len(data) == 2 * (14 + 2 * 9 + 2 * 23)
     rows = data[:]
-    assert rows["episode"].shape == (len(data),)
-    for number, episode in enumerate(data.episodes):
+    for episode in data.episodes:
         mine = rows[episode.start : episode.start + episode.length]
         frames, drive = expected_rows(root, episode)
-        assert (mine["episode"] == number).all()
-        for key in (*KEYS, "is_init"):
+        for key in KEYS:
             torch.testing.assert_close(mine[key], frames[key], rtol=0, atol=0)
         for key in ("frame", "dt"):
             assert (mine[key] == drive[key]).all()
@@ -77,20 +75,14 @@ def test_all_rows(root):
         if episode.mirrored:
             calibration[:, 2] = 35 - calibration[:, 2]
         assert (mine["calibration"] == calibration).all()
-        end = [False] * (episode.length - 1) + [True]
-        assert mine["next", "done"].flatten().tolist() == mine["next", "truncated"].flatten().tolist() == end
-        assert not mine["next", "terminated"].any()
-        assert not (mine["done"] | mine["truncated"] | mine["terminated"]).any()
-    assert data.episodes[-1].start + data.episodes[-1].length == len(data)
-    assert data[5].batch_size == ()
-    assert (data[5]["pixels"] == rows["pixels"][5]).all()
-    assert data[torch.tensor([70, 3, 3])]["state"].equal(rows["state"][[70, 3, 3]])
+    shared.check_contract(data)
+    shared.check_indices(data)
 
 
-@pytest.mark.parametrize("options", ways_to_slice())
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_episode(root, options):
     # 18 + 8 + 36 windows fit in the drives and as many in their mirror images.
-    check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "frame", KEYS)
+    shared.check_slices(open_dataset(root, mirrored=True, **{"batch_size": 24, **options}), options, "step", KEYS)
 
 
 def test_single_rows(root):
@@ -110,7 +102,7 @@ def test_single_rows(root):
 def test_statistics_by_hand(root):
     """Of the training drives alone: numpy, from the PNGs of those two drives."""
     data = open_dataset(root, ["hill", "town"])
-    frames, differences, velocities = [], [], []
+    frames, differences, states = [], [], []
     for name in ("hill", "town"):
         before = None
         for k in range(LENGTHS[name]):
@@ -121,14 +113,14 @@ def test_statistics_by_hand(root):
                 if before is not None:
                     differences.append(image - before)
             before = image
-        velocities.append(read_kitti_drive(root, name, cache=None)["state"][:, 3:].double().numpy())
-    velocities, both = np.concatenate(velocities), [np.stack(frames), np.stack(differences)]
+        states.append(read_kitti_drive(root, name, cache=None)["state"].numpy())
+    states, both = np.concatenate(states), [np.stack(frames), np.stack(differences)]
     assert [len(part) for part in both] == [14 + 22, 13 + 20]
     statistics = data.statistics
     for name, function in (("mean", np.mean), ("std", np.std)):
         expected = np.concatenate([function(part, axis=(0, 1, 2)) for part in both])
         np.testing.assert_allclose(statistics["pixels", name].flatten(), expected, atol=2e-6)
-        np.testing.assert_allclose(statistics["velocity", name], function(velocities, axis=0), rtol=1e-5)
+    shared.check_statistics(statistics, velocity=states[:, 3:], state=states)
     assert statistics["pixels", "mean"].shape == (6, 1, 1)
     others = open_dataset(root).statistics
     assert abs(others["velocity", "mean"][0] - statistics["velocity", "mean"][0]) > 0.01  # the lane would count
@@ -180,7 +172,7 @@ def test_flow(root, tmp_path):
     assert "pixels" not in light[:]
     assert light[:]["flow"].equal(rows["flow"])
     assert light[:]["calibration"].equal(rows["calibration"])
-    assert set(light.statistics.keys()) == {"velocity"}
+    assert set(light.statistics.keys()) == {"state", "velocity"}
     short = open_dataset(root, ["lane", "town"], mirrored=True, flow=True, cache=tmp_path / "cache")
     assert (short[:] == rows).all()
     assert len(list(tmp_path.glob("cache/motion-*"))) == 2
@@ -206,7 +198,7 @@ def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypa
 
 
 def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
-    bars = counting_bars(monkeypatch)
+    bars = shared.counting_bars(monkeypatch)
     open_dataset(root, "hill", cache=tmp_path)
     assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
     open_dataset(root, "hill", cache=tmp_path)  # from the cache: no bar
@@ -223,21 +215,10 @@ def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
 
 def test_it_deletes_nothing_of_the_users(root):
     data = open_dataset(root, "lane")
-    with pytest.raises(RuntimeError, match="delete them by hand"):
-        data.delete()
-    assert data.data_path == data.data_path_root == data.root == root
+    shared.check_nothing_is_deleted(data)
+    assert data.root == root
     assert (root / "sequences/lane/image_2/000000.png").is_file()
-    with pytest.raises(RuntimeError):
-        data.extend(data[:2])
-
-
-def darkness(rows):
-    return rows.select("episode", "state").set("dark", 1 - rows["pixels"][..., :3, :, :].mean((-3, -2, -1)))
 
 
 def test_preprocess_sees_pixels(root, tmp_path):
-    data = open_dataset(root, "lane", mirrored=True)
-    storage = data.preprocess(darkness, num_workers=1, mp_start_method="fork", dest=tmp_path)
-    rows = data[:]
-    torch.testing.assert_close(storage[:]["dark"], 1 - rows["pixels"][:, :3].mean((1, 2, 3)))
-    assert storage[:]["state"].equal(rows["state"])
+    shared.check_preprocess(open_dataset(root, "lane", mirrored=True), tmp_path)

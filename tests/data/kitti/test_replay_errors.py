@@ -75,7 +75,7 @@ def test_drives_shorter_than_a_slice(tmp_path):
     root = tmp_path
     for name, frames in (("hill", 14), ("lane", 9), ("town", 23)):
         make(root, sequence=name, images=range(frames), poses=range(frames))
-    message = r"slices have 15 rows, but these drives are shorter: {'hill/image_2': 14, 'lane/image_2': 9}; leave them"
+    message = r"slices have 15 rows, but 2 episodes are shorter: {'hill/image_2': 14, 'lane/image_2': 9}; pass"
     fails(ValueError, message, root, batch_size=30, num_slices=2)
     fails(ValueError, message, root, batch_size=30, slice_len=15)
     fails(ValueError, message, root, batch_size=30, sampler=SliceSampler(num_slices=2))
@@ -85,6 +85,6 @@ def test_drives_shorter_than_a_slice(tmp_path):
         ends = sample["next", "truncated"].flatten().nonzero().flatten() + 1
         lengths = ends.diff(prepend=torch.zeros(1, dtype=torch.int64))
         assert lengths.tolist() == [min(15, data.episodes[k].length) for k in sample["episode"][ends - 1]]
-    assert len(open_dataset(root, "town", batch_size=30, num_slices=2).sample()) == 30
-    for wrong in ({"num_slices": 2, "slice_len": 3}, {"num_slices": 2, "sampler": SliceSampler(num_slices=2)}):
-        fails(ValueError, "pass one of num_slices, slice_len and sampler", root, **wrong)
+    assert open_dataset(root, "town", batch_size=30, num_slices=2).sample().shape == (2, 15)
+    fails(ValueError, "either a sampler", root, num_slices=2, sampler=SliceSampler(num_slices=2))
+    fails(ValueError, "num_slices=2 times slice_len=3 is 6 rows", root, num_slices=2, slice_len=3, batch_size=7)

@@ -55,6 +55,8 @@ def test_a_drive_that_starts_later(tmp_path):
     assert [episode.length for episode in data.episodes] == [4, 4]
     rows = data[:]
     assert rows["frame"].flatten().tolist() == [2, 3, 4, 5] * 2
+    assert rows["step"].flatten().tolist() == [0, 1, 2, 3] * 2
+    assert rows["time"][[0, 4]].flatten().tolist() == [0, 0]
     values = (255 * rows["pixels"][:, :, 5, 7]).round().int().tolist()
     assert values == [[100 + k, 50 + k, k, *[int(k > 2)] * 3] for k in (2, 3, 4, 5)] * 2
 
@@ -82,7 +84,8 @@ def test_real_frames(tmp_path):
     assert [(e.camera, e.mirrored, e.length) for e in data.episodes] == [
         (camera, mirrored, 40) for camera in ("image_0", "image_1") for mirrored in (False, True)
     ]
-    batch = data.sample().reshape(4, 10)
+    batch = data.sample()
+    assert batch.shape == (4, 10)
     for row in batch:
         episode = data.episodes[row["episode"][0]]
         drive_rows = read_kitti_drive(tmp_path, drive, camera=episode.camera, colour=False, cache=None)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict import MemoryMappedTensor
-from torchrl.data import SamplerWithoutReplacement, SliceSampler
+from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
 import torch_denkf.data.lerobot.recording as recording_module
+from tests.data import replay_for_tests as shared
 from tests.data.lerobot.lerobot_folder import (
     NAMES,
     SIZE,
@@ -23,11 +24,11 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_2,
     write_version_3,
 )
-from tests.data.replay_for_tests import counting_bars
-from torch_denkf.data import LeRobotExperienceReplay
+from torch_denkf.data import LeRobotReplay
 
 LENGTHS = [9, 6, 12, 7, 8]
-open_all = partial(LeRobotExperienceReplay, size=SIZE, cache=None, split="all")
+TESTS = {4, 8, 11, 19, 24}  # of 25 episodes
+open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +55,8 @@ def check_rows(data, lengths, tolerance=0.0):
         assert (mine["state"].numpy() == joints(episode.number, length)).all()
         assert (mine["action"].numpy() == actions(episode.number, length)).all()
         np.testing.assert_allclose(mine["time"].flatten(), np.arange(length) / 10, atol=1e-7)  # float32 in the file
-        assert mine["time"].dtype == torch.float64
-        assert mine["frame"].flatten().tolist() == list(range(length))
-        assert (mine["episode"] == episode.number).all()
         assert mine["observed"].all()
-        assert mine["is_init"].flatten().tolist() == [True] + [False] * (length - 1)
-        end = [False] * (length - 1) + [True]
-        assert mine["next", "done"].flatten().tolist() == mine["next", "truncated"].flatten().tolist() == end
-        assert not mine["next", "terminated"].any()
-        assert not (mine["done"] | mine["truncated"] | mine["terminated"]).any()
+    shared.check_contract(data)
 
 
 # What is read ---------------------------------------------------------------------------------------------------------
@@ -74,9 +68,7 @@ def test_version_2_with_lossless_video(root):
     check_rows(data, LENGTHS)
     assert data.fps == 10
     assert data.names == tuple(NAMES)
-    assert data[5].batch_size == ()
-    assert data[5]["pixels"].equal(data[:]["pixels"][5])
-    assert data[torch.tensor([30, 3, 3])]["pixels"].equal(data[:]["pixels"][[30, 3, 3]])
+    shared.check_indices(data)
 
 
 # Neighbouring frames differ by 14/255 in red. Lossy codecs keep flat colours and soft ramps to within 6/255 (measured:
@@ -138,6 +130,7 @@ def test_splits_are_by_episode_and_stay(tmp_path):
     assert len(sets["test"]) == 5
     assert not sets["train"] & sets["test"]
     assert sets["train"] | sets["test"] == sets["all"] == set(range(25))
+    assert sets["test"] == TESTS  # these must never move: networks were trained on the others
     assert len({number % 5 for number in sets["test"]}) > 1  # not each fifth: recordings often go round objects
     test = open_all(tmp_path, split="test")
     for episode in test.episodes:
@@ -149,101 +142,72 @@ def test_splits_are_by_episode_and_stay(tmp_path):
     fewer = {e.number for e in open_all(tmp_path, split="test").episodes}
     assert fewer == {number for number in sets["test"] if number < 12}
     (tmp_path / "meta/episodes.jsonl").write_text(next(lines[k] for k in range(5) if k not in sets["test"]))
-    with pytest.raises(ValueError, match=r"split 'test' has none of the episodes .*pass split='all'"):
+    with pytest.raises(ValueError, match=r"none of the 1 episodes in .* is in the split 'test', .*pass split='all'"):
         open_all(tmp_path, split="test")
 
 
-@pytest.mark.parametrize(
-    "options", [{"num_slices": 4}, {"slice_len": 6}, {"sampler": SliceSampler(num_slices=4)}, {"prefetch": 2}]
-)
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_episode(root, options):
-    if "prefetch" in options:
-        options = {"slice_len": 6, **options}
-    data = open_all(root, batch_size=24, **options)
-    rows, starts = data[:], set()
-    for _ in range(30):
-        flat = data.sample()
-        batch, index = flat.reshape(4, 6), flat["index"].reshape(4, 6)
-        assert (batch["episode"] == batch["episode"][:, :1]).all()
-        assert (batch["frame"].diff(dim=1) == 1).all()
-        assert (index.diff(dim=1) == 1).all()
-        for key in ("pixels", "state", "action", "time"):
-            assert batch[key].equal(rows[key][index]), key
-        assert batch["is_init"].squeeze(-1).tolist() == [[True] + [False] * 5] * 4
-        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * 5 + [True]] * 4
-        starts |= set(index[:, 0].tolist())
-    possible = {e.start + k for e in data.episodes for k in range(e.length - 5)}
-    assert starts <= possible
-    assert len(starts) > 0.75 * len(possible)  # 4 + 1 + 7 + 2 + 3 windows, 120 draws
+    shared.check_slices(
+        open_all(root, **{"batch_size": 24, **options}), options, "step", ("pixels", "state", "action", "time")
+    )
 
 
 def test_each_row_once(root):
-    data = LeRobotExperienceReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
+    data = LeRobotReplay(root, size=SIZE, cache=None, batch_size=6, sampler=SamplerWithoutReplacement())
     seen = torch.cat([batch["index"].flatten() for batch in data])
     assert sorted(seen.tolist()) == list(range(len(data)))
     assert len(data) < sum(LENGTHS)
 
 
 def test_statistics_by_numpy(root):
-    data = LeRobotExperienceReplay(root, size=SIZE, cache=None)  # the training split
+    data = LeRobotReplay(root, size=SIZE, cache=None)  # the training split
     which = [e.number for e in data.episodes]
     assert len(which) == 4
-    parts = {
-        "state": np.concatenate([joints(e, LENGTHS[e]) for e in which]).astype(np.float64),
-        "action": np.concatenate([actions(e, LENGTHS[e]) for e in which]).astype(np.float64),
-        "pixels": np.concatenate([pictures(e, LENGTHS[e]) for e in which]).reshape(-1, 3) / 255,
-    }
-    for key, values in parts.items():
-        for name, function in (("mean", np.mean), ("std", np.std)):
-            found = data.statistics[key, name].flatten()
-            np.testing.assert_allclose(found, function(values, axis=0), rtol=2e-6, atol=1e-7)
+    shared.check_statistics(
+        data.statistics,
+        state=np.concatenate([joints(e, LENGTHS[e]) for e in which]),
+        action=np.concatenate([actions(e, LENGTHS[e]) for e in which]),
+        pixels=np.concatenate([pictures(e, LENGTHS[e]) for e in which]).reshape(-1, 3) / 255,
+    )
     assert data.statistics["pixels", "mean"].shape == (3, 1, 1)
     assert data.statistics["state", "std"][2] == 0  # a joint that never moves
-    everything = open_all(root).statistics
-    assert (
-        abs(everything["state", "mean"][0] - data.statistics["state", "mean"][0]) > 0.01
-    )  # the test split would count
+    everything = open_all(root)  # its statistics are those of the training episodes, too
+    assert (everything.statistics == data.statistics).all()
+    assert abs(everything[:]["state"][:, 0].mean() - data.statistics["state", "mean"][0]) > 0.01
 
 
 def test_transforms_and_preprocess_see_the_pixels(root, tmp_path):
     data = open_all(root, transform=lambda rows: rows.set("half", rows["pixels"] / 2), batch_size=4)
     sample = data.sample()
     assert sample["half"].equal(sample["pixels"] / 2)
-    storage = open_all(root).preprocess(brightness, num_workers=1, mp_start_method="fork", dest=tmp_path)
-    torch.testing.assert_close(storage[:]["mean"], data[:]["pixels"].mean((1, 2, 3)))
-
-
-def brightness(rows):
-    return rows.select("episode").set("mean", rows["pixels"].mean((-3, -2, -1)))
+    shared.check_preprocess(open_all(root), tmp_path)
 
 
 def test_it_deletes_and_writes_nothing(root):
     data = open_all(root)
-    with pytest.raises(RuntimeError, match="delete it by hand"):
-        data.delete()
-    with pytest.raises(RuntimeError):
-        data.extend(data[:2])
-    assert data.data_path == data.data_path_root == root.resolve()
+    shared.check_nothing_is_deleted(data)
+    assert data.root == root.resolve()
 
 
 # Cache and bar --------------------------------------------------------------------------------------------------------
 
 
 def test_the_second_open_reads_the_cache(root, tmp_path, monkeypatch):
-    first = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
+    first = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
     assert len(list(tmp_path.iterdir())) == 1  # no temporary file stays
     with monkeypatch.context() as patch:
         patch.setattr(recording_module, "frames_at_times", None)
         patch.setattr(recording_module, "read_table", None)
-        again = LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split="all")
-        parts = [LeRobotExperienceReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
-    assert isinstance(again._recording["image"], MemoryMappedTensor)
-    assert again._recording["image"].dtype == torch.uint8
+        again = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
+        parts = [LeRobotReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
+    assert isinstance(again._images, MemoryMappedTensor)
+    assert again._images.dtype == torch.uint8
     assert "pixels" not in again._storage[:]
     assert (again[:] == first[:]).all()
     check_rows(again, LENGTHS)
     assert sum(len(part) for part in parts) == sum(LENGTHS)
-    LeRobotExperienceReplay(root, size=(24, 32), cache=tmp_path)
+    LeRobotReplay(root, size=(24, 32), cache=tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -258,7 +222,7 @@ def test_changed_files_are_read_anew(tmp_path):
 
 
 def test_a_bar_counts_frames(root, tmp_path, monkeypatch):
-    bars = counting_bars(monkeypatch)
+    bars = shared.counting_bars(monkeypatch)
     open_all(root, cache=tmp_path)
     open_all(root, cache=tmp_path)  # from the cache: no bar
     open_all(root, progress=False)

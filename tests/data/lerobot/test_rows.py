@@ -11,7 +11,7 @@ from torchrl.data.datasets.openx import _format_data, _StreamingStorage
 from torchrl.data.video import VideoClipRef
 
 import torch_denkf.data.lerobot.rows as rows_module
-from torch_denkf.data import LeRobotExperienceReplay, recording_from_rows
+from torch_denkf.data import LeRobotReplay, recording_from_rows
 
 SIZE = (12, 16)
 LENGTHS = [5, 7, 4, 6, 8]
@@ -59,7 +59,7 @@ def check(data, stored, images):
     parts = [stored[key].reshape(TOTAL, -1) for key in ACTIONS]
     torch.testing.assert_close(rows["action"], torch.cat(parts, -1), rtol=0, atol=0)
     frames = torch.cat([torch.arange(length) for length in LENGTHS])
-    assert rows["frame"].flatten().equal(frames)
+    assert rows["step"].flatten().equal(frames)
     torch.testing.assert_close(rows["time"].flatten(), frames / 5.0, check_dtype=False)
     assert rows["episode"].equal(stored["episode"].long())
     assert rows["observed"].all()
@@ -76,14 +76,15 @@ def test_open_x_as_torchrl_opens_it(stored, tmp_path, monkeypatch):
     stored.memmap(tmp_path / "berkeley_autolab_ur5")
     replay = OpenXExperienceReplay("berkeley_autolab_ur5", root=tmp_path, download=False, streaming=False)
     recording = recording_from_rows(replay, names=tuple("abc"), folder=tmp_path / "frames", **OPTIONS)
-    data = LeRobotExperienceReplay(recording, split="all", slice_len=4, batch_size=12)
+    data = LeRobotReplay(recording, split="all", slice_len=4, batch_size=12)
     check(data, stored, stored["observation", "image"])
     assert (data.fps, data.names, data.data_path) == (5.0, tuple("abc"), None)
     assert not list((tmp_path / "frames").iterdir())  # the file has no name, so that nothing has to remove it
-    batch = data.sample().reshape(3, 4)
+    batch = data.sample()
+    assert batch.shape == (3, 4)
     assert (batch["episode"] == batch["episode"][:, :1]).all()
-    assert (batch["frame"].diff(dim=1) == 1).all()
-    with pytest.raises(RuntimeError, match="recording in memory is not this data set's"):
+    assert (batch["step"].diff(dim=1) == 1).all()
+    with pytest.raises(RuntimeError, match="recordings in memory were not written"):
         data.delete()
 
 
@@ -92,23 +93,21 @@ def test_images_that_fit_are_not_copied(stored, tmp_path):
     recording = recording_from_rows(mapped, **OPTIONS)
     assert isinstance(recording.rows["image"], MemoryMappedTensor)
     assert recording.rows["image"].data_ptr() == mapped["observation", "image"].data_ptr()
-    check(LeRobotExperienceReplay(recording, split="all"), stored, stored["observation", "image"])
+    check(LeRobotReplay(recording, split="all"), stored, stored["observation", "image"])
 
 
 def test_channels_behind_sizes_and_floats(stored):
     hand = ("observation", "hand_image")
     channels_first = stored[hand].permute(0, 3, 1, 2)
     recording = recording_from_rows(stored, pixels_key=hand, **OPTIONS)
-    check(LeRobotExperienceReplay(recording, split="all"), stored, channels_first)
+    check(LeRobotReplay(recording, split="all"), stored, channels_first)
     recording = recording_from_rows(stored, pixels_key=hand, size=(6, 8), **OPTIONS)
     scaled = [cv2.resize(frame, (8, 6), interpolation=cv2.INTER_AREA) for frame in stored[hand].numpy()]
-    check(
-        LeRobotExperienceReplay(recording, split="all"), stored, torch.from_numpy(np.stack(scaled)).permute(0, 3, 1, 2)
-    )
+    check(LeRobotReplay(recording, split="all"), stored, torch.from_numpy(np.stack(scaled)).permute(0, 3, 1, 2))
     rows = stored.clone()
     rows[hand] = stored[hand].float() / 255
     recording = recording_from_rows(rows, pixels_key=hand, **OPTIONS)
-    check(LeRobotExperienceReplay(recording, split="all"), stored, channels_first)
+    check(LeRobotReplay(recording, split="all"), stored, channels_first)
 
 
 def test_torchrls_lerobot_rows():
@@ -119,7 +118,7 @@ def test_torchrls_lerobot_rows():
         "episode_index": torch.tensor([7] * 5 + [4] * 3),
         "task": ["pick"] * 8,
     }
-    data = LeRobotExperienceReplay(recording_from_rows(VLAExperienceReplay.from_columns(columns), fps=30), split="all")
+    data = LeRobotReplay(recording_from_rows(VLAExperienceReplay.from_columns(columns), fps=30), split="all")
     rows = data[:]
     assert rows["pixels"].equal(columns["observation.images.top"].float() / 255)
     assert rows["state"].equal(columns["observation.state"])
@@ -131,7 +130,7 @@ def test_rows_without_actions(stored):
     rows = stored.exclude("action")
     recording = recording_from_rows(rows, fps=5, state_key=("observation", "robot_state"))
     assert "action" not in recording.rows
-    assert "action" not in LeRobotExperienceReplay(recording).statistics
+    assert "action" not in LeRobotReplay(recording).statistics
 
 
 def test_errors(stored, monkeypatch):

@@ -10,12 +10,12 @@ from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
 
-from tests.data.replay_for_tests import check_slices, ways_to_slice
+from tests.data import replay_for_tests as shared
 from tests.data.ur5.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.data.ur5 import cache
 from torch_denkf.data.ur5.files import read_demo
-from torch_denkf.data.ur5.rows import split_of
+from torch_denkf.data.ur5.rows import is_for_tests
 from torch_denkf.simulation.ur5.names import TASKS
 
 open_dataset = partial(UR5ExperienceReplay, cache=None)
@@ -40,23 +40,15 @@ def test_all_rows(root):
         assert (mine["state"].numpy() == demo.state).all()
         assert (mine["action"].numpy() == demo.action).all()
         assert (mine["success"].squeeze(-1).numpy() == demo.success).all()
-        assert (mine["episode"] == number).all()
         assert (mine["task"] == number % 3).all()
-        assert mine["step"].flatten().tolist() == list(range(episode.length))
+        np.testing.assert_allclose(mine["time"].flatten(), 0.08 * np.arange(episode.length), rtol=1e-12)
         assert mine["observed"].flatten().nonzero().flatten().tolist() == demo.steps.tolist()
         assert mine["pixels"].dtype == torch.float32
         pixels = np.zeros((episode.length, 3, *SIZE), np.float32)
         pixels[demo.steps] = demo.pixels.astype(np.float32) / 255
         assert (mine["pixels"].numpy() == pixels).all()
-        assert mine["is_init"].flatten().tolist() == [True] + [False] * (episode.length - 1)
-        end = [False] * (episode.length - 1) + [True]
-        assert mine["next", "done"].flatten().tolist() == mine["next", "truncated"].flatten().tolist() == end
-    assert not rows["next", "terminated"].any()
-    assert not (rows["done"] | rows["truncated"] | rows["terminated"]).any()
-    assert data.episodes[-1].start + data.episodes[-1].length == len(data)
-    assert data[5].batch_size == ()
-    assert (data[5]["pixels"] == rows["pixels"][5]).all()
-    assert data[torch.tensor([70, 3, 3])]["pixels"].equal(rows["pixels"][[70, 3, 3]])
+    shared.check_contract(data)
+    shared.check_indices(data)
 
 
 def test_frames_only(root):
@@ -81,7 +73,7 @@ def test_splits_are_by_demo(root, tmp_path):
     assert demos["test"]
     assert not demos["train"] & demos["test"]
     # A fifth of 2,000 is 400; the standard deviation of a binomial draw is 18.
-    tests = [number for number in range(2000) if split_of(number) == "test"]
+    tests = [number for number in range(2000) if is_for_tests(number)]
     assert abs(len(tests) - 400) < 54
     # These must never move: networks were trained on the others.
     assert tests[:6] == [9, 12, 15, 19, 26, 31]
@@ -91,23 +83,20 @@ def test_splits_are_by_demo(root, tmp_path):
     assert {e.demo for e in open_dataset(fewer, split="test").episodes} == set(tests[:3])
 
 
-@pytest.mark.parametrize("options", ways_to_slice())
+@pytest.mark.parametrize("options", shared.ways_to_slice())
 def test_slices_are_contiguous_and_in_one_demo(root, options):
     data = open_dataset(root, split="all", **{"batch_size": 24, **options})
-    check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
+    shared.check_slices(data, options, "step", ("pixels", "state", "action", "observed", "step"))
 
 
 def test_statistics_are_of_the_training_demos_alone(root):
     train = [e.demo for e in open_dataset(root).episodes]
     demos = [make_demo(number, LENGTHS[number]) for number in train]
-    state = np.concatenate([demo.state for demo in demos]).astype(np.float64)
-    pixels = np.concatenate([demo.pixels for demo in demos]) / 255
+    state, action = (np.concatenate([getattr(demo, name) for demo in demos]) for name in ("state", "action"))
+    pixels = np.concatenate([demo.pixels for demo in demos]).transpose(0, 2, 3, 1).reshape(-1, 3) / 255
     for split, frames_only in [("train", False), ("test", False), ("all", True)]:
         statistics = open_dataset(root, split=split, frames_only=frames_only).statistics
-        np.testing.assert_allclose(statistics["state", "mean"], state.mean(0), rtol=1e-6)
-        np.testing.assert_allclose(statistics["state", "std"], state.std(0), rtol=1e-6)
-        np.testing.assert_allclose(statistics["pixels", "mean"].flatten(), pixels.mean((0, 2, 3)), rtol=1e-6)
-        np.testing.assert_allclose(statistics["pixels", "std"].flatten(), pixels.std((0, 2, 3)), rtol=1e-6)
+        shared.check_statistics(statistics, state=state, action=action, pixels=pixels)
     shape = tuple(statistics["pixels", "std"].shape)
     assert shape == (3, 1, 1)
 
@@ -142,8 +131,7 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "read_demo", count)
     first = UR5ExperienceReplay(folder, split="all", cache=place)
     assert len(decoded) == 1 + 4  # the first one also tells the size
-    stored = first._frames._stored
-    assert type(stored).__name__ == "MemoryMappedTensor"
+    assert type(first._frames["pixels"]).__name__ == "MemoryMappedTensor"
     decoded.clear()
     for split in ("all", "train"):
         again = UR5ExperienceReplay(folder, split=split, cache=place)
@@ -175,16 +163,8 @@ def test_transforms_and_preprocess(root, tmp_path):
     scale = ObservationNorm(loc=-1.0, scale=2.0, in_keys=["pixels"])
     plain, scaled = open_dataset(root, split="all"), open_dataset(root, split="all", transform=scale)
     torch.testing.assert_close(scaled[:9]["pixels"], 2 * plain[:9]["pixels"] - 1)
-    storage = plain.preprocess(_means, num_workers=1, mp_start_method="fork", dest=tmp_path / "means")
-    torch.testing.assert_close(storage[:]["mean"], plain[:]["pixels"].mean((-3, -2, -1))[:, None])
-    with pytest.raises(RuntimeError, match="by hand"):
-        plain.delete()
-    with pytest.raises(RuntimeError):
-        plain.extend(plain[:2])
-
-
-def _means(rows):
-    return rows.select("episode").set("mean", rows["pixels"].mean((-3, -2, -1)).unsqueeze(-1))
+    shared.check_preprocess(plain, tmp_path / "means")
+    shared.check_nothing_is_deleted(plain)
 
 
 def test_demos_without_pictures(tmp_path):
@@ -193,7 +173,7 @@ def test_demos_without_pictures(tmp_path):
     rows = data[:]
     assert "pixels" not in rows
     assert not rows["observed"].any()
-    assert list(data.statistics.keys()) == ["state"]
+    assert list(data.statistics.keys()) == ["state", "action"]
     assert len(UR5ExperienceReplay(tmp_path, split="all", cache=tmp_path / "cache")) == 32
     with pytest.raises(ValueError, match="no-pixels"):
         open_dataset(tmp_path, frames_only=True)

@@ -26,8 +26,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data.cache import _cache_directory, _cached
+from torch_denkf.data.cache import _cached, cache_folder, stamp
 from torch_denkf.data.kitti.files import read_calibration, read_poses, read_times, scale_calibration
+from torch_denkf.data.pictures import check_size, text_of_size
 from torch_denkf.vision.poses import poses_to_state
 
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
@@ -123,9 +124,7 @@ def read_kitti_drive(
     """
     root = Path(root).expanduser().resolve()
     sequence = f"{sequence:02d}" if isinstance(sequence, int) else sequence
-    height, width = (int(side) for side in size)
-    if height < 1 or width < 1:
-        raise ValueError(f"size is (height, width) in pixels and must be positive, got {tuple(size)}")
+    height, width = check_size(size)
     folder, poses = root / "sequences" / sequence, root / "poses" / f"{sequence}.txt"
     camera = _choose_camera(folder, camera)
     files = _frame_files(folder / camera)
@@ -135,22 +134,14 @@ def read_kitti_drive(
     def read() -> TensorDict:
         return _read(folder, poses, camera, files, (height, width), colour, progress)
 
-    if cache is None or cache is False:
+    directory = cache_folder(cache)
+    if directory is None:
         return read()
-    directory = _cache_directory() if cache is True else Path(cache).expanduser()
     texts = [poses, folder / "calib.txt", folder / "times.txt"]
     key = [_FORMAT, str(root), sequence, camera, height, width, colour]
-    key += [(path.name, *_stamp(path)) for path in [*texts, *files.values()]]
+    key += [(path.name, *stamp(path)) for path in [*texts, *files.values()]]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     return _cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return (-1, -1)
-    return (status.st_mtime_ns, status.st_size)
 
 
 def _choose_camera(folder: Path, camera: str | None) -> str:
@@ -222,8 +213,8 @@ def _read(
                     native, first_file = shape, files[number]
                 elif shape != native:
                     raise ValueError(
-                        f"{files[number]} is {_text(shape)}, but {first_file} is {_text(native)}; the images of a "
-                        "drive have one size, that of its calibration: scale this one or take it away"
+                        f"{files[number]} is {text_of_size(shape)}, but {first_file} is {text_of_size(native)}; the "
+                        "images of a drive have one size, that of its calibration: scale this one or take it away"
                     )
                 image[number - first], valid[number - first] = pixels, True
         except BaseException:
@@ -244,10 +235,6 @@ def _read(
         },
         batch_size=[rows],
     )
-
-
-def _text(size: tuple[int, int]) -> str:
-    return f"{size[1]} pixels wide and {size[0]} high"
 
 
 def _decode(file: Path, flags: int) -> np.ndarray | None:

@@ -11,6 +11,7 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 
 from torch_denkf._progress import progress_bar
+from torch_denkf.data.episodes import Episode
 from torch_denkf.data.kitti.drive import _frame_files, list_kitti_drives, read_kitti_drive
 from torch_denkf.data.kitti.motion import with_motion
 
@@ -18,22 +19,23 @@ PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))
 
 
 @dataclass(frozen=True)
-class Episode:
+class KITTIEpisode(Episode):
     """One drive as one camera saw it, or its mirror image.
 
     Attributes:
         drive: name of the sequence.
         camera: folder of the images.
         mirrored: whether left and right are exchanged.
-        start: the episode's first row in the data set.
-        length: its rows; they follow each other in time.
     """
 
     drive: str
     camera: str
     mirrored: bool
-    start: int
-    length: int
+
+    @property
+    def split_name(self) -> str:
+        """The drive: its cameras and mirror images are on the same side of a split."""
+        return self.drive
 
 
 def find_drives(root: Path, drives: Sequence[str | int] | str | int | None) -> list[str]:

@@ -9,7 +9,7 @@ import cv2
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_denkf.data.kitti.drive import _cache_directory, _cached
+from torch_denkf.data.cache import _cached, cache_folder
 from torch_denkf.data.kitti.gaps import steps_at
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
 
@@ -67,10 +67,10 @@ def with_motion(
     def compute() -> TensorDict:
         return _compute(drive, height)
 
-    if cache is None or cache is False:
+    directory = cache_folder(cache)
+    if directory is None:
         motion = compute()
     else:
-        directory = _cache_directory() if cache is True else Path(cache).expanduser()
         digest = hashlib.blake2b(f"{_FORMAT} {height} {tuple(drive['image'].shape)}".encode(), digest_size=10)
         for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
             digest.update(drive[key].contiguous().numpy().data)

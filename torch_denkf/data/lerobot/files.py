@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from torch_denkf.data.lerobot.video import EXTRA
+from torch_denkf.data.parquet import read_parquet
+from torch_denkf.data.pictures import decode_picture
 
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
 COMPLETE = "download the data set completely"
@@ -194,22 +194,9 @@ def read_table(file: Path, columns: list[str] | None = None):
         FileNotFoundError: without the file.
         ValueError: if it is damaged, or lacks a column.
     """
-    try:
-        import pyarrow as arrow
-        import pyarrow.parquet as parquet
-    except ImportError as error:
-        raise ImportError(f"LeRobot keeps its numbers in parquet files, which need pyarrow: {EXTRA}") from error
     if not file.is_file():
         raise FileNotFoundError(f"no {file}, which the data set's metadata names; {COMPLETE}")
-    try:
-        with parquet.ParquetFile(file) as opened:
-            there = opened.schema_arrow.names
-            missing = sorted(set(columns or ()) - set(there))
-            if missing:
-                raise ValueError(f"{file} lacks the columns {missing}; it has {there}")
-            return opened.read(columns)
-    except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"{file} is no complete parquet file ({error}); download it anew") from error
+    return read_parquet(file, columns)
 
 
 def rows_of_episode(table, episode: EpisodeFiles):
@@ -264,8 +251,4 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
         names += [f"images/{camera}/episode{m}{episode:06d}/frame{m}{frame:06d}.png" for m in "_-"]
         files = [root / name for name in names if name]
         data = next((file.read_bytes() for file in files if file.is_file()), b"")
-    # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
-    ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
-    complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete else None
-    return None if pixels is None else pixels[..., ::-1]
+    return decode_picture(data)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from tensordict import TensorDict
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.data.cache import _cache_directory, _cached
+from torch_denkf.data.cache import _cached, cache_folder, stamp
 from torch_denkf.data.lerobot.files import (
     EpisodeFiles,
     Layout,
@@ -26,14 +24,15 @@ from torch_denkf.data.lerobot.files import (
     rows_of_episode,
     vectors,
 )
-from torch_denkf.data.lerobot.video import frames_at_times
+from torch_denkf.data.pictures import image_store, scaled, text_of_size
+from torch_denkf.data.video import frames_at_times
 
 _FORMAT = 1  # part of the cache's key: raise it when what is stored changes
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What :class:`torch_denkf.data.LeRobotExperienceReplay` replays.
+class DecodedRecording:
+    """What :class:`torch_denkf.data.LeRobotReplay` replays.
 
     Attributes:
         rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,
@@ -60,7 +59,7 @@ def read_recording(
     size: tuple[int, int],
     cache: str | Path | bool | None,
     progress: bool,
-) -> Recording:
+) -> DecodedRecording:
     """Read all episodes of a LeRobot folder, or load them from the cache.
 
     Raises:
@@ -74,15 +73,15 @@ def read_recording(
     keys = {"state": state_key} if action_key is None else {"state": state_key, "action": action_key}
     widths = {name: layout.width(key) for name, key in keys.items()}
     names = layout.names(state_key)
-    if cache is None or cache is False:
-        return Recording(_read(layout, keys, widths, size, None, progress), layout.fps, names, root)
-    folder = _cache_directory() if cache is True else Path(cache).expanduser()
+    folder = cache_folder(cache)
+    if folder is None:
+        return DecodedRecording(_read(layout, keys, widths, size, None, progress), layout.fps, names, root)
     key = [_FORMAT, str(root), layout.camera, keys, layout.fps, *size]
-    key += [(str(file.relative_to(root)), *_stamp(file)) for file in _files(layout)]
+    key += [(str(file.relative_to(root)), *stamp(file)) for file in _files(layout)]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
     rows = _cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
-    return Recording(rows, layout.fps, names, root)
+    return DecodedRecording(rows, layout.fps, names, root)
 
 
 def _files(layout: Layout) -> list[Path]:
@@ -90,13 +89,6 @@ def _files(layout: Layout) -> list[Path]:
     if layout.episodes[0].video is None:
         files |= set((layout.root / "images" / layout.camera).rglob("*.png"))
     return sorted(files)
-
-
-def _stamp(file: Path) -> tuple[int, int]:
-    if not file.is_file():
-        return (-1, -1)  # the reader says what is missing
-    status = file.stat()
-    return status.st_mtime_ns, status.st_size
 
 
 class _Frames:
@@ -113,9 +105,8 @@ class _Frames:
         if self._native is None:
             self._native = image.shape[:2], source
         if image.shape[:2] != self._native[0]:
-            (h, w), (height, width) = image.shape[:2], self._native[0]
             raise ValueError(
-                f"{source} is {w} pixels wide and {h} high, but {self._native[1]} is {width} wide and {height} high; "
+                f"{source} is {text_of_size(image.shape)}, but {self._native[1]} is {text_of_size(self._native[0])}; "
                 "one camera has images of one size"
             )
         self.images[rows] = scaled(image, self.size)
@@ -124,31 +115,6 @@ class _Frames:
 
     def close(self) -> None:
         self._bar.close()
-
-
-def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
-    """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
-
-    Raises:
-        OSError: if the folder cannot be written to.
-    """
-    if folder is None:
-        return np.zeros((rows, 3, *size), np.uint8)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as file:
-            return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
-    except OSError as error:
-        raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
-
-
-def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``[H, W, 3]`` to ``[3, *size]``: averaged over areas where it shrinks."""
-    if image.shape[:2] != size:
-        shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
-        image = np.ascontiguousarray(image)
-        image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return image.transpose(2, 0, 1)
 
 
 def _read(

@@ -11,7 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-from torch_denkf.data.lerobot.recording import Recording, image_store, scaled
+from torch_denkf.data.lerobot.recording import DecodedRecording
+from torch_denkf.data.pictures import image_store, scaled
 
 __all__ = ["recording_from_rows"]
 
@@ -29,7 +30,7 @@ def recording_from_rows(
     size: tuple[int, int] | None = None,
     names: tuple[str, ...] | None = None,
     folder: str | Path | None = None,
-) -> Recording:
+) -> DecodedRecording:
     """Turn rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
 
     The defaults are the keys that most of the Open X-Embodiment sets have there, and those of
@@ -44,7 +45,7 @@ def recording_from_rows(
             action_key=[("action", name) for name in actions],
             size=(96, 128),
         )
-        replay = LeRobotExperienceReplay(recording, batch_size=64, slice_len=16)
+        replay = LeRobotReplay(recording, batch_size=64, slice_len=16)
 
     Args:
         rows: batch size ``[N]``, the rows of an episode one behind the other; or a replay buffer of such rows, which is
@@ -61,7 +62,7 @@ def recording_from_rows(
         folder: holds copied images in a file that goes with the recording; None keeps them in memory.
 
     Returns:
-        What :class:`torch_denkf.data.LeRobotExperienceReplay` takes instead of a folder. Times count from 0 in each
+        What :class:`torch_denkf.data.LeRobotReplay` takes instead of a folder. Times count from 0 in each
         episode.
 
     Raises:
@@ -123,7 +124,7 @@ def recording_from_rows(
             "frame": frame,
         }
     )
-    return Recording(out, float(fps), names)
+    return DecodedRecording(out, float(fps), names)
 
 
 def _get(rows: TensorDictBase, key: NestedKey) -> Tensor | TensorDictBase:
@@ -158,7 +159,7 @@ def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
     if not isinstance(value, Tensor):
         raise TypeError(
             f"{_text(key)} holds {type(value).__name__}, not images; decode them first, or pass the data set's "
-            "folder to LeRobotExperienceReplay"
+            "folder to LeRobotReplay"
         )
     if value.ndim == 4 and (value.dtype == torch.uint8 or value.dtype.is_floating_point):
         if value.shape[1] == 3:

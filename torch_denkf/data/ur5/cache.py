@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data.cache import _cache_directory, _cached_in_place
+from torch_denkf.data.cache import _cached_in_place, cache_folder
+from torch_denkf.data.pictures import check_size
 from torch_denkf.data.ur5.files import COMMAND, MANIFEST, Demo, Entry, read_demo, read_manifest
 from torch_denkf.simulation.ur5.names import TASKS
 
@@ -75,11 +76,10 @@ def read_demos(
         ValueError: if one was changed, is no demo, or is of another size than the first; or if ``size`` is larger.
         OSError: if the cache cannot be written.
     """
-    if size is not None and (len(size) != 2 or min(size) < 1):
-        raise ValueError(f"size is (height, width) in pixels and must be positive, got {size}")
-    if cache is None or cache is False:
+    size = None if size is None else check_size(size)
+    directory = cache_folder(cache)
+    if directory is None:
         return _read(root, entries, size, None, progress)
-    directory = _cache_directory() if cache is True else Path(cache).expanduser()
     key = json.dumps([_FORMAT, size, [astuple(entry) for entry in entries]])  # by content, wherever the folder lies
     name = "x".join(map(str, size)) if size else "stored"
     entry = directory / f"ur5-{len(entries)}-{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"

@@ -7,11 +7,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from torch_denkf.simulation.ur5.names import CONTROL_STEP
+
 __all__ = ["ARM_JOINTS", "CONTROL_STEP", "FULL_OPENING", "UR5Scene"]
 
 ASSET = Path(__file__).with_name("assets") / "ur5_table.xml"
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-CONTROL_STEP = 0.08  # s
 FULL_OPENING = 0.8  # rad: J7 of an open gripper, 85 mm between the fingers
 FINGER_TRAVEL = 0.0425  # m, each finger's
 JOINT_SPEED = np.pi * CONTROL_STEP  # rad a step: a UR5's joints turn 180 degrees a second

@@ -9,6 +9,10 @@ import cv2
 import numpy as np
 
 EXTRA = "pip install 'torch_denkf[lerobot]'"
+NOT_DECODED = (
+    "no frame of {} can be decoded: it is damaged (download or copy it anew), or in a codec that OpenCV here lacks, "
+    f"such as AV1 ({EXTRA} brings PyAV, which has it)"
+)
 
 
 def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -30,11 +34,11 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
         ValueError: if no frame of the file can be decoded.
     """
     if not file.is_file():
-        raise FileNotFoundError(f"no video {file}; download the data set completely, or pass another camera")
+        raise FileNotFoundError(f"no video {file}; download or copy it completely, or pass another camera")
     order = np.argsort(times, kind="stable")
     ordered, off = times[order], np.full(len(times), np.inf)
     any_decoded = False
-    for time, frame in _decoded(file):
+    for time, frame in decoded_frames(file):
         any_decoded = True
         if time > ordered[-1] + tolerance:
             break
@@ -45,13 +49,10 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
             off[near] = np.abs(times[near] - time)
             yield near, frame
     if not any_decoded:
-        raise ValueError(
-            f"no frame of {file} can be decoded: it is damaged (download it anew), or in a codec that OpenCV here "
-            f"lacks, such as AV1 ({EXTRA} brings PyAV, which has it)"
-        )
+        raise ValueError(NOT_DECODED.format(file))
 
 
-def _decoded(file: Path) -> Iterator[tuple[float, np.ndarray]]:
+def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
     """All frames that can be decoded, in the order in which they are shown."""
     capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
     try:

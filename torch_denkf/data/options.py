@@ -1,0 +1,71 @@
+"""The options that all data sets share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypedDict
+
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.writers import Writer
+from torchrl.envs.transforms import Transform
+
+from torch_denkf.data.episodes import Split
+from torch_denkf.data.slices import choose_sampler
+
+__all__ = ["ReplayOptions", "check_options", "sampler_of"]
+
+
+class ReplayOptions(TypedDict, total=False):
+    """What every data set's constructor takes beside its source; see :class:`torch_denkf.data.EpisodeReplay`."""
+
+    split: Split
+    validation_share: float
+    batch_size: int | None
+    num_slices: int | None
+    slice_len: int | None
+    strict_length: bool
+    sampler: Sampler | None
+    writer: Writer | None
+    collate_fn: Callable | None
+    pin_memory: bool
+    prefetch: int | None
+    transform: Transform | Callable | None
+    cache: str | Path | bool | None
+    progress: bool
+
+
+def check_options(options: Mapping[str, Any]) -> None:
+    """Refuses options that are wrong whatever the data are: reading these may take long.
+
+    Raises:
+        TypeError: for an option that there is not.
+        ValueError: for a split that there is not, a share out of range, and options that contradict each other.
+    """
+    unknown = sorted(set(options) - set(ReplayOptions.__annotations__))
+    if unknown:
+        raise TypeError(
+            f"data sets have no option {', '.join(unknown)}; there are {list(ReplayOptions.__annotations__)}"
+        )
+    split, share = options.get("split", "train"), options.get("validation_share", 0.0)
+    if split not in ("train", "validation", "test", "all"):
+        raise ValueError(f"split is 'train', 'validation', 'test' or 'all', got {split!r}")
+    if not 0 <= share < 1:
+        raise ValueError(f"validation_share is a share of the training episodes, in [0, 1), got {share}")
+    if split == "validation" and not share:
+        raise ValueError(
+            "split='validation' is empty without a validation_share; pass validation_share=0.1, and the same to the "
+            "data set with split='train', which then leaves these episodes out"
+        )
+    sampler_of(options)
+
+
+def sampler_of(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
+    """The sampler and the batch size that the options ask for, see :func:`torch_denkf.data.slices.choose_sampler`."""
+    return choose_sampler(
+        options.get("sampler"),
+        options.get("num_slices"),
+        options.get("slice_len"),
+        options.get("batch_size"),
+        options.get("strict_length", True),
+    )

@@ -1,0 +1,135 @@
+"""Pictures of one size: scaled when they are read, kept as bytes, handed out as numbers in [0, 1]."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = [
+    "JoinedPictures",
+    "check_size",
+    "decode_picture",
+    "float_pictures",
+    "image_store",
+    "scaled",
+    "text_of_size",
+    "unnamed_file",
+]
+
+
+def check_size(size: Sequence[int]) -> tuple[int, int]:
+    """(height, width) as whole numbers.
+
+    Raises:
+        ValueError: if one is not positive.
+    """
+    height, width = (int(side) for side in size)
+    if height < 1 or width < 1:
+        raise ValueError(f"size is (height, width) in pixels and must be positive, got {tuple(size)}")
+    return height, width
+
+
+def text_of_size(size: Sequence[int]) -> str:
+    """A size (height, width) for a message."""
+    return f"{size[1]} pixels wide and {size[0]} high"
+
+
+def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``[H, W, 3]`` to ``[3, *size]``: averaged over areas where it shrinks."""
+    if image.shape[:2] != size:
+        shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
+        image = np.ascontiguousarray(image)
+        image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return image.transpose(2, 0, 1)
+
+
+def decode_picture(data: bytes) -> np.ndarray | None:
+    """The bytes of a PNG, a JPEG or another file that OpenCV knows, as RGB ``[H, W, 3]``; None if they are damaged."""
+    # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
+    ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
+    complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete else None
+    return None if pixels is None else pixels[..., ::-1]
+
+
+def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
+    """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
+    if folder is None:
+        return np.zeros((rows, 3, *size), np.uint8)
+    with unnamed_file(folder) as file:
+        return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+
+
+def unnamed_file(folder: Path) -> IO[bytes]:
+    """A file in ``folder`` that goes when it is let go.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryFile(dir=folder)
+    except OSError as error:
+        raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
+
+
+class JoinedPictures:
+    """Pictures of several memory-mapped stores one behind the other, none of them copied.
+
+    Args:
+        stores: uint8 ``[N_k, C, H, W]`` each.
+
+    Examples:
+        >>> joined = JoinedPictures([torch.zeros(2, 1, 1, 1), torch.ones(3, 1, 1, 1)])
+        >>> joined.shape, joined[torch.tensor([4, 0])].flatten()
+        (torch.Size([5, 1, 1, 1]), tensor([1., 0.]))
+    """
+
+    def __init__(self, stores: Sequence[Tensor]):
+        self.stores = list(stores)
+        lengths = torch.tensor([len(store) for store in self.stores], dtype=torch.int64)
+        self._ends = lengths.cumsum(0)
+
+    @property
+    def shape(self) -> torch.Size:
+        """Of all of them together."""
+        return torch.Size([int(self._ends[-1]), *self.stores[0].shape[1:]])
+
+    def __getitem__(self, index: Tensor) -> Tensor:
+        """Pictures by number, int64 ``[m]``."""
+        which = torch.searchsorted(self._ends, index, right=True)
+        out = self.stores[0].new_empty(len(index), *self.stores[0].shape[1:])
+        for number in which.unique().tolist():
+            at, store = which == number, self.stores[number]
+            out[at] = store[index[at] - int(self._ends[number]) + len(store)]
+        return out
+
+
+def float_pictures(pictures: Tensor | JoinedPictures, index: Tensor) -> dict[str, Tensor]:
+    """``"pixels"`` of some pictures, float32 in [0, 1]; zeros where the index is negative.
+
+    Args:
+        pictures: uint8 ``[N, C, H, W]``.
+        index: int64 ``[m]``.
+
+    Examples:
+        >>> float_pictures(torch.full((2, 1, 1, 1), 255, dtype=torch.uint8), torch.tensor([1, -1]))["pixels"].flatten()
+        tensor([1., 0.])
+    """
+    there = index >= 0
+    if there.all():
+        return {"pixels": pictures[index].float().div_(255)}
+    pixels = torch.zeros(len(index), *pictures.shape[1:])
+    pixels[there] = pictures[index[there]].float().div_(255)
+    return {"pixels": pixels}

@@ -1,0 +1,123 @@
+"""Streams of different rates on one clock: which reading belongs to which row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+__all__ = ["Way", "interpolate", "last_reading", "nearest_reading", "row_times"]
+
+Way = Literal["last", "nearest", "linear"]
+SLACK = 1e-6  # s: times that differ by less are the same
+
+
+def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarray:
+    """Times of the rows, in s: those at which every stream has begun and none has ended.
+
+    Args:
+        streams: times of each stream's readings, s, ascending.
+        clock: the stream whose times are the rows', or a rate in Hz.
+
+    Raises:
+        ValueError: if the streams do not overlap by two rows.
+
+    Examples:
+        >>> row_times({"camera": np.array([0.0, 0.5, 1.0, 1.5]), "state": np.array([0.4, 1.1])}, "camera")
+        array([0.5, 1. ])
+        >>> row_times({"state": np.array([0.0, 0.9])}, 4.0)
+        array([0.  , 0.25, 0.5 , 0.75])
+    """
+    begin, end = max(times[0] for times in streams.values()), min(times[-1] for times in streams.values())
+    rows = np.zeros(0)
+    if end >= begin:
+        if isinstance(clock, str):
+            times = streams[clock]
+            rows = times[(times >= begin - SLACK) & (times <= end + SLACK)]
+        else:
+            rows = begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
+    if len(rows) < 2:
+        spans = ", ".join(f"{name} from {times[0]:.6g} to {times[-1]:.6g} s" for name, times in streams.items())
+        raise ValueError(
+            f"the streams have fewer than two rows in common: {spans}; their clocks must be the same: pass start= or "
+            "times= for pictures, and unit= for tables whose times are not in s"
+        )
+    return rows
+
+
+def last_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """For each row the last reading before it, or at it, and whether it arrived since the row before.
+
+    Args:
+        times: of the readings, s, ascending, ``[m]``.
+        rows: times of the rows, s, ascending, ``[n]``.
+        tolerance: s; an older reading is none.
+
+    Returns:
+        Its index ``[n]``, -1 where there is none, and whether it is new, bool ``[n]``.
+
+    Examples:
+        >>> last_reading(np.array([0.0, 1.0]), np.array([0.0, 0.5, 1.0]), None)
+        (array([0, 0, 1]), array([ True, False,  True]))
+    """
+    index = np.searchsorted(times, rows + SLACK, side="right") - 1
+    if tolerance is not None:
+        index = np.where(rows - times[index.clip(0)] > tolerance + SLACK, -1, index)
+    new = np.diff(index, prepend=-1) != 0
+    return index, new & (index >= 0)
+
+
+def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """For each row the reading that is nearest in time, also a later one, and whether the row is its nearest, too.
+
+    Args:
+        times: see :func:`last_reading`.
+        rows: likewise.
+        tolerance: s; a reading farther away is none. By default half the usual time between two rows.
+
+    Returns:
+        As :func:`last_reading`: index and whether the reading is seen here; in no other row, then.
+
+    Examples:
+        >>> nearest_reading(np.array([0.1, 1.4]), np.array([0.0, 1.0, 2.0]), None)
+        (array([ 0,  1, -1]), array([ True,  True, False]))
+    """
+    tolerance = 0.5 * float(np.median(np.diff(rows))) if tolerance is None else tolerance
+    right = np.searchsorted(times, rows).clip(0, len(times) - 1)
+    left = (right - 1).clip(0)
+    index = np.where(rows - times[left] <= times[right] - rows, left, right)
+    off = np.abs(times[index] - rows)
+    there = off <= tolerance + SLACK
+    order = np.lexsort((off, index))  # of the rows that share a reading, the nearest comes first
+    mine = np.zeros(len(rows), bool)
+    mine[order] = np.diff(index[order], prepend=-1) != 0
+    return np.where(there, index, -1), there & mine
+
+
+def interpolate(
+    times: np.ndarray, values: np.ndarray, rows: np.ndarray, tolerance: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Straight lines between the reading before a row and the one after it.
+
+    Args:
+        times: see :func:`last_reading`.
+        values: of the readings, ``[m, C]``.
+        rows: likewise.
+        tolerance: s; between readings that are farther apart there is no value.
+
+    Returns:
+        Values ``[n, C]``, zero where there is none, and where there is one, bool ``[n]``.
+
+    Examples:
+        >>> interpolate(np.array([0.0, 1.0]), np.array([[0.0], [2.0]]), np.array([0.25, 1.0]), None)
+        (array([[0.5],
+           [2. ]]), array([ True,  True]))
+    """
+    there = (rows >= times[0] - SLACK) & (rows <= times[-1] + SLACK)
+    if tolerance is not None:
+        right = np.searchsorted(times, rows - SLACK).clip(0, len(times) - 1)
+        left = np.where(times[right] <= rows + SLACK, right, (right - 1).clip(0))
+        there &= times[right] - times[left] <= tolerance + SLACK
+    columns = [np.interp(rows, times, column) for column in values.T]
+    return np.where(there[:, None], np.stack(columns, -1), 0.0), there

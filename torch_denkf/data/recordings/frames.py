@@ -1,0 +1,245 @@
+"""Pictures of a camera over time: a video, or a folder of images, decoded once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from torch_denkf._progress import progress_bar
+from torch_denkf.data.cache import _cached, cache_folder, stamp
+from torch_denkf.data.pictures import decode_picture, scaled, text_of_size, unnamed_file
+from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
+from torch_denkf.data.video import NOT_DECODED, decoded_frames
+
+__all__ = ["Frames", "Images", "Video"]
+
+_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What a camera's pictures have in common; take :class:`Video` or :class:`Images`.
+
+    Args:
+        file: the video, or the folder of images.
+        times: when each picture was taken: a CSV or Parquet file with one row a picture, or the times themselves. By
+            default a video's own clock, and the numbers in the images' names.
+        time: name of the column of times in that file.
+        unit: of these times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
+        start: in s, added to all times: when a video began, on the clock of the other streams.
+        sample: which picture a row of the data set gets: ``"last"``, the last one up to then; or ``"nearest"``, the
+            nearest in time, which may lie in the future. A picture is shown in one row alone; rows without one of their
+            own are not ``observed``.
+        tolerance: in s; pictures that are farther away count as missing. By default, none with ``"last"``, half a
+            row's time with ``"nearest"``.
+
+    Raises:
+        ValueError: for an unknown ``unit`` or ``sample``, and tolerances that are not positive.
+    """
+
+    file: str | Path
+    times: str | Path | Sequence[float] | None = None
+    time: str = "time"
+    unit: Unit = "s"
+    start: float = 0.0
+    sample: Literal["last", "nearest"] = "last"
+    tolerance: float | None = None
+
+    def __post_init__(self):
+        check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
+
+    def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
+        """All pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64 ``[F]``, s.
+
+        They are decoded once and then come memory-mapped from the cache, whatever the clock.
+
+        Raises:
+            FileNotFoundError: without the file or folder.
+            ValueError: if none can be decoded, they differ in size, or their times are not as many or do not ascend.
+            OSError: if the cache cannot be written.
+        """
+        source = Path(self.file).expanduser().resolve()
+        files = self._files(source)
+        folder = cache_folder(cache)
+        if folder is None:
+            stored = self._decode(source, files, size, None, progress)
+        else:
+            key = json.dumps([_FORMAT, *size, [(str(file), *stamp(file)) for file in files]])
+            entry = folder / f"frames-{source.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+            stored = _cached(entry, lambda: self._decode(source, files, size, folder, progress))
+        times = self._times(source, stored)
+        check_times(times, lambda row: f"picture {row} (from 0) of {source}", self.time)
+        return TensorDict({"pixels": stored["pixels"], "time": torch.from_numpy(times)}, stored.batch_size)
+
+    def _files(self, source: Path) -> list[Path]:
+        """The files that are decoded, in order."""
+        raise NotImplementedError
+
+    def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
+        """Each picture's own time, its RGB pixels (None if it is damaged), and its name for messages."""
+        raise NotImplementedError
+
+    def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
+        """Times of the pictures, where none were passed, s."""
+        return stored["time"].numpy().copy()
+
+    def _times(self, source: Path, stored: TensorDict) -> np.ndarray:
+        if self.times is None:
+            return self._own_times(source, stored) + self.start
+        given = self.times
+        if isinstance(given, (str, Path)):
+            _, numbers, where = read_numbers(Path(given).expanduser(), self.time, [])
+            times = numbers[:, 0]
+            check_times(times * SECONDS[self.unit], where, self.time)
+        else:
+            times = np.asarray(given, dtype=np.float64).reshape(-1)
+        # Damaged pictures are not stored: the place of each tells which time is its own.
+        place, there = stored["place"].numpy(), int(stored["count"][0])
+        if len(times) != there:
+            name = given if isinstance(given, (str, Path)) else "times"
+            raise ValueError(f"{name} has {len(times)} times, but {source} has {there} pictures; it needs one for each")
+        return times[place] * SECONDS[self.unit] + self.start
+
+    def _decode(
+        self, source: Path, files: list[Path], size: tuple[int, int], folder: Path | None, progress: bool
+    ) -> TensorDict:
+        store, times, places, native, count = _Store(size, folder), [], [], None, 0
+        with progress_bar(f"reading {source.name}", None, unit=" frames", shown=progress) as bar:
+            for place, (time, pixels, name) in enumerate(self._pictures(files)):
+                count = place + 1
+                if pixels is None:
+                    warnings.warn(f"{name} cannot be decoded; it counts as missing", stacklevel=2)
+                    continue
+                native = native or (pixels.shape[:2], name)
+                if pixels.shape[:2] != native[0]:
+                    raise ValueError(
+                        f"{name} is {text_of_size(pixels.shape)}, but {native[1]} is {text_of_size(native[0])}; one "
+                        "camera has pictures of one size"
+                    )
+                store.add(scaled(pixels, size))
+                times.append(time)
+                places.append(place)
+                bar.update()
+        if not times:
+            raise ValueError(NOT_DECODED.format(source))
+        entries = {"pixels": store.pictures(len(times)), "time": torch.tensor(times, dtype=torch.float64)}
+        entries |= {"place": torch.tensor(places), "count": torch.full((len(times),), count)}
+        return TensorDict(entries, [len(times)])
+
+
+@dataclass(frozen=True)
+class Video(Frames):
+    """A camera's video file; see :class:`Frames` for the arguments.
+
+    OpenCV decodes most codecs; AV1 needs PyAV: ``pip install 'torch_denkf[lerobot]'``. Times are those at which the
+    frames are shown, counted from the video's first frame.
+
+    Examples:
+        >>> Video("run1.mp4", start=12.5).sample
+        'last'
+    """
+
+    def _files(self, source: Path) -> list[Path]:
+        if not source.is_file():
+            raise FileNotFoundError(f"no video {source}; check the path")
+        return [source]
+
+    def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
+        for number, (time, pixels) in enumerate(decoded_frames(files[0])):
+            yield time, pixels, f"frame {number} of {files[0]}"
+
+
+@dataclass(frozen=True)
+class Images(Frames):
+    """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
+
+    Args:
+        rate: pictures a second, from ``start`` on, where neither ``times`` nor the names say when they were taken.
+
+    Examples:
+        >>> Images("run1/images", rate=10.0).sample
+        'last'
+    """
+
+    rate: float | None = None
+
+    def _files(self, source: Path) -> list[Path]:
+        if not source.is_dir():
+            raise FileNotFoundError(f"no folder {source}; check the path")
+        files = [file for file in source.iterdir() if file.suffix.lower() in _SUFFIXES]
+        if not files:
+            raise ValueError(f"no images in {source}; expected names that end in {', '.join(_SUFFIXES)}")
+        return sorted(files, key=_in_order)
+
+    def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
+        for file in files:
+            yield 0.0, decode_picture(file.read_bytes()), str(file)
+
+    def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
+        place = stored["place"].numpy()
+        if self.rate is not None:
+            if not self.rate > 0:
+                raise ValueError(f"rate is the number of pictures a second and must be positive, got {self.rate}")
+            return place / self.rate
+        times = [_number(file) for file in self._files(source)]
+        if None in times:
+            name = self._files(source)[times.index(None)].name
+            raise ValueError(
+                f"nothing says when the images in {source} were taken: their names, such as {name!r}, are no times; "
+                "pass times= or rate="
+            )
+        return np.array(times)[place] * SECONDS[self.unit]
+
+
+def _number(file: Path) -> float | None:
+    """The number that a file is called."""
+    try:
+        return float(file.stem)
+    except ValueError:
+        return None
+
+
+def _in_order(file: Path) -> tuple[list[float], str]:
+    """By number, or by the numbers in the name: img_9 comes before img_10."""
+    number = _number(file)
+    return [float(part) for part in re.findall(r"\d+", file.stem)] if number is None else [number], file.name
+
+
+class _Store:
+    """Pictures one behind the other, however many: in memory, or in a file that goes when they are let go.
+
+    Args:
+        size: (H, W).
+        folder: where the file is; None for memory.
+    """
+
+    def __init__(self, size: tuple[int, int], folder: Path | None):
+        self._size, self._memory = size, bytearray()
+        self._file = None if folder is None else unnamed_file(folder)
+
+    def add(self, pixels: np.ndarray) -> None:
+        """Keep a picture ``[3, H, W]``."""
+        data = np.ascontiguousarray(pixels).tobytes()
+        if self._file is None:
+            self._memory += data
+        else:
+            self._file.write(data)
+
+    def pictures(self, count: int) -> torch.Tensor:
+        """All of them, uint8 ``[count, 3, H, W]``."""
+        shape = (count, 3, *self._size)
+        if self._file is None:
+            return torch.frombuffer(self._memory, dtype=torch.uint8).reshape(shape)
+        self._file.flush()
+        return torch.from_numpy(np.memmap(self._file, np.uint8, "r+", shape=shape))

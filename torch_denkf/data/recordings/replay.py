@@ -1,0 +1,270 @@
+"""One's own recordings as one of torchrl's data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.data.episodes import Episode, hashed_tests
+from torch_denkf.data.options import ReplayOptions, check_options
+from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
+from torch_denkf.data.recordings.clock import interpolate, last_reading, nearest_reading, row_times
+from torch_denkf.data.recordings.frames import Frames
+from torch_denkf.data.recordings.tables import Readings, Table
+from torch_denkf.data.replay import EpisodeReplay
+from torch_denkf.data.statistics import picture_statistics
+
+__all__ = ["Recording", "RecordingReplay"]
+
+_TAKEN = (
+    "episode",
+    "step",
+    "time",
+    "pixels",
+    "observed",
+    "is_init",
+    "next",
+    "done",
+    "terminated",
+    "truncated",
+    "index",
+)
+
+
+class Recording:
+    """One episode: a camera and other streams, each with times of its own on one common clock.
+
+    Args:
+        name: of the episode; by default that of the first stream's file.
+        **streams: by the names that they get in the data set. One may be pictures, a
+            :class:`~torch_denkf.data.Video` or :class:`~torch_denkf.data.Images`; the others are
+            :class:`~torch_denkf.data.Table`. ``state`` is the truth, ``action`` what was commanded; other names are
+            yours.
+
+    Raises:
+        TypeError: for streams that are neither pictures nor tables.
+        ValueError: without streams, with two cameras, or with names that the data set needs itself.
+
+    Examples:
+        >>> from torch_denkf.data import Table, Video
+        >>> run = Recording(
+        ...     camera=Video("run1.mp4"), state=Table("run1.csv", time="t", columns=["x", "y"], sample="linear")
+        ... )
+        >>> run.name, list(run.streams)
+        ('run1', ['camera', 'state'])
+    """
+
+    def __init__(self, *, name: str | None = None, **streams: Frames | Table):
+        if not streams:
+            raise ValueError("a recording needs streams, such as camera=Video('run1.mp4'), state=Table('run1.csv')")
+        for key, stream in streams.items():
+            if not isinstance(stream, (Frames, Table)):
+                raise TypeError(f"stream {key!r} is a Video, Images or Table, got {type(stream).__name__}")
+            if key.endswith("_observed") or (key in _TAKEN and not isinstance(stream, Frames)):
+                raise ValueError(f"the data set has an entry {key!r} of its own; give the stream another name")
+        cameras = [key for key, stream in streams.items() if isinstance(stream, Frames)]
+        if len(cameras) > 1:
+            raise ValueError(f"a recording has one camera, got {cameras}; make a data set for each")
+        self.camera = cameras[0] if cameras else None
+        self.streams = dict(streams)
+        self.name = Path(next(iter(streams.values())).file).stem if name is None else name
+
+
+@dataclass(frozen=True)
+class RecordingEpisode(Episode):
+    """One recording.
+
+    Attributes:
+        begin: time of its first row, in s, on the recording's own clock.
+    """
+
+    begin: float
+
+
+class RecordingReplay(EpisodeReplay):
+    r"""One's own recordings, as a replay buffer of rows on one clock.
+
+    Keys, samples and splits are those of :class:`~torch_denkf.data.EpisodeReplay`; here the readings are
+
+    ===================== ============ ===========================================================================
+    key                   shape        content
+    ===================== ============ ===========================================================================
+    ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB, of the camera, whatever its stream is called
+    ``observed``          [n,1]        bool: the row has a picture of its own; other rows' pixels are zero. Only where
+                                       there is a camera
+    NAME                  [n,C]        float32: the columns of the table ``NAME``, such as ``state``; zero where
+                                       missing
+    ``NAME_observed``     [n,1]        bool: the row has a reading of its own
+    ===================== ============ ===========================================================================
+
+    Rows are the times of the stream ``clock``, or of a rate, from where all streams have begun to where the first one
+    ends. Each other stream comes onto them by its ``sample``:
+
+    * ``"last"``, the default, holds the last value until the next one arrives. It never looks into the future.
+    * ``"nearest"`` and ``"linear"`` do, by up to one reading. They suit a ``state`` that is known afterwards.
+
+    A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
+    So a filter with ``observed_key="imu_observed"`` does not count one reading twice, and a model that is driven by the
+    held value, such as an ``action``, reads it in all rows. With ``"linear"`` every value counts as observed.
+
+    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read anew each time.
+
+    Args:
+        recordings: one, or several with the same streams; each is an episode.
+        clock: name of the stream whose times the rows have, or a rate in Hz; by default the camera's, or else the
+            first stream's.
+        size: (H, W) to scale the pictures to, whatever their aspect.
+        test_share: share of the recordings that are for tests, by a hash of their names; none by default.
+        **options: of :class:`~torch_denkf.data.EpisodeReplay`.
+
+    Attributes:
+        episodes: with the recordings' names, and their ``begin`` on their own clock.
+        columns: names of the columns of each table.
+
+    Raises:
+        FileNotFoundError: without a stream's file or folder.
+        ImportError: for Parquet files, without pyarrow.
+        ValueError: for tables that lack columns, hold what is no number, or whose times do not ascend; pictures that
+            cannot be decoded; streams without common times; recordings that differ in their streams or share a name.
+        OSError: if the cache cannot be written.
+
+    Examples:
+        >>> from tempfile import mkdtemp
+        >>> from torch_denkf.data import Table
+        >>> file = Path(mkdtemp()) / "run1.csv"
+        >>> _ = file.write_text("t,x,wheel\n" + "".join(f"{k / 10},{k},{2 * k}\n" for k in range(20)))
+        >>> run = Recording(state=Table(file, ["x"], time="t"), wheel=Table(file, ["wheel"], time="t"))
+        >>> data = RecordingReplay(run, clock=5.0, num_slices=2, slice_len=4)
+        >>> data.sample()["wheel"].shape, data[:3]["state"].flatten(), data[:3]["time"].flatten()
+        (torch.Size([2, 4, 1]), tensor([0., 2., 4.]), tensor([0.0000, 0.2000, 0.4000], dtype=torch.float64))
+    """
+
+    episodes: tuple[RecordingEpisode, ...]
+
+    def __init__(
+        self,
+        recordings: Recording | Sequence[Recording],
+        *,
+        clock: str | float | None = None,
+        size: tuple[int, int] = (96, 128),
+        test_share: float = 0.0,
+        **options: Unpack[ReplayOptions],
+    ):
+        check_options(options)
+        for_tests = hashed_tests(test_share)
+        recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+        size = check_size(size)
+        clock = _check(recordings, clock)
+        cache, progress = options.get("cache", True), options.get("progress", True)
+        rows: list[TensorDict] = []
+        episodes: list[RecordingEpisode] = []
+        pictures: list[Tensor] = []
+        self.columns: dict[str, tuple[str, ...]] = {}
+        for recording in recordings:
+            streams: dict[str, Any] = {
+                key: stream.read() if isinstance(stream, Table) else stream.read(size, cache, progress)
+                for key, stream in recording.streams.items()
+            }
+            self._check_columns(recording, streams)
+            part, begin = _on_clock(recording, streams, clock)
+            if recording.camera is not None:
+                frame = part["picture"]
+                part["picture"] = torch.where(frame >= 0, frame + sum(map(len, pictures)), -1)
+                pictures.append(streams[recording.camera]["pixels"])
+            episodes.append(RecordingEpisode(recording.name, sum(map(len, rows)), len(part), begin))
+            rows.append(part)
+        together: TensorDict = torch.cat(rows)
+        self._numbers = tuple(self.columns)
+        self._picture, self._pictures = together.pop("picture", None), JoinedPictures(pictures)
+        super().__init__(
+            together,
+            episodes,
+            for_tests=for_tests,
+            pictures=None if self._picture is None else partial(_pixels, self._pictures, self._picture),
+            **options,
+        )
+
+    def _check_columns(self, recording: Recording, streams: Mapping[str, Any]) -> None:
+        columns = {key: stream.columns for key, stream in streams.items() if isinstance(stream, Readings)}
+        for key, names in columns.items():
+            if self.columns.setdefault(key, names) != names:
+                raise ValueError(
+                    f"recording {recording.name!r} has {list(names)} in {key!r}, the first one has "
+                    f"{list(self.columns[key])}; pass columns= to all of them"
+                )
+
+    def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
+        if self._picture is None:
+            return None
+        frame = self._picture[index]
+        return picture_statistics(self._pictures, frame[frame >= 0])
+
+
+def _pixels(pictures: JoinedPictures, picture: Tensor, row: Tensor) -> dict[str, Tensor]:
+    return float_pictures(pictures, picture[row])
+
+
+def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | float:
+    """The clock, where the recordings go together.
+
+    Raises:
+        ValueError: where they do not, or the clock is none of their streams.
+    """
+    if not recordings:
+        raise ValueError("there are no recordings; pass one, or a list of them")
+    first, names = recordings[0], [recording.name for recording in recordings]
+    if len(set(names)) < len(names):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise ValueError(
+            f"recordings are told apart by their names, but {twice} are there twice; pass Recording(name=)"
+        )
+    for recording in recordings:
+        if set(recording.streams) != set(first.streams) or recording.camera != first.camera:
+            raise ValueError(
+                f"recording {recording.name!r} has the streams {list(recording.streams)}, {first.name!r} has "
+                f"{list(first.streams)}; recordings of one data set have the same"
+            )
+    if clock is None:
+        return first.camera or next(iter(first.streams))
+    if isinstance(clock, str) and clock not in first.streams:
+        raise ValueError(f"clock is a stream, one of {list(first.streams)}, or a rate in Hz; got {clock!r}")
+    if not isinstance(clock, str) and not clock > 0:
+        raise ValueError(f"clock is a stream or a positive rate in Hz, got {clock}")
+    return clock
+
+
+def _on_clock(recording: Recording, streams: Mapping[str, Any], clock: str | float) -> tuple[TensorDict, float]:
+    """Rows of a recording, with the number of each one's picture, and the time of the first, s."""
+    times = {
+        key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
+    }
+    try:
+        rows = row_times(times, clock)
+    except ValueError as error:
+        raise ValueError(f"recording {recording.name!r}: {error}") from error
+    out: dict[str, Tensor] = {}
+    for key, stream in recording.streams.items():
+        read = streams[key]
+        if stream.sample == "linear":
+            values, seen = interpolate(times[key], read.values, rows, stream.tolerance)
+        else:
+            choose = last_reading if stream.sample == "last" else nearest_reading
+            index, seen = choose(times[key], rows, stream.tolerance)
+            if not isinstance(read, Readings):
+                out["picture"] = torch.from_numpy(np.where(seen, index, -1))
+                out["observed"] = torch.from_numpy(seen[:, None])
+                continue
+            values = np.where((index >= 0)[:, None], read.values[index], 0.0)
+        out[key] = torch.from_numpy(values.astype(np.float32))
+        out[f"{key}_observed"] = torch.from_numpy(seen[:, None])
+    out["step"] = torch.arange(len(rows)).unsqueeze(-1)
+    out["time"] = torch.from_numpy(rows[:, None] - rows[0])
+    return TensorDict(out, [len(rows)]), float(rows[0])

@@ -1,0 +1,201 @@
+"""Readings in tables, CSV or Parquet: a time and some numbers a row."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from torch_denkf.data.parquet import read_parquet
+from torch_denkf.data.recordings.clock import Way
+
+__all__ = ["Readings", "Table", "Unit", "check_times", "read_numbers"]
+
+Unit = Literal["s", "ms", "us", "ns"]
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+class Readings(NamedTuple):
+    """What a table holds.
+
+    Attributes:
+        times: s, ascending, ``[n]``.
+        values: ``[n, C]``.
+        columns: names of the values.
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    r"""Readings of a sensor, states or commands: a CSV file with a header, or a Parquet file.
+
+    Args:
+        file: ends in ``.csv``, ``.txt`` or ``.tsv`` (tabs), or ``.parquet``.
+        columns: names of the columns to read, in this order; by default all but the time.
+        time: name of the column of times; they ascend.
+        unit: of the times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
+        sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next.
+            These two look into the future: ``"nearest"``, the nearest in time, before or after; ``"linear"``, straight
+            lines between the readings before and after (unwrap angles first).
+        tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by
+            default, none with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, no value between
+            readings that are farther apart; by default there always is one.
+
+    Raises:
+        ValueError: for an unknown ``unit`` or ``sample``, and tolerances that are not positive.
+
+    Examples:
+        >>> from tempfile import mkdtemp
+        >>> file = Path(mkdtemp()) / "imu.csv"
+        >>> _ = file.write_text("t,wx,wy\n0,1,2\n10,3,4\n")
+        >>> Table(file, ["wy"], time="t", unit="ms").read()
+        Readings(times=array([0.  , 0.01]), values=array([[2.],
+               [4.]]), columns=('wy',))
+    """
+
+    file: str | Path
+    columns: Sequence[str] | None = None
+    time: str = "time"
+    unit: Unit = "s"
+    sample: Way = "last"
+    tolerance: float | None = None
+
+    def __post_init__(self):
+        check_stream(self.sample, ("last", "nearest", "linear"), self.tolerance, self.unit)
+
+    def read(self) -> Readings:
+        """The whole table.
+
+        Raises:
+            FileNotFoundError: without the file.
+            ImportError: for Parquet, without pyarrow.
+            ValueError: for columns that are not there, values that are no finite numbers, and times that do not
+                ascend; names the file, the line and the column.
+        """
+        columns = None if self.columns is None else list(self.columns)
+        if isinstance(self.columns, str):
+            raise ValueError(f"columns is a list of names, such as [{self.columns!r}]; got {self.columns!r}")
+        names, numbers, place = read_numbers(Path(self.file).expanduser(), self.time, columns)
+        times = numbers[:, 0] * SECONDS[self.unit]
+        check_times(times, place, self.time)
+        return Readings(times, numbers[:, 1:], names)
+
+
+def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str) -> None:
+    """Refuses options that no stream has.
+
+    Raises:
+        ValueError: if there is one.
+    """
+    if sample not in ways:
+        raise ValueError(f"sample is one of {', '.join(map(repr, ways))}, got {sample!r}")
+    if unit not in SECONDS:
+        raise ValueError(f"unit is one of {', '.join(map(repr, SECONDS))}, got {unit!r}")
+    if tolerance is not None and not tolerance > 0:
+        raise ValueError(f"tolerance is a time in s, positive, or None; got {tolerance}")
+
+
+def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> None:
+    """Refuses times that stand still or go back.
+
+    Args:
+        times: s, ``[n]``.
+        place: where a row is, for a message.
+        column: name of their column.
+
+    Raises:
+        ValueError: if there are none, or one does not ascend.
+    """
+    if not len(times):
+        raise ValueError(f"{place(-1)} has no rows; leave the stream out")
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        k = int(back[0]) + 1
+        raise ValueError(
+            f"{place(k)}: {column!r} goes from {times[k - 1]:.9g} to {times[k]:.9g} s; times must ascend: sort the "
+            "rows, or take those out that are there twice"
+        )
+
+
+def read_numbers(
+    file: Path, time: str, columns: Sequence[str] | None
+) -> tuple[tuple[str, ...], np.ndarray, Callable[[int], str]]:
+    """Columns of a table: their names without that of the time, numbers ``[n, 1 + C]``, and where a row is in the file.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ImportError: for Parquet, without pyarrow.
+        ValueError: for columns that are not there, and values that are no finite numbers.
+    """
+    read = _read_parquet if file.suffix.lower() in (".parquet", ".pq") else _read_csv
+    return read(file, time, columns)
+
+
+def _choose(file: Path, there: Sequence[str], time: str, columns: Sequence[str] | None) -> list[str]:
+    names = [time, *([name for name in there if name != time] if columns is None else columns)]
+    missing = [name for name in names if name not in there]
+    if missing:
+        hint = "pass time= for the column of times" if time in missing else "pass columns= of those"
+        raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {hint}")
+    return names
+
+
+def _no_number(place: str, column: str, value: object) -> ValueError:
+    return ValueError(
+        f"{place}: {column!r} is {value!r}, which is no finite number; correct it, or leave the row out: what is "
+        "missing then counts as not observed"
+    )
+
+
+def _read_csv(file: Path, time: str, columns: Sequence[str] | None):
+    if not file.is_file():
+        raise FileNotFoundError(f"no table {file}; check the path")
+    numbers: list[list[float]] = []
+    lines: list[int] = []
+    with file.open(newline="", encoding="utf-8-sig") as opened:
+        reader = csv.reader(opened, delimiter="\t" if file.suffix.lower() == ".tsv" else ",")
+        there = [name.strip() for name in next(reader, [])]
+        names = _choose(file, there, time, columns)
+        where = [there.index(name) for name in names]
+        for row in reader:
+            if not row:
+                continue
+            values = []
+            for column, name in zip(where, names, strict=True):
+                text = row[column] if column < len(row) else ""
+                try:
+                    values.append(float(text))
+                except ValueError as error:
+                    raise _no_number(f"{file}:{reader.line_num}", name, text) from error
+                if not np.isfinite(values[-1]):
+                    raise _no_number(f"{file}:{reader.line_num}", name, text)
+            numbers.append(values)
+            lines.append(reader.line_num)
+    table = np.array(numbers, dtype=np.float64).reshape(-1, len(names))
+    return tuple(names[1:]), table, lambda row: f"{file}:{lines[row]}" if lines else str(file)
+
+
+def _read_parquet(file: Path, time: str, columns: Sequence[str] | None):
+    wanted = None if columns is None else [time, *columns]
+    table = read_parquet(file) if wanted is None else read_parquet(file, list(dict.fromkeys(wanted)))
+    names = _choose(file, table.column_names, time, columns)
+    numbers = np.empty((table.num_rows, len(names)))
+    for column, name in enumerate(names):
+        try:
+            numbers[:, column] = table[name].to_numpy().astype(np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{file}: {name!r} holds {table[name].type}, not a number a row; pass columns= without it"
+            ) from error
+        bad = np.flatnonzero(~np.isfinite(numbers[:, column]))
+        if len(bad):
+            raise _no_number(f"{file}, row {bad[0]} (from 0)", name, table[name][int(bad[0])].as_py())
+    return tuple(names[1:]), numbers, lambda row: f"{file}, row {row} (from 0)" if table.num_rows else str(file)

@@ -1,0 +1,101 @@
+"""Samples of slices: which sampler cuts them, and the shape ``[B, T]`` in which they come."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torchrl.data import SliceSampler
+from torchrl.data.replay_buffers.sample_units import SampleUnit
+from torchrl.data.replay_buffers.samplers import Sampler
+
+from torch_denkf.data.episodes import Episode
+
+__all__ = ["Slices", "choose_sampler", "refuse_short_episodes", "slices_of"]
+
+
+def choose_sampler(
+    sampler: Sampler | None, num_slices: int | None, slice_len: int | None, batch_size: int | None, strict_length: bool
+) -> tuple[Sampler | None, int | None]:
+    """A sampler of slices of episodes, if they are asked for, or else the one that was passed; and the batch size.
+
+    Raises:
+        ValueError: if ``sampler`` comes with ``num_slices`` or ``slice_len``, or these two contradict ``batch_size``.
+
+    Examples:
+        >>> sampler, batch_size = choose_sampler(None, 4, 16, None, True)
+        >>> sampler.slice_len, batch_size
+        (16, 64)
+    """
+    if num_slices is None and slice_len is None:
+        return sampler, batch_size
+    if sampler is not None:
+        raise ValueError("pass either a sampler, which may cut slices itself, or num_slices and slice_len")
+    if num_slices is not None and slice_len is not None:
+        rows = num_slices * slice_len
+        if batch_size not in (None, rows):
+            raise ValueError(
+                f"num_slices={num_slices} times slice_len={slice_len} is {rows} rows, but batch_size={batch_size}; "
+                "leave one of the three out"
+            )
+        num_slices, batch_size = None, rows
+    sampler = SliceSampler(
+        num_slices=num_slices, slice_len=slice_len, traj_key="episode", cache_values=True, strict_length=strict_length
+    )
+    return sampler, batch_size
+
+
+def slices_of(sampler: Sampler | None) -> Slices | None:
+    """Brings samples into shape where the sampler's slices have equal lengths; None elsewhere."""
+    if not isinstance(sampler, SliceSampler) or any(sampler.span):
+        return None
+    return Slices(sampler) if sampler.strict_length or sampler.pad_output else None
+
+
+class Slices(SampleUnit):
+    """Shapes the rows of a sample ``[B * T]`` as slices ``[B, T]``, before the storage is read.
+
+    Args:
+        sampler: draws slices of equal lengths.
+    """
+
+    def __init__(self, sampler: SliceSampler):
+        self._sampler = sampler
+
+    def expand(self, index: Any, info: dict[str, Any], storage: Any) -> tuple[Any, dict[str, Any]]:
+        """The same rows, and what the sampler says about each of them, in the shape of slices."""
+        first = index[0] if isinstance(index, tuple) else index
+        rows = len(first)
+        ends = info.get(self._sampler.truncated_key)  # without replacement, the last sample may have fewer slices
+        count = self._sampler.num_slices or rows // self._sampler.slice_len
+        shape = (count if ends is None else int(ends.sum()), -1)
+
+        def shaped(value: Any) -> Any:
+            # Weights of prioritised samplers may be arrays; what is not a row's stays as it is.
+            if getattr(value, "ndim", 0) and len(value) == rows:
+                return torch.as_tensor(value).reshape(*shape, *value.shape[1:])
+            return value
+
+        index = tuple(map(shaped, index)) if isinstance(index, tuple) else shaped(index)
+        return index, {key: shaped(value) for key, value in info.items()}
+
+
+def refuse_short_episodes(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
+    """TorchRL's samplers leave short episodes out without a word; here, that is a mistake.
+
+    Raises:
+        ValueError: if an episode is shorter than a slice.
+    """
+    if not isinstance(sampler, SliceSampler) or not sampler.strict_length:
+        return
+    length = sampler.slice_len
+    if length is None:
+        length = None if batch_size is None else batch_size // sampler.num_slices
+    short = {episode.name: episode.length for episode in episodes if length is not None and episode.length < length}
+    if short:
+        some = dict(list(short.items())[:8])
+        raise ValueError(
+            f"slices have {length} rows, but {len(short)} episodes are shorter: {some}; pass shorter slices, leave the "
+            "episodes out, or pass strict_length=False for slices that may be shorter"
+        )

@@ -1,0 +1,40 @@
+"""Means and standard deviations of readings and of pictures."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf.data.pictures import JoinedPictures
+
+__all__ = ["mean_and_std", "picture_statistics"]
+
+
+def mean_and_std(values: Tensor) -> dict[str, Tensor]:
+    """Of each column of ``[n, ...]``, in double; the standard deviation divides by n.
+
+    Examples:
+        >>> mean_and_std(torch.tensor([[1.0], [3.0]]))
+        {'mean': tensor([2.], dtype=torch.float64), 'std': tensor([1.], dtype=torch.float64)}
+    """
+    values = values.double()
+    return {"mean": values.mean(0), "std": values.std(0, correction=0)}
+
+
+def picture_statistics(pictures: Tensor | JoinedPictures, index: Tensor, chunk: int = 256) -> dict[str, Tensor]:
+    """Mean and standard deviation of each channel, ``[C, 1, 1]``, of values in [0, 1].
+
+    Args:
+        pictures: uint8 ``[N, C, H, W]``, maybe memory-mapped.
+        index: which of them count, ``[n]``.
+        chunk: pictures that are looked at together.
+    """
+    counts = torch.zeros(pictures.shape[1], 256, dtype=torch.float64)  # how often each value is there, which is exact
+    for part in index.split(chunk):
+        for channel, values in enumerate(pictures[part].unbind(1)):
+            counts[channel] += torch.bincount(values.reshape(-1), minlength=256)
+    value = torch.arange(256, dtype=torch.float64) / 255
+    share = counts / counts.sum(-1, keepdim=True).clamp_min(1)
+    mean = share @ value
+    std = (share * (value - mean[:, None]).square()).sum(-1).sqrt()
+    return {"mean": mean[:, None, None], "std": std[:, None, None]}
