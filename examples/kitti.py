@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--train", nargs="+", default=["00", "01", "02", "03", "04", "05", "06", "07"])
     parser.add_argument("--test", nargs="+", default=["08", "09"])
     parser.add_argument("--out", type=Path, default=Path("runs/kitti-page"))
-    parser.add_argument("--updates", nargs=2, type=int, default=(400, 60), help="of the sensor and of the filter")
+    parser.add_argument("--updates", nargs=2, type=int, default=(600, 150), help="of the sensor and of the filter")
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
     args = parser.parse_args()
     torch.manual_seed(0)
