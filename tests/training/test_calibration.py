@@ -95,3 +95,9 @@ def test_readings_that_are_not_accepted_are_not_held():
     values, seen = torch.tensor([[1.0], [9.0], [2.0]]), torch.ones(3, 1, dtype=torch.bool)
     held = hold_last(values, seen, torch.zeros(1), lambda step, last: (values[step] - last).abs() < 5)
     assert held.flatten().tolist() == [1.0, 1.0, 2.0]
+
+
+def test_what_is_usable_but_not_there_is_not_held():
+    values, seen = torch.tensor([[1.0], [2.0]]), torch.tensor([[True], [False]])
+    held = hold_last(values, seen, torch.zeros(1), lambda step, last: torch.tensor([True]))
+    assert held.flatten().tolist() == [1.0, 1.0]

@@ -52,3 +52,12 @@ def test_copies_show_the_same(tmp_path):
     for copy in (deepcopy(data), loads(dumps(data)), deepcopy(ReplayEnv(data)).data):
         for key in ("pixels", "picture", "observed"):
             assert copy[:][key].equal(data[:][key]), key
+
+
+def test_pictures_behind_a_damaged_one_keep_their_times(tmp_path):
+    write_images(tmp_path / "run", [f"{k}.png" for k in range(4)])
+    (tmp_path / "run" / "1.png").write_bytes(b"nothing")
+    images = Images(tmp_path / "run", times=[0.0, 1.0, 3.0, 7.0])
+    with pytest.warns(UserWarning, match="1.png cannot be decoded"):
+        data = RecordingReplay(Recording(camera=images), size=SIZE, cache=None)
+    assert data[:]["time"].squeeze(-1).tolist() == [0, 3, 7]
