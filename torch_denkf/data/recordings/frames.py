@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -60,7 +60,11 @@ class Frames:
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
-        if not isinstance(self.start, Real) or not np.isfinite(self.start):
+        try:
+            known = math.isfinite(self.start)
+        except TypeError:
+            known = False
+        if not known:
             raise ValueError(f"start is a time in s, got {self.start!r}")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
