@@ -68,7 +68,7 @@ class UKF(GaussianFilter):
         kappa: float = 0.5,
         **options: Unpack[GaussianOptions],
     ):
-        points = {"alpha": alpha, "beta": beta, "kappa": kappa}
-        forecast = UKFTransition(transition, as_process_noise(process_noise, initial), **points)
-        update = partial(UKFAnalysis, observation, **points)
+        q = as_process_noise(process_noise, initial)
+        forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa)
+        update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)
         super().__init__(sensor, noise, forecast, update, initial=initial, **options)

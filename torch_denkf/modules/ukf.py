@@ -53,8 +53,7 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         **keys: see :class:`GaussianTransitionKeys`. The covariance of the last analysis may be singular.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
-            draws its own noise.
+        ValueError: where :class:`EKFTransition` does.
 
     Example:
         >>> from tensordict import TensorDict
@@ -95,18 +94,17 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
-        KeyError: if an entry is missing.
+        ValueError: where :class:`EKFAnalysis` does.
+        KeyError: likewise.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import Select
-        >>> td = TensorDict({
-        ...     "forecast": {"mean": torch.zeros(2), "cov": torch.eye(2)},
-        ...     "sensor": {"ensemble": torch.ones(1), "noise": torch.ones(1)},
-        ... })
-        >>> UKFAnalysis(Select([1]))(td)["belief", "mean"].round(decimals=4)
-        tensor([0.0000, 0.5000])
+        >>> from torch_denkf.modules import LearnedObservation
+        >>> forecast = {"mean": torch.zeros(1), "cov": torch.eye(1)}
+        >>> reading = {"ensemble": torch.tensor([4.0]), "noise": torch.ones(1)}
+        >>> td = TensorDict({"forecast": forecast, "sensor": reading})
+        >>> UKFAnalysis(LearnedObservation(torch.square))(td)["info", "innovation"].round(decimals=4)  # 4 - E x^2
+        tensor([3.])
     """
 
     def __init__(
