@@ -32,6 +32,10 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
     chance. It takes the place of :class:`EnsembleAnalysis` and reads and writes the same keys. Nothing of size S x O is
     kept; S local systems, E x E each, are solved ``tile`` at a time.
 
+    ``nis`` and ``log_likelihood`` take each observation by itself, with the variance of its own forecast plus R: the
+    correlations that E members show between observations are what localisation does not believe. The expectation of
+    ``nis`` is the number of observations, if the filter is consistent.
+
     Args:
         near: which observations count where: :class:`~torch_denkf.functional.Neighbours`, or a taper ``[S, O]``. From
             places and a radius: :meth:`around`.
@@ -44,10 +48,6 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         **keys: see :class:`EnsembleAnalysisKeys`. Of learned observations the mean is taken. What is not observed may
             be NaN, readings and variances alike.
-
-    ``nis`` and ``log_likelihood`` take each observation by itself, with the variance of its own forecast plus R: the
-    correlations that E members show between observations are what localisation does not believe. The expectation of
-    ``nis`` is the number of observations, if the filter is consistent.
 
     Raises:
         ValueError: if a taper is not a matrix, or the sizes do not fit.
