@@ -10,7 +10,7 @@ from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._members import MemberNetwork
+from torch_denkf.modules.transition import MemberNetwork
 from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.pairs import within_pair
 
