@@ -8,7 +8,7 @@ from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.calibration import MemberGain
+from torch_denkf.modules.noise import MemberGain
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
