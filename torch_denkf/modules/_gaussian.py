@@ -14,7 +14,6 @@ from torch_denkf.functional import GaussianUpdate, mean_observation
 from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
-
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 
 
@@ -194,9 +193,7 @@ class GaussianAnalysis(SubModel):
         """The update, and the mask that it used."""
         raise NotImplementedError
 
-    def _observe(
-        self, entries: Entries, states: torch.Tensor, call: Call
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _observe(self, entries: Entries, states: torch.Tensor, call: Call) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)

@@ -102,7 +102,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         noise = torch.zeros_like(predicted) if self.scheme == "perturbed" else None
         if self.rotate:
             size = forecast.shape[-2]
-            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(*forecast.shape[:-2], size, size)
+            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(
+                *forecast.shape[:-2], size, size
+            )
         ones = torch.ones_like(predicted[..., 0, :])
         return self.compute(forecast, predicted, torch.zeros_like(predicted), ones, unseen, noise=noise)
 

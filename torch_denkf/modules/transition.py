@@ -27,9 +27,7 @@ class MemberNetwork(SubModel):
         """Draws the network's noise for ``[*batch_size, E]`` rows."""
         if members is None or not self.noise_names:
             return None
-        return self.module.draw_noise(
-            batch_size, members, time=time, device=device, dtype=dtype, generator=generator
-        )
+        return self.module.draw_noise(batch_size, members, time=time, device=device, dtype=dtype, generator=generator)
 
     def noise_sizes(self, state, *_):
         """E, from the ensemble."""
