@@ -233,7 +233,7 @@ class SubModel(TensorDictModule):
         given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
         if len(own | set(given.values())) > 1 and any(word in str(error) for word in ("dtype", "scalar type")):
             raise TypeError(
-                f"{type(self).__name__} computes in {', '.join(map(str, own)) or "its inputs' precision"} and got "
+                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'what it is given'} and got "
                 + ", ".join(f"{key!r} in {dtype}" for key, dtype in given.items())
                 + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
                 "(filter.double())."
