@@ -3,8 +3,8 @@ Reading the diagnostics
 =======================
 
 A filter says what it believes, and how sure it is. Is it right about both? This page makes one filter that is right and
-four that are wrong, each in another way. It shows by which numbers and pictures the faults are told apart. Most of these
-numbers need no true state, so they can be watched on a robot, too.
+four that are wrong, each in another way. It shows by which numbers and pictures the faults are told apart. Most of
+these numbers need no true state, so they can be watched on a robot, too.
 
 The filter's *belief* is an *ensemble*: 100 guesses of the state, whose mean is the estimate and whose spread says how
 sure the filter is. In each step the filter moves all guesses on (the *forecast*), and a reading corrects them (the
@@ -15,9 +15,9 @@ sure the filter is. In each step the filter moves all guesses on (the *forecast*
 # A system that is known exactly
 # ------------------------------
 # A mass swings on a spring. The state is [position in m, speed in m/s], and gusts push the mass. A sensor reads the
-# position, ten times a second, and every third reading is lost. ``LinearGaussianEnv`` simulates such systems, so we know
-# all that a filter has to know: the motion, the gusts' strength, and the error of a reading. Two names are common: *Q* is
-# the noise of the motion in one step, the *process noise*; *R* is the noise of a reading.
+# position, ten times a second, and every third reading is lost. ``LinearGaussianEnv`` simulates such systems, so we
+# know all that a filter has to know: the motion, the gusts' strength, and the error of a reading. Two names are common:
+# *Q* is the noise of the motion in one step, the *process noise*; *R* is the noise of a reading.
 
 import matplotlib.pyplot as plt
 import torch
@@ -125,8 +125,8 @@ for name, numbers in told.items():
 #   each reading, and in the next step the innovation points back: the correlation is negative.
 # * **Q zero.** The filter believes that its motion is perfect. The spread shrinks from step to step, and readings no
 #   longer count. NIS is far above 1, and the innovations of neighbouring steps are alike: the correlation is positive.
-# * **Biased sensor.** NIS is only a little higher. The mean of the innovations is not zero, though smaller than the bias:
-#   the filter has followed its sensor most of the way. Readings alone cannot show the whole bias.
+# * **Biased sensor.** NIS is only a little higher. The mean of the innovations is not zero, though smaller than the
+#   bias: the filter has followed its sensor most of the way. Readings alone cannot show the whole bias.
 # * **Wrong motion.** The innovations' mean is zero. NIS is above 1, and neighbouring innovations are alike.
 
 right = told["right"]
@@ -163,9 +163,9 @@ assert all(inside[name][0] < 0.8 for name in cases if name != "right")
 
 # %%
 # Two pictures show the same at a glance. The first one asks where the truth lies among the guesses, from below all (0)
-# to above all (1). The bars are flat if the filter is right. They are high at both ends if it is too sure of itself, and
-# high at one end if its belief is off to one side. In the grey
-# band all bars of a right filter end, up to chance. Errors of neighbouring steps are alike, so every 15th step counts.
+# to above all (1). The bars are flat if the filter is right. They are high at both ends if it is too sure of itself,
+# and high at one end if its belief is off to one side. In the grey band all bars of a right filter end, up to chance.
+# Errors of neighbouring steps are alike, so every 15th step counts.
 
 figure, axes = plt.subplots(1, 5, figsize=(11, 2.9), sharex=True, layout="constrained")
 for axis, (name, out) in zip(axes, cases.items(), strict=True):
@@ -176,8 +176,8 @@ plt.show()
 
 # %%
 # The second one sorts all steps by their spread, and draws the error over the spread in each eighth of them. On the
-# diagonal the filter knows how wrong it is; above it, it is too sure. The spread varies here, because readings are lost:
-# after a gap the filter is less sure, and a filter that is right is then also less exact.
+# diagonal the filter knows how wrong it is; above it, it is too sure. The spread varies here, because readings are
+# lost: after a gap the filter is less sure, and a filter that is right is then also less exact.
 
 figure, axes = plt.subplots(1, 5, figsize=(11, 2.9), layout="constrained")
 for axis, (name, out) in zip(axes, cases.items(), strict=True):
@@ -199,4 +199,5 @@ plt.show()
 # single NIS far above all others                   a reading that is an outlier: leave such a step out
 # ================================================  ================================================================
 #
-# How a training gets Q and R right: :doc:`plot_training`. The numbers in a loop of your own: :doc:`/how_to/online_loop`.
+# How a training gets Q and R right: :doc:`plot_training`. The numbers in a loop of your own:
+# :doc:`/how_to/online_loop`.

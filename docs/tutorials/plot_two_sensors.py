@@ -123,10 +123,11 @@ fused = Filter(
 # The training
 # ------------
 # ``SensorLoss`` runs the learned sensor alone, on single pictures, and scores its samples against
-# ``"target_observation"``; ``noise`` also teaches ``DiagonalNoise`` how far off the samples' mean is. Then ``DEnKFLoss`` runs the whole filter over windows of 20 steps, and scores its ensembles
-# against the true states. The score is the *continuous ranked probability score* (CRPS): it is small where the ensemble
-# is near the truth and as wide as it is wrong. ``nll`` adds a little of the likelihood of the readings, which teaches the
-# noise. ``set_keys`` tells a loss which samples are the learned sensor's, and which mask belongs to them.
+# ``"target_observation"``; ``noise`` also teaches ``DiagonalNoise`` how far off the samples' mean is. Then
+# ``DEnKFLoss`` runs the whole filter over windows of 20 steps, and scores its ensembles against the true states. The
+# score is the *continuous ranked probability score* (CRPS): it is small where the ensemble is near the truth and as
+# wide as it is wrong. ``nll`` adds a little of the likelihood of the readings, which teaches the noise. ``set_keys``
+# tells a loss which samples are the learned sensor's, and which mask belongs to them.
 
 alone, together = SensorLoss(fused, noise=0.1), DEnKFLoss(fused, nll=0.1)
 alone.set_keys(sensor=("camera", "ensemble"), observed="camera_seen", noise=("camera", "noise"))
@@ -190,8 +191,8 @@ assert rmse["both"]["without"][0] < 0.9 * rmse["camera alone"]["without"][0]
 # kept for each analysis, under the name of its place. ``("info", "nis")`` is the sum over the analyses. Where a sensor
 # saw nothing, its NIS is 0.
 #
-# The encoder's NIS is about 1. The camera's is smaller: the samples of the learned sensor differ from guess to guess, the
-# learned noise comes on top, and so the filter expects larger innovations than it gets.
+# The encoder's NIS is about 1. The camera's is smaller: the samples of the learned sensor differ from guess to guess,
+# the learned noise comes on top, and so the filter expects larger innovations than it gets.
 
 both = runs["both"]
 for place, mask in (("by_camera", "camera_seen"), ("by_wheel", "wheel_seen")):
