@@ -12,9 +12,9 @@ import pytest
 from torch_denkf.transforms import DEnKFTransform
 
 ROOT = Path(__file__).parents[1]
-WITHOUT = ("README.md",)
 PAGES = sorted(path for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")] if "_build" not in path.parts)
 BLOCK = re.compile(r"(?:^<!-- not run: (?P<why>.+?) -->\n+)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"`((?:torch_denkf|tests|examples|benchmarks|docs)/[\w./-]+\.\w+)`")
 
 
@@ -25,7 +25,7 @@ def name(path):
 def blocks():
     for path in PAGES:
         text = path.read_text()
-        for match in BLOCK.finditer(text) if name(path) not in WITHOUT else ():
+        for match in BLOCK.finditer(text):
             line = text.count("\n", 0, match.start("code"))
             marks = [pytest.mark.skip(reason=match["why"])] if match["why"] else []
             yield pytest.param(path, line, match["code"], id=f"{name(path)}:{line}", marks=marks)
@@ -37,9 +37,18 @@ def test_block_runs(path, line, code, tmp_path, monkeypatch):
     exec(compile("\n" * line + code, str(path), "exec"), {"__name__": "__main__"})
 
 
-@pytest.mark.parametrize("path", [page for page in PAGES if page.is_relative_to(ROOT / "docs")], ids=name)
+@pytest.mark.parametrize("path", PAGES, ids=name)
 def test_named_files_exist(path):
-    assert [file for file in FILE.findall(path.read_text()) if not (ROOT / file).exists()] == []
+    text = path.read_text()
+    linked = [target.split("#")[0] for target in LINK.findall(text) if "://" not in target and "gallery" not in target]
+    assert [file for file in FILE.findall(text) if not (ROOT / file).exists()] == []
+    assert [file for file in linked if file and not (path.parent / file).exists()] == []
+
+
+def test_the_readme_fits_on_two_screens():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 150
+    assert len(text.encode()) <= 9000
 
 
 def test_table_of_the_transform_names_its_own_methods():

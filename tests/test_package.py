@@ -62,7 +62,10 @@ def test_modules_is_a_relative_link():
     ("packages", "may"),
     [
         (["functional", "metrics"], set()),
-        (["vision", "modules", "filters", "transforms", "objectives", "training", "data", "envs"], {"mujoco", "cv2"}),
+        (
+            ["vision", "modules", "filters", "transforms", "objectives", "training", "data", "envs", "odometry"],
+            {"mujoco", "cv2"},
+        ),
     ],
 )
 def test_importing_costs_no_simulator_and_no_opencv(packages, may):
@@ -80,7 +83,18 @@ print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib'}} & (set(sys.modules
 
 
 def test_every_public_name_is_there():
-    for name in ("functional", "metrics", "modules", "filters", "transforms", "objectives", "data", "envs", "plots"):
+    for name in (
+        "functional",
+        "metrics",
+        "modules",
+        "filters",
+        "transforms",
+        "objectives",
+        "data",
+        "envs",
+        "plots",
+        "odometry",
+    ):
         package = __import__(f"torch_denkf.{name}", fromlist=["*"])
         for public in getattr(package, "__all__", ()):
             assert hasattr(package, public), f"torch_denkf.{name}.{public}"

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torch_denkf.filters.inductor.kernels import SMALL, FewCalls
+from torch_denkf.filters.inductor.kernels import FEW_ROWS, SMALL, SMALL_OF_ROWS, FewCalls
 
 aten = torch.ops.aten
 
@@ -21,7 +21,7 @@ def changed(function, *args):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_bias_is_added_after_the_product(dtype):
     torch.manual_seed(0)
-    x, weight, bias = (torch.randn(shape, dtype=dtype) for shape in ((6, 4), (4, 3), (3,)))
+    x, weight, bias = (torch.randn(shape, dtype=dtype) for shape in ((64, 16), (16, 8), (8,)))
     module, calls = changed(torch.addmm, bias, x, weight)
     assert calls == [aten.mm.default, aten.add.Tensor]
     torch.testing.assert_close(module(bias, x, weight), bias + x @ weight)
@@ -53,4 +53,24 @@ def test_larger_products_stay():
     left, right = torch.randn(3, 8, SMALL // 8), torch.randn(3, SMALL // 8, 2)
     module, calls = changed(torch.bmm, left, right)
     assert calls == [aten.bmm.default]
+    torch.testing.assert_close(module(left, right), left @ right)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rows", [1, FEW_ROWS])
+def test_products_of_few_rows_are_written_out(rows, dtype):
+    torch.manual_seed(0)
+    x, weight = torch.randn(rows, 64, dtype=dtype), torch.randn(48, 64, dtype=dtype)
+    module, calls = changed(lambda a, b: a @ b.mT, x, weight)
+    assert aten.mm.default not in calls
+    assert aten.sum.dim_IntList in calls
+    torch.testing.assert_close(module(x, weight), torch.einsum("ri,ci->rc", x, weight))
+
+
+@pytest.mark.parametrize("shape", [(FEW_ROWS + 1, 32, 32), (1, 2, SMALL_OF_ROWS)])
+def test_products_of_more_rows_or_a_larger_matrix_stay(shape):
+    rows, inner, columns = shape
+    left, right = torch.randn(rows, inner), torch.randn(inner, columns)
+    module, calls = changed(torch.mm, left, right)
+    assert calls == [aten.mm.default]
     torch.testing.assert_close(module(left, right), left @ right)

@@ -5,6 +5,17 @@
     denkf collect-ur5 --demos 2000 --size 224 --out demos               # whole sequences
     denkf collect-ur5 --demos 2000 --size 112 --frames 8 --out frames   # for a sensor
     denkf collect-ur5 --out demos --verify                              # checksums
+
+From Python:
+
+>>> import tempfile
+>>> folder = tempfile.mkdtemp()
+>>> main(["--out", folder, "--demos", "1", "--no-pixels", "--processes", "1"])
+1 demos in ...: 1 made, 0 were there; 0 failed episodes left out
+0
+>>> main(["--out", folder, "--verify"])
+1 demos in ...: all checksums are right
+0
 """
 
 from __future__ import annotations
@@ -12,10 +23,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from torch_denkf._progress import progress_bar
+from torch_denkf.cli._command import Command, say
 from torch_denkf.data.ur5 import files
 from torch_denkf.envs.ur5.collect import EPISODE, collect_ur5_demos
 from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
@@ -23,91 +34,67 @@ from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
 __all__ = ["main"]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--out", required=True, type=Path, help="folder of the demos")
+    add("--demos", type=int, default=2000, help="that the folder shall have")
+    add("--size", nargs="+", type=int, default=[224], metavar="PX", help="one side, or height and width")
+    add("--frames", type=int, default=0, help="random steps of each demo to draw; 0 for all")
+    add("--no-pixels", action="store_true", help="states and actions alone")
+    add("--domain", choices=DOMAIN_NAMES, default="sim", help="of the environment")
+    add("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="in turn")
+    add("--seed", type=int, default=0, help="another one gives other demos")
+    add("--max-steps", type=int, default=EPISODE, help="of each demo that are kept")
+    add("--noise", type=float, default=0.0, help="of the expert's joint targets, rad")
+    add("--processes", type=int, default=os.cpu_count() or 1, help="that collect at a time")
+    add("--verify", action="store_true", help="check the files that are there and make none")
 
-    Args:
-        arguments: words of the command line; by default the process's own.
 
-    Returns:
-        The exit status: 0; 1 if ``--verify`` finds damaged files, named on stderr; 2 with a message on stderr; 130
-        when interrupted.
-
-    Examples:
-        >>> import tempfile
-        >>> folder = tempfile.mkdtemp()
-        >>> main(["--out", folder, "--demos", "1", "--no-pixels", "--processes", "1"])
-        1 demos in ...: 1 made, 0 were there; 0 failed episodes left out
-        0
-        >>> main(["--out", folder, "--verify"])
-        1 demos in ...: all checksums are right
-        0
-    """
-    parser = argparse.ArgumentParser(
-        prog=files.COMMAND,
-        description="Collect demonstrations of the UR5 table; a repeated command goes on where the last one ended.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--out", required=True, type=Path, help="folder of the demos")
-    parser.add_argument("--demos", type=int, default=2000, help="that the folder shall have")
-    parser.add_argument(
-        "--size", nargs="+", type=int, default=[224], metavar="PX", help="one side, or height and width"
-    )
-    parser.add_argument("--frames", type=int, default=0, help="random steps of each demo to draw; 0 for all")
-    parser.add_argument("--no-pixels", action="store_true", help="states and actions alone")
-    parser.add_argument("--domain", choices=DOMAIN_NAMES, default="sim", help="of the environment")
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="in turn")
-    parser.add_argument("--seed", type=int, default=0, help="another one gives other demos")
-    parser.add_argument("--max-steps", type=int, default=EPISODE, help="of each demo that are kept")
-    parser.add_argument("--noise", type=float, default=0.0, help="of the expert's joint targets, rad")
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="that collect at a time")
-    parser.add_argument("--verify", action="store_true", help="check the files that are there and make none")
-    args = parser.parse_args(arguments)
+def _run(args: argparse.Namespace) -> int:
     if args.verify:
         return _verify(args.out)
-    try:
-        with progress_bar("collecting", args.demos, unit=" demos") as bar:
-            made = collect_ur5_demos(
-                args.out,
-                args.demos,
-                size=tuple(args.size * 2 if len(args.size) == 1 else args.size),
-                frames=None if args.no_pixels else args.frames,
-                domain=args.domain,
-                tasks=args.tasks,
-                seed=args.seed,
-                max_steps=args.max_steps,
-                noise=args.noise,
-                processes=args.processes,
-                progress=bar.update,
-            )
-    except (ImportError, OSError, RuntimeError, ValueError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command goes on from here\n")
-        return 130
+    with progress_bar("collecting", args.demos, unit=" demos") as bar:
+        made = collect_ur5_demos(
+            args.out,
+            args.demos,
+            size=tuple(args.size * 2 if len(args.size) == 1 else args.size),
+            frames=None if args.no_pixels else args.frames,
+            domain=args.domain,
+            tasks=args.tasks,
+            seed=args.seed,
+            max_steps=args.max_steps,
+            noise=args.noise,
+            processes=args.processes,
+            progress=bar.update,
+        )
     failures = sum(entry.failures for entry in files.read_manifest(args.out).values())
-    sys.stdout.write(
+    say(
         f"{args.demos} demos in {args.out}: {made} made, {args.demos - made} were there; "
-        f"{failures} failed episodes left out\n"
+        f"{failures} failed episodes left out"
     )
     return 0
 
 
 def _verify(root: Path) -> int:
-    try:
-        entries = files.read_manifest(root).values()
-    except OSError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
+    entries = files.read_manifest(root).values()
     if not entries:
-        sys.stderr.write(f"error: no demos in {root}: no {files.MANIFEST}, or an empty one\n")
-        return 2
+        raise FileNotFoundError(f"no demos in {root}: no {files.MANIFEST}, or an empty one")
     wrong = [text for text in (files.what_is_wrong(root, entry) for entry in entries) if text is not None]
     sys.stderr.write("".join(f"{text}\n" for text in wrong))
     found = f"{len(wrong)} are missing or damaged" if wrong else "all checksums are right"
-    sys.stdout.write(f"{len(entries)} demos in {root}: {found}\n")
+    say(f"{len(entries)} demos in {root}: {found}")
     return 1 if wrong else 0
+
+
+main = Command(
+    "collect-ur5",
+    "Collect demonstrations of the UR5 table; a repeated command goes on where the last one ended.",
+    "denkf collect-ur5 --demos 2000 --size 224 --frames 16 --out demos",
+    _arguments,
+    _run,
+    resumable=True,
+    mistakes=(RuntimeError,),
+)
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Unpack
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
@@ -156,6 +158,46 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         )
         if transform is not None:
             self.append_transform(transform)
+
+    def draw(self, generator: torch.Generator, length: int | None = None) -> TensorDictBase:
+        """A sample whose randomness all comes from a generator: what a :class:`torch_denkf.training.Stage` asks for.
+
+        Args:
+            generator: on the CPU; with the same state it draws the same rows.
+            length: rows of a slice in this sample, as many slices as ever; by default the data set's own.
+
+        Returns:
+            As :meth:`sample`, ``[B, T]`` for slices.
+
+        Raises:
+            ValueError: if there are no slices to have a length, an episode is shorter, or samples are drawn in advance.
+
+        Example:
+            >>> import torch
+            >>> step = torch.arange(10).unsqueeze(-1)
+            >>> rows = TensorDict({"step": step, "time": step * 0.1}, [10])
+            >>> data = EpisodeReplay(rows, [Episode("a", 0, 10)], for_tests=lambda _: False, num_slices=2, slice_len=5)
+            >>> data.draw(torch.Generator().manual_seed(0), length=3).shape
+            torch.Size([2, 3])
+        """
+        if self._prefetch:
+            raise ValueError("with prefetch=... samples are drawn in advance, by no generator of yours; leave it out")
+        self.set_rng(generator)
+        if length is None:
+            return self.sample()
+        sampler = self.sampler
+        if not isinstance(sampler, SliceSampler) or self.batch_size is None:
+            raise ValueError("length is that of slices: open the data set with num_slices=... or slice_len=...")
+        own = sampler.slice_len
+        rows = (sampler.num_slices or self.batch_size // own) * length
+        try:
+            sampler.slice_len = None if own is None else length
+            refuse_short_episodes(self.episodes, sampler, rows)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Got conflicting batch_sizes")  # another length is what is wanted
+                return self.sample(rows)
+        finally:
+            sampler.slice_len = own
 
     @property
     def _source(self) -> str:

@@ -37,27 +37,29 @@ def draw_noise(
         generator: source of randomness; torch's global one by default.
         as_far_as_known: what to do about noise whose size the step alone knows: leave it out, or return ``None``.
     """
-    like, complete = filter.like(), True
+    parts = [found for place, module in modules for found in random_parts(module, place)]
     drawn: Entries = {}
+    if not parts:
+        return drawn
+    like, complete = filter.like(), True
     device = next((value.device for value in entries.values()), None if like is None else like.device)
     dtype = None if like is None else like.dtype
     members, state_dim = _sizes(filter, entries)
-    for place, module in modules:
-        for part_place, part in random_parts(module, place):
-            keys = [("noise", part_place, name) if name else ("noise", part_place) for name in part.noise_names]
-            if not all(key in entries for key in keys):
-                noise = part.draw_noise(
-                    batch_size,
-                    members=members,
-                    state_dim=state_dim,
-                    observation_dim=_observation_dim(filter, part, entries),
-                    time=time,
-                    device=device,
-                    dtype=dtype,
-                    generator=generator,
-                )
-                complete = complete and noise is not None
-                drawn.update(flat_noise(noise, part_place))
+    for place, part in parts:
+        keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]
+        if not all(key in entries for key in keys):
+            noise = part.draw_noise(
+                batch_size,
+                members=members,
+                state_dim=state_dim,
+                observation_dim=_observation_dim(filter, part, entries),
+                time=time,
+                device=device,
+                dtype=dtype,
+                generator=generator,
+            )
+            complete = complete and noise is not None
+            drawn.update(flat_noise(noise, place))
     return drawn if complete or as_far_as_known else None
 
 

@@ -8,6 +8,9 @@ from torch import Tensor
 
 __all__ = ["as_rows", "starts_of"]
 
+#: What marks the last element of an episode.
+_ENDS = ("done", "truncated")
+
 
 def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = False) -> Tensor | None:
     """Marks the first elements of episodes or slices, ``[*B, T, 1]``; ``None`` where nothing says.
@@ -21,12 +24,12 @@ def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = F
         init_key: the mark.
         step: whether ``tensordict`` is one step ``[*B]``, of which ``is_init`` alone says something.
     """
-    is_init = _marks(tensordict, tensordict, init_key)
     if step:
-        return is_init
-    done, following = _ends(tensordict, tensordict), tensordict.get("next", None)
+        return _marks(tensordict, tensordict, init_key)[0]
+    is_init, *ends = _marks(tensordict, tensordict, init_key, *_ENDS)
+    done, following = _either(*ends), tensordict.get("next", None)
     if is_init is None and isinstance(following, TensorDictBase):
-        done = _either(done, _ends(following, tensordict))
+        done = _either(done, _either(*_marks(following, tensordict, *_ENDS)))
     if done is None:
         return is_init
     time = tensordict.ndim - 1
@@ -47,27 +50,26 @@ def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictB
     return tensordict, new
 
 
-def _ends(source: TensorDictBase, tensordict: TensorDictBase) -> Tensor | None:
-    """The last elements of episodes or slices, ``[*B, T, 1]``."""
-    return _either(_marks(source, tensordict, "done"), _marks(source, tensordict, "truncated"))
-
-
 def _either(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     return second if first is None else first if second is None else first | second
 
 
-def _marks(source: TensorDictBase, tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """A mark ``[*B, T, 1]``: that of the root, or of any agent in any group."""
-    value = source.get(key, None)
-    if value is None:
+def _marks(source: TensorDictBase, tensordict: TensorDictBase, *keys: NestedKey) -> list[Tensor | None]:
+    """Marks ``[*B, T, 1]``: each that of the root, or of any agent in any group."""
+    values = [source.get(key, None) for key in keys]
+    nested = []
+    if any(value is None for value in values):
+        nested = [key for key in map(unravel_key, source.keys(True, True)) if isinstance(key, tuple)]
+        nested = [key for key in nested if key[0] not in ("next", "previous")]
+
+    def mark(key: NestedKey, value: Tensor | None) -> Tensor | None:
+        if value is not None:
+            return _any(value, tensordict.ndim)
         name = key if isinstance(key, str) else key[-1]
-        found = [
-            source.get(other)
-            for other in map(unravel_key, source.keys(True, True))
-            if isinstance(other, tuple) and other[-1] == name and other[0] not in ("next", "previous")
-        ]
-        return torch.stack([_any(mark, tensordict.ndim) for mark in found]).any(0) if found else None
-    return _any(value, tensordict.ndim)
+        found = [_any(source.get(other), tensordict.ndim) for other in nested if other[-1] == name]
+        return torch.stack(found).any(0) if found else None
+
+    return [mark(key, value) for key, value in zip(keys, values, strict=True)]
 
 
 def _any(mark: Tensor, ndim: int) -> Tensor:

@@ -444,9 +444,9 @@ class Filter(TensorDictSequential):
 
     def initial_belief(self, entries: Entries, call: Call) -> Entries:
         """The belief at the start of an episode."""
-        hidden = {key: value for key, value in entries.items() if key not in self.structure.belief}
-        start = run_module(self.initial, hidden, call.part("initial"))
-        return summaries(start, self.structure.belief)
+        belief = self.structure.belief
+        hidden = {key: value for key, value in entries.items() if key not in belief}
+        return summaries(run_module(self.initial, hidden, call.part("initial")), belief)
 
     def _of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         if isinstance(tensordict, TensorDictBase):

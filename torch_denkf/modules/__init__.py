@@ -4,6 +4,8 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 """
 
 from torch_denkf.modules._base import Call, SubModel, reads, run_module
+from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
+from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.calibration import MemberGain
@@ -81,4 +83,7 @@ __all__ = [
     "LSTMTransition",
     "LSTMUpdate",
     "UnicyclePose",
+    "EnsembleAnalysisKeys",
+    "GaussianAnalysisOptions",
+    "GaussianTransitionKeys",
 ]

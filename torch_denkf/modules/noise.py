@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant, variance_and_floor
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise"]
@@ -65,15 +65,9 @@ class DiagonalNoise(SubModel):
         network = StochasticMLP(in_features, observation_dim, num_cells, layer="none", output_gain=0.0)
         super().__init__(network, [in_key], [out_key])
         self.observation_dim = observation_dim
-        variance = as_floating(r).expand(observation_dim) ** 2
-        floor = 0.01 * variance if floor is None else as_floating(floor).expand(observation_dim)
-        if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
-            raise ValueError(
-                f"DiagonalNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
-                f"floor = {floor.tolist()}."
-            )
-        self.register_buffer("variance", (variance - floor).clone())
-        self.register_buffer("floor", floor.clone())
+        variance, floor = variance_and_floor("DiagonalNoise", observation_dim, r, floor)
+        self.register_buffer("variance", variance)
+        self.register_buffer("floor", floor)
         register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
         register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
 

@@ -28,8 +28,6 @@ from torch_denkf.functional.random_bits import dropout_factor, random_bytes, ran
 
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
-_RELU = partial(nn.ReLU, inplace=True)  # a layer's output is nobody else's, and need not be kept for the gradient
-
 
 class FlipoutLinear(nn.Module):
     r"""A linear layer with Gaussian weights, sampled by flipout.
@@ -137,7 +135,7 @@ class StochasticMLP(nn.Module):
         layer: Literal["dropout", "flipout", "none"] = "dropout",
         rate: float = 0.1,
         posterior_std: float = 0.05,
-        activation: Callable[[], nn.Module] = _RELU,
+        activation: Callable[[], nn.Module] = nn.ReLU,
         output_gain: float = 1.0,
     ):
         super().__init__()

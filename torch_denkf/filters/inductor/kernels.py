@@ -18,6 +18,8 @@ aten = torch.ops.aten
 
 #: Multiplications for one matrix of a batch, up to which inductor's own loop takes its place (measured: 128 and 320).
 SMALL = 1024
+#: A product of so few rows with one matrix is written out up to so many multiplications.
+FEW_ROWS, SMALL_OF_ROWS = 8, 2**15
 
 
 class FewCalls(CustomGraphPass):
@@ -47,16 +49,22 @@ def part_bias(graph: Graph) -> None:
 
 
 def write_out_products(graph: Graph) -> None:
-    """Writes batches of products of tiny matrices, e.g. covariances with two observed numbers, as sums of products."""
-    for node in graph.find_nodes(op="call_function", target=aten.bmm.default):
-        left, right = node.args
-        rows, inner = left.meta["val"].shape[1:]
-        if rows * inner * right.meta["val"].shape[2] <= SMALL:
-            with graph.inserting_before(node):
-                left = insert_call(graph, aten.unsqueeze.default, left, 3)
-                right = insert_call(graph, aten.unsqueeze.default, right, 1)
-                products = insert_call(graph, aten.mul.Tensor, left, right)
-                _replace(graph, node, insert_call(graph, aten.sum.dim_IntList, products, [2]))
+    """Writes products of tiny matrices, and of few rows with a matrix, as sums of products.
+
+    The former are covariances with two observed numbers, in batches; the latter are layers of a network on one robot.
+    """
+    for target in (aten.bmm.default, aten.mm.default):
+        for node in graph.find_nodes(op="call_function", target=target):
+            left, right = node.args
+            *batch, rows, inner = left.meta["val"].shape
+            multiplications = rows * inner * right.meta["val"].shape[-1]
+            limit = SMALL if batch or rows > FEW_ROWS else SMALL_OF_ROWS
+            if multiplications <= limit:
+                with graph.inserting_before(node):
+                    left = insert_call(graph, aten.unsqueeze.default, left, len(batch) + 2)
+                    right = insert_call(graph, aten.unsqueeze.default, right, len(batch))
+                    products = insert_call(graph, aten.mul.Tensor, left, right)
+                    _replace(graph, node, insert_call(graph, aten.sum.dim_IntList, products, [len(batch) + 1]))
 
 
 def insert_call(graph: Graph, function: Any, *args: Any) -> Node:

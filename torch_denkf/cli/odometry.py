@@ -1,0 +1,126 @@
+"""``denkf odometry``: the path of a car, from the images of its camera.
+
+::
+
+    denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --out runs/drive
+    denkf odometry KITTI/sequences/09/image_0 --calibration KITTI/sequences/09/calib.txt \
+        --times KITTI/sequences/09/times.txt --checkpoint runs/car --out runs/09
+
+Leaves ``path.csv`` (pose, velocities, and standard deviations of all), ``path_kitti.txt`` and ``path_tum.txt`` (which
+evo reads), and pictures where matplotlib is installed. See :func:`torch_denkf.odometry.track`, which does the work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch_denkf._progress import progress_bar
+from torch_denkf.cli._command import Command, say
+from torch_denkf.vision.camera import KITTI_HEIGHT
+
+__all__ = ["main"]
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("frames", type=Path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
+    add("--calibration", required=True, type=Path, metavar="FILE", help="KITTI's calib.txt; or a file with fx fy cx cy")
+    add("--checkpoint", required=True, type=Path, metavar="FOLDER", help="that denkf train left")
+    add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
+    add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
+    add("--fps", type=float, help="frames in a second; that of a video by default")
+    add("--times", type=Path, metavar="FILE", help="a time in s for each frame, a row each")
+    add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
+    add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
+    add("--seed", type=int, default=0, help="of the filter's noise")
+    add("--no-pictures", action="store_true", help="leave the pictures out")
+    add("--threads", type=int, default=1, help="of torch and OpenCV")
+
+
+def _run(args: argparse.Namespace) -> None:
+    if args.fps is not None and args.times is not None:
+        raise ValueError("pass --fps or --times, not both")
+    import cv2
+    import torch
+
+    from torch_denkf.data import write_trajectory
+    from torch_denkf.odometry import load_car_filter, read_camera, read_frames, track, write_path
+
+    torch.set_num_threads(args.threads)
+    cv2.setNumThreads(args.threads)
+    car, source = load_car_filter(args.checkpoint), read_frames(args.frames)
+    folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
+    calibration = read_camera(args.calibration, args.camera or folder)
+    times, fps = _times(args.times, source), args.fps or source.fps
+    if times is None and fps is None:
+        raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
+    beliefs = track(
+        car,
+        _counted(source),
+        calibration,
+        times=times,
+        fps=None if times is not None else fps,
+        height=args.height,
+        pitch=args.pitch,
+        seed=args.seed,
+    )
+    means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading
+    for belief in write_path(beliefs, args.out / "path.csv"):
+        means.append(belief.mean)
+        seconds.append(belief.time)
+        blind += not belief.observed
+        doubt = float(belief.var[:2].sum().sqrt())
+    states = torch.stack(means)
+    write_trajectory(args.out / "path_kitti.txt", states, layout="kitti")
+    write_trajectory(args.out / "path_tum.txt", states, torch.tensor(seconds, dtype=torch.float64), layout="tum")
+    way = float(states[1:, :2].sub(states[:-1, :2]).norm(dim=-1).sum())
+    say(
+        f"{way:.1f} m in {seconds[-1] - seconds[0]:.1f} s, {len(states)} steps, {blind} without a reading; "
+        f"at the end x {float(states[-1, 0]):.1f} m, y {float(states[-1, 1]):.1f} m, heading "
+        f"{math.degrees(float(states[-1, 2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
+    )
+    files = ["path.csv", "path_kitti.txt", "path_tum.txt"]
+    if not args.no_pictures:
+        try:
+            from torch_denkf.cli.plot import draw
+
+            files += [file.name for file in draw(args.out / "path.csv", args.out)]
+        except ImportError as error:
+            say(f"no pictures: {error}")
+    say(f"{args.out}: {', '.join(files)}")
+
+
+def _times(file: Path | None, source) -> Sequence[float] | None:
+    """The frames' times; of a file with a row for each number, those of the numbers that are there."""
+    if file is None:
+        return None
+    from torch_denkf.odometry import read_times
+
+    times = read_times(file)
+    if source.count is None or len(times) == source.count:
+        return times
+    if len(times) >= source.first + source.count:
+        return times[source.first : source.first + source.count]
+    raise ValueError(f"{file} has {len(times)} times, but {source.path} has {source.count} frames")
+
+
+def _counted(source):
+    with progress_bar("odometry", source.count, unit=" frames") as bar:
+        for frame in source:
+            yield frame
+            bar.update()
+
+
+main = Command(
+    "odometry",
+    "The path of a car, with its uncertainty, from the images of one camera whose calibration and height are known.",
+    "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive",
+    _arguments,
+    _run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

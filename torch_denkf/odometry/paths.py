@@ -1,0 +1,101 @@
+"""A tracked path as a file: what is believed at each frame, and how sure that is."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.functional import ensemble_cov
+from torch_denkf.odometry.tracking import TrackedBelief
+
+__all__ = ["PATH_COLUMNS", "read_path", "write_path"]
+
+_STATE = ("x_m", "y_m", "theta_rad", "v_m_per_s", "theta_dot_rad_per_s")
+#: Of path.csv; ``std_`` are standard deviations, ``cov_xy_m2`` is the covariance of x and y.
+PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name in _STATE), "cov_xy_m2")
+
+
+def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
+    """Writes beliefs to a CSV file as they come, and hands them on.
+
+    What was written is there when the work is broken off. Numbers have nine digits, which float32 needs to be exact.
+
+    Args:
+        beliefs: from :func:`torch_denkf.odometry.track`.
+        file: with a row for each belief, see ``PATH_COLUMNS``; its folder is made.
+
+    Yields:
+        The beliefs.
+
+    Raises:
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> belief = TrackedBelief(3, 0.3, True, torch.ones(5), torch.full((5,), 4.0), torch.randn(8, 5))
+        >>> file = Path(tempfile.mkdtemp()) / "path.csv"
+        >>> for written in write_path([belief], file):
+        ...     pass
+        >>> read_path(file)["belief", "var"]
+        tensor([[4., 4., 4., 4., 4.]], dtype=torch.float64)
+    """
+    file = Path(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(PATH_COLUMNS)
+        for belief in beliefs:
+            covariance = float(ensemble_cov(belief.ensemble[:, :2])[0, 1])
+            numbers = [*belief.mean.tolist(), *belief.var.sqrt().tolist(), covariance]
+            time = f"{belief.time:.9g}"
+            writer.writerow([belief.frame, time, int(belief.observed), *(f"{value:.9g}" for value in numbers)])
+            stream.flush()
+            yield belief
+
+
+def read_path(file: str | Path) -> TensorDict:
+    """Reads what :func:`write_path` wrote.
+
+    Args:
+        file: ``path.csv``.
+
+    Returns:
+        ``[T]``, float64: ``("belief", "mean")`` and ``("belief", "var")`` ``[T, 5]``, ``("belief", "cov")``
+        ``[T, 5, 5]`` (of x and y; all else is diagonal), ``"time"`` ``[T, 1]``, ``"frame"`` and ``"observed"``
+        ``[T, 1]``.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ValueError: if it lacks columns or rows, or a number cannot be read; the message names file and line.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"no path {file}; `denkf odometry` leaves a path.csv")
+    with file.open(newline="") as stream:
+        reader = csv.DictReader(stream)
+        if missing := [name for name in PATH_COLUMNS if name not in (reader.fieldnames or ())]:
+            raise ValueError(f"{file} has no columns {', '.join(missing)}; pass a path.csv of `denkf odometry`")
+        rows = []
+        for row in reader:
+            try:
+                rows.append([float(row[name]) for name in PATH_COLUMNS])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{file}:{reader.line_num}: expected {len(PATH_COLUMNS)} numbers ({error})") from error
+    if not rows:
+        raise ValueError(f"{file} has no rows")
+    table = torch.tensor(rows, dtype=torch.float64)
+    frame, time, observed, mean, std, cov = table.split([1, 1, 1, 5, 5, 1], -1)
+    belief = TensorDict({"mean": mean, "var": std.square(), "cov": _cov(std, cov)}, [len(rows)])
+    entries = {"belief": belief, "time": time, "frame": frame.long(), "observed": observed.bool()}
+    return TensorDict(entries, [len(rows)])
+
+
+def _cov(std: Tensor, cov: Tensor) -> Tensor:
+    matrix = torch.diag_embed(std.square())
+    matrix[:, 0, 1] = matrix[:, 1, 0] = cov.squeeze(-1)
+    return matrix
