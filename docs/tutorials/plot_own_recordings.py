@@ -68,14 +68,14 @@ def write_recording(name: str) -> None:
         table = csv.writer(file)
         table.writerow(["t", "angle", "speed"])
         for row, state in enumerate(states[:: fine // RATE].tolist()):
-            table.writerow([row / RATE, *state])
+            table.writerow([row / RATE, *(round(number, 4) for number in state)])
 
 
 names = [f"run{number:02d}" for number in range(14)]
 for name in names:
     write_recording(name)
 print(sorted(path.name for path in folder.iterdir())[:4], "...")
-print((folder / "run00.csv").read_text()[:60])
+print(*(folder / "run00.csv").read_text().splitlines()[:3], sep="\n")
 
 # %%
 # The data set
@@ -108,6 +108,7 @@ unseen = read(names[12:], transform=hide)
 batch = train.sample()
 print({key: tuple(batch[key].shape) for key in ("pixels", "state", "observed", "time")})
 
+# sphinx_gallery_thumbnail_number = 2
 figure, axes = plt.subplots(1, 5, figsize=(8, 1.45), layout="constrained")
 for axis, frame in zip(axes, batch[0, ::3], strict=False):
     axis.imshow(frame["pixels"].permute(1, 2, 0))

@@ -109,12 +109,12 @@ ways = {"eager": run(denkf.step, start.copy(), frames, ("belief", "ensemble"))}
 # ``compile`` puts all further steps through torch's compiler. The first step then takes some seconds, because it is
 # compiled; ``compile(chunk=0)`` goes back. Without ``chunk=1`` sequences are compiled, too, four steps at a time.
 
-denkf.compile(chunk=1)
+denkf = denkf.compile(chunk=1)
 begun = time.perf_counter()
 run(denkf.step, start.copy(), frames[:2], ("belief", "ensemble"))
 print(f"compiled in {time.perf_counter() - begun:.0f} s")
 ways["compiled"] = run(denkf.step, start.copy(), frames, ("belief", "ensemble"))
-denkf.compile(chunk=0)
+denkf = denkf.compile(chunk=0)
 
 # %%
 # Write it into a file

@@ -89,7 +89,7 @@ def make() -> DEnKF:
 # * The *likelihood* of the readings (``nll``) says how well the forecast told the next reading, and how sure it was.
 
 
-def fit(length: int, initial: torch.nn.Module, updates: int = 80, **options) -> DEnKF:
+def fit(length: int, initial: torch.nn.Module, updates: int = 110, **options) -> DEnKF:
     """Trains a new filter on windows of some length."""
     filter = make()
     filter.initial = initial
@@ -99,7 +99,7 @@ def fit(length: int, initial: torch.nn.Module, updates: int = 80, **options) -> 
     optimiser = torch.optim.Adam([{"params": others}, {"params": noises}])
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, [2e-2, 2e-1], total_steps=updates)
     for _ in range(updates):
-        rows, start = torch.randint(len(train), (24, 1)), torch.randint(train.shape[1] - length, (24, 1))
+        rows, start = torch.randint(len(train), (32, 1)), torch.randint(train.shape[1] - length, (32, 1))
         terms = loss(train[rows, start + torch.arange(length)])
         optimiser.zero_grad()
         sum(terms.values()).backward()
@@ -150,7 +150,7 @@ print(f"{'the truth':23s}  {NOISE:.2f}   {GUST:.2f}")
 #   is right: the error of a forecast from the truth is just what Q describes.
 # * **One step from anywhere.** The belief at the beginning of a window is wide, and one reading of the position says
 #   nothing about the speed. So the training learns little about the motion, and the speed is wrong.
-# * **Sixteen steps from the truth.** R is better, and still too large. The sensor matters only late in a window.
+# * **Sixteen steps from the truth.** R is much better: within some steps the belief gets worse, and the sensor matters.
 # * **Sixteen steps, squared error.** The means are good. The spread of the speed is too large, because no term of the
 #   loss asks for it.
 # * **Sixteen steps from anywhere, CRPS.** R and Q are both about right, and so is the spread. A window begins with a
@@ -165,7 +165,7 @@ assert abs(good["q"] - GUST) < 0.03
 assert (good["inside"] - 0.9).abs().max() < 0.06
 assert (good["ratio"] - 1).abs().max() < 0.3
 assert table["1 step from the truth"]["r"] > 1.4 * NOISE
-assert NOISE * 1.1 < table["16 steps from the truth"]["r"] < table["1 step from the truth"]["r"]
+assert table["16 steps from the truth"]["r"] < 0.85 * table["1 step from the truth"]["r"]
 assert table["1 step from anywhere"]["rmse"][1] > 3 * good["rmse"][1]
 assert table["16 steps, squared error"]["ratio"][1] > good["ratio"][1] + 0.1
 
@@ -191,13 +191,19 @@ for axis in axes[:, 0]:
 plt.show()
 
 # %%
-# One of the swings, from the third second on: above the filter that learned from single steps, below the one that
-# learned from sixteen.
+# The fastest of the swings, from the third second on: above the filter that learned from single steps, below the one
+# that learned from sixteen.
 
+swing = int(unseen["state"][:, 20:, 1].abs().amax(1).argmax())
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
 for axis, name in zip(axes, ("1 step from anywhere", "16 steps, CRPS"), strict=True):
     plot_bands(
-        runs[name][3], dims=[1], names=["speed, m/s"], time=DT * torch.arange(20, 60), legend=axis is axes[0], ax=axis
+        runs[name][swing],
+        dims=[1],
+        names=["speed, m/s"],
+        time=DT * torch.arange(20, 60),
+        legend=axis is axes[0],
+        ax=axis,
     )
     axis.set_title(name, loc="right", fontsize="medium")
 axes[0].set_xlabel("")
