@@ -188,8 +188,10 @@ figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 for name, (_, milliseconds) in ways.items():
     axis.plot(milliseconds.sort().values, 100 * torch.linspace(0, 1, len(milliseconds)), label=name)
 axis.set(xscale="log", xlabel="time of a step, ms", ylabel="steps done, %")
-axis.legend(frameon=False)
-axis.grid(which="both", alpha=0.2)
+axis.set_xticks([0.2, 0.5, 1, 2, 5, 10], ["0.2", "0.5", "1", "2", "5", "10"])
+axis.minorticks_off()
+axis.legend(frameon=False, loc="lower right")
+axis.grid(alpha=0.2)
 plt.show()
 
 # %%

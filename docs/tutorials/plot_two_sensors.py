@@ -206,7 +206,7 @@ assert torch.allclose(both["info", "nis"], parts)
 # %%
 # One of the carts. The grey stripe of the position is the time without pictures, the one of the speed the time without
 # encoder. Without pictures the position is carried on by the speed, and its band grows. The first picture after that
-# pulls the band together. Without encoder both bands grow, and the pictures alone hold the position.
+# pulls the band together. Without encoder the band of the speed grows.
 
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
 cart, first = 1, 25
