@@ -86,7 +86,7 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
     }
     if way > 100:
         devkit = kitti_devkit_error(believed, truth)
-        row |= {"devkit_percent": 100 * float(devkit.translation), "devkit_deg_per_100m": 100 * float(devkit.rotation)}
+        row |= {"devkit_percent": float(devkit.translation), "devkit_deg_per_100m": 100 * float(devkit.rotation)}
     return row
 
 
