@@ -17,7 +17,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from torch import nn
 from torchrl.envs import TransformedEnv
 
 from torch_denkf import (
@@ -101,7 +100,8 @@ def make_filter(data: RecordingReplay) -> Filter:
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
-    initial = FromSensor([0], mean=loc, std=scale, ensemble_size=64)
+    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
+    initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
     return Filter(
         {
             "sensor": ImageSensor(
@@ -116,7 +116,7 @@ def make_filter(data: RecordingReplay) -> Filter:
             ),
             "camera_noise": DiagonalNoise(1, r=0.2 * scale[:1], loc=loc[:1], scale=scale[:1]),
             "encoder_noise": ConstantNoise([0.05], trainable=True, in_key="encoder", out_key="encoder_noise"),
-            "transition": NoisyTransition(transition, as_process_noise((0.05 * scale).tolist(), initial)),
+            "transition": NoisyTransition(transition, as_process_noise(pushes, initial)),
             "h_camera": Select([0]),
             "by_camera": EnsembleAnalysis("etkf", belief_key="middle"),
             "h_encoder": Select([1], in_key=("middle", "ensemble"), out_key="encoder_predicted"),
@@ -149,11 +149,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, help="folder of runs; made by default")
     parser.add_argument("--out", type=Path, default=Path("runs/own-recordings-page"))
-    parser.add_argument("--updates", nargs=2, type=int, default=(300, 200), help="of the sensor and of the filter")
+    parser.add_argument("--updates", nargs=2, type=int, default=(250, 150), help="of the sensor and of the filter")
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
     args = parser.parse_args()
     torch.manual_seed(0)
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)  # small steps: a second thread gains little
     if args.smoke:
         args.out, args.updates = args.out.with_name("own-recordings-smoke"), (2, 2)
     if args.root is None:
@@ -162,7 +162,7 @@ def main() -> None:
 
     # The data set: rows 20 times a second; every second one has a picture of its own.
     cache = args.out / "cache"
-    data = read(args.root, cache=cache, num_slices=16, slice_len=20)
+    data = read(args.root, cache=cache, num_slices=8, slice_len=20)
     model = make_filter(data)
     train(model, data, args.out / "training", tuple(args.updates))
 
@@ -194,9 +194,16 @@ def main() -> None:
 
 
 def draw(seen, reading: torch.Tensor, file: Path) -> None:
-    """Position and speed with their 90 % bands, the truth and what was read."""
-    names, dots = ["position, cm", "speed, cm/s"], {dim: reading[:, dim] for dim in (0, 1)}
-    axes = plot_bands(seen, names=names, factors=[100, 100], readings=dots, time=1 / RATE)
+    """Position and speed with their 90 % bands, the truth and what was read; shaded where the encoder is silent."""
+    reading = reading.where(torch.cat([seen["observed"], seen["encoder_observed"]], -1), torch.nan)
+    axes = plot_bands(
+        seen,
+        names=["position, cm", "speed, cm/s"],
+        factors=[100, 100],
+        readings={dim: reading[:, dim] for dim in (0, 1)},
+        observed="encoder_observed",
+        time=1 / RATE,
+    )
     axes[0].figure.savefig(file, dpi=110)
     print(f"  {file}")
 

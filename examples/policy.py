@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Composite, Unbounded
@@ -41,6 +40,7 @@ from torch_denkf.modules import ConstantNoise, FromSensor, Select, SubModel
 
 DT, STEPS, NOISE = 0.05, 200, 0.2  # s; of an episode; of the cosine and the sine that the encoder reads
 PULL, MOTOR, GUST, TORQUE = 15.0, 3.0, 0.1, 2.0  # 1/s^2; 1/s^2 per Nm; rad/s a step; Nm
+INPUTS = {"belief": (("belief", "mean"), 3), "last reading": ("encoder", 2), "four readings": ("encoders", 8)}
 
 
 def swing(cos: Tensor, sin: Tensor, speed: Tensor, torque: Tensor, pull, motor, gust) -> Tensor:
@@ -127,14 +127,10 @@ def make_env(kind: str, denkf: DEnKF, count: int) -> TransformedEnv:
     return env
 
 
-def ppo(kind: str, denkf: DEnKF, out: Path, batches: int) -> Tensor:
-    """Trains a policy, and returns the returns of 256 new episodes."""
+def ppo(kind: str, denkf: DEnKF, out: Path, batches: int) -> tuple[Tensor, Tensor]:
+    """Trains a policy; then its returns in 256 new episodes, and how much of the time the pendulum stood upright."""
     torch.manual_seed(1)
-    key, width = {
-        "belief": (("belief", "mean"), 3),
-        "last reading": ("encoder", 2),
-        "four readings": ("encoders", 8),
-    }[kind]
+    key, width = INPUTS[kind]
     size = {"num_cells": [64, 64], "activation_class": nn.Tanh}
     head = nn.Sequential(MLP(width, 2, **size), NormalParamExtractor())
     actor = ProbabilisticActor(
@@ -149,7 +145,13 @@ def ppo(kind: str, denkf: DEnKF, out: Path, batches: int) -> Tensor:
     loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
     rows = 64 * 32
-    collector = Collector(make_env(kind, denkf, 64), actor, frames_per_batch=rows, total_frames=batches * rows)
+    collector = Collector(
+        make_env(kind, denkf, 64),
+        actor,
+        frames_per_batch=rows,
+        total_frames=batches * rows,
+        auto_register_policy_transforms=True,
+    )
     logger = CSVLogger(kind.replace(" ", "-"), log_dir=str(out))
     for number, data in enumerate(bar := tqdm(collector, total=batches, desc=f"PPO on the {kind}", disable=None)):
         for _ in range(6):
@@ -185,17 +187,14 @@ def main() -> None:
     if args.smoke:
         args.out, args.updates, args.batches = args.out.with_name("policy-smoke"), 2, 1
     denkf = learn_filter(args.out, args.updates)
-    pull, motor, gust = denkf["transition"].logs.exp().tolist()
-    print(
-        f"learned: pull {pull:.1f} 1/s^2 (true {PULL}), motor {motor:.2f} (true {MOTOR}), gusts {gust:.2f} rad/s (true {GUST})"
-    )
-    for kind in ("belief", "last reading", "four readings"):
-        begun = time.time()
+    names = (("pull", PULL, "1/s^2"), ("motor", MOTOR, "1/s^2 per Nm"), ("gusts", GUST, "rad/s a step"))
+    for (name, true, unit), learned in zip(names, denkf["transition"].logs.exp().tolist(), strict=True):
+        print(f"{name}: learned {learned:.2f} {unit} (true {true})")
+    for kind in INPUTS:
         returns, upright = ppo(kind, denkf, args.out, args.batches)
         error = returns.std() / len(returns) ** 0.5
-        print(
-            f"{kind:<14} return {returns.mean():.0f} ± {error:.0f}, upright {100 * upright:.0f} %  {time.time() - begun:.0f} s"
-        )
+        text = f"return {returns.mean():.0f} ± {error:.0f}, upright in {100 * upright:.0f} % of the second half"
+        print(f"PPO on the {kind:<14} {text}")
 
 
 if __name__ == "__main__":
