@@ -3,10 +3,10 @@
     python examples/own_recordings.py                    # recordings that are made here
     python examples/own_recordings.py --root FOLDER      # runs of your own, files of the same names
 
-A run is three files: ``RUN.mp4`` from the camera, ``RUN-encoder.csv`` (columns time, speed) from an encoder on a wheel,
-and ``RUN-truth.csv`` (time, position, speed) from what you trust, such as a tracker, to train and to score with. Each
-has a rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees where the cart is, the encoder how fast
-it goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
+A run is three files: ``RUN.mp4`` from the camera, ``RUN-encoder.csv`` (time, speed) from an encoder on a wheel, and
+``RUN-truth.csv`` (time, position, speed) from what you trust, such as a tracker, to train and to score with. Each has a
+rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees where the cart is, the encoder how fast it
+goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
 """
 
 from __future__ import annotations
@@ -102,6 +102,8 @@ def make_filter(data: RecordingReplay) -> Filter:
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
     pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
     initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
+    encoder = {"sensor_key": "encoder", "observed_key": "encoder_observed"}
+    encoder |= {"predicted_key": "encoder_predicted", "noise_variance_key": "encoder_noise"}
     return Filter(
         {
             "sensor": ImageSensor(
@@ -120,14 +122,7 @@ def make_filter(data: RecordingReplay) -> Filter:
             "h_camera": Select([0]),
             "by_camera": EnsembleAnalysis("etkf", belief_key="middle"),
             "h_encoder": Select([1], in_key=("middle", "ensemble"), out_key="encoder_predicted"),
-            "by_encoder": EnsembleAnalysis(
-                "etkf",
-                forecast_key=("middle", "ensemble"),
-                predicted_key="encoder_predicted",
-                sensor_key="encoder",
-                noise_variance_key="encoder_noise",
-                observed_key="encoder_observed",
-            ),
+            "by_encoder": EnsembleAnalysis("etkf", forecast_key=("middle", "ensemble"), **encoder),
         },
         initial=initial,
     )
@@ -136,20 +131,17 @@ def make_filter(data: RecordingReplay) -> Filter:
 def train(model: Filter, data: RecordingReplay, out: Path, updates: tuple[int, int]) -> None:
     """The sensor alone, then all of the filter through 20 steps; resumes where it was broken off."""
     scale = data.statistics["state", "std"]
-    of_sensor = SensorLoss(model, observation_scale=scale[:1])
-    of_filter = DEnKFLoss(model, state_scale=scale, observation_scale=scale[:1], nll=0.02)
-    stages = [
-        Stage("sensor", of_sensor, data.draw, updates[0], lengths={0: 8}),
-        Stage("filter", of_filter, data.draw, updates[1], lr=1e-3, lengths={0: 10, updates[1] // 2: 20}),
-    ]
-    FilterTrainer(model, stages, out=out, device="cpu", keep="last").fit()
+    loss = DEnKFLoss(model, state_scale=scale, observation_scale=scale[:1], nll=0.02)
+    sensor = Stage("sensor", SensorLoss(model, observation_scale=scale[:1]), data.draw, updates[0], lengths={0: 8})
+    whole = Stage("filter", loss, data.draw, updates[1], lr=1e-3, lengths={0: 10, updates[1] // 2: 20})
+    FilterTrainer(model, [sensor, whole], out=out, device="cpu", keep="last").fit()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--updates", nargs=2, type=int, default=(250, 150), help="of the sensor and of the filter")
     parser.add_argument("--root", type=Path, help="folder of runs; made by default")
     parser.add_argument("--out", type=Path, default=Path("runs/own-recordings-page"))
-    parser.add_argument("--updates", nargs=2, type=int, default=(250, 150), help="of the sensor and of the filter")
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
     args = parser.parse_args()
     torch.manual_seed(0)
@@ -177,13 +169,8 @@ def main() -> None:
     belief, truth = seen["belief", "mean"], seen["state"]
     # The same sensors without a filter: what each read last is held.
     start = data.statistics["state", "mean"].expand(len(seen), 2)
-    reading = torch.cat(
-        [
-            hold_last(seen["sensor", "ensemble"].mean(-2), seen["observed"], start[:, :1]),
-            hold_last(seen["encoder"], seen["encoder_observed"], start[:, 1:]),
-        ],
-        -1,
-    )
+    position = hold_last(seen["sensor", "ensemble"].mean(-2), seen["observed"], start[:, :1])
+    reading = torch.cat([position, hold_last(seen["encoder"], seen["encoder_observed"], start[:, 1:])], -1)
     print(f"{len(unseen.episodes)} unseen runs, 30 % of the frames missing: root mean squared error, cm and cm/s")
     for name, states in (("filter", belief), ("last readings", reading)):
         error = 100 * (states - truth).square().mean((0, 1)).sqrt()
@@ -196,14 +183,9 @@ def main() -> None:
 def draw(seen, reading: torch.Tensor, file: Path) -> None:
     """Position and speed with their 90 % bands, the truth and what was read; shaded where the encoder is silent."""
     reading = reading.where(torch.cat([seen["observed"], seen["encoder_observed"]], -1), torch.nan)
-    axes = plot_bands(
-        seen,
-        names=["position, cm", "speed, cm/s"],
-        factors=[100, 100],
-        readings={dim: reading[:, dim] for dim in (0, 1)},
-        observed="encoder_observed",
-        time=1 / RATE,
-    )
+    dots, names = {dim: reading[:, dim] for dim in (0, 1)}, ["position, cm", "speed, cm/s"]
+    shaded = {"observed": "encoder_observed", "time": 1 / RATE}
+    axes = plot_bands(seen, names=names, factors=[100, 100], readings=dots, **shaded)
     axes[0].figure.savefig(file, dpi=110)
     print(f"  {file}")
 

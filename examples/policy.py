@@ -55,8 +55,7 @@ class Pendulum(EnvBase):
 
     def __init__(self, count: int):
         super().__init__(batch_size=[count])
-        entries = {"state": Unbounded((count, 3)), "encoder": Unbounded((count, 2))}
-        self.observation_spec = Composite(entries, shape=[count])
+        self.observation_spec = Composite(state=Unbounded((count, 3)), encoder=Unbounded((count, 2)), shape=[count])
         self.state_spec = Composite({"state": Unbounded((count, 3))}, shape=[count])
         self.action_spec = Bounded(-TORQUE, TORQUE, (count, 1))
         self.reward_spec = Unbounded((count, 1))
