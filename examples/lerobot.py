@@ -6,6 +6,10 @@
 Any folder of LeRobot 2.0, 2.1 or 3.0 will do. The sensor reads the state from single pictures. Where commands were
 recorded, they drive the filter's motion, which is learned. ``examples/kitti.py``, ``ur5.py`` and ``own_recordings.py``
 are the same page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot]"``.
+
+Without --root it takes about a minute. Unseen episodes, 30 % of the frames missing, mean absolute error of two joints:
+about 0.06 rad for the filter, 0.07 for the last reading, 0.47 for the mean pose. The 90 % intervals hold 97 %: they are
+wider than they need be. A folder of a real robot wants many more updates than the default.
 """
 
 from __future__ import annotations

@@ -7,6 +7,10 @@ A run is three files: ``RUN.mp4`` from the camera, ``RUN-encoder.csv`` (time, sp
 ``RUN-truth.csv`` (time, position, speed) from what you trust, such as a tracker, to train and to score with. Each has a
 rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees where the cart is, the encoder how fast it
 goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
+
+Without --root it takes about a minute and a half of one core. Three unseen runs, 30 % of the frames missing: the filter
+is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The 90 %
+intervals hold 97 % of the positions and 88 % of the speeds.
 """
 
 from __future__ import annotations

@@ -5,7 +5,11 @@
 Nobody measures the speed, and the motor is too weak to lift the pendulum at once. First a filter learns gravity, motor
 and gusts from random torques and the encoder alone, by the readings' likelihood (``DEnKFLoss.ad_enkf``): it never sees
 the true state. One line appends it to the environment. Then the same PPO is trained three times: on the belief's mean,
-on the last reading, and on the last four. Each writes its returns into ``--out`` as CSV.
+on the last reading, and on the last four. Each writes its rewards into ``--out`` as CSV.
+
+It takes about three and a half minutes of one core. Seed 0; returns over 256 new episodes of 200 steps, and how much of
+their second half the pendulum stands upright: about -560 and 42 % on the belief, -1100 and 7 % on the last reading,
+-940 and 22 % on the last four. One training of each; none has learned to stand still.
 """
 
 from __future__ import annotations
