@@ -7,8 +7,8 @@ The camera sends a picture every seventh step, about. The sensor reads joints an
 commands move the arm, and goes on between pictures. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
 the same page for other robots. The full study, with every filter and disturbance, is ``python -m benchmarks.ur5``.
 
-Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean absolute
-error: joints about 5 degrees and place 2.8 cm for the filter, 10 degrees and 2.8 cm for the last reading. 200 demos at
+Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean
+absolute error: joints about 5 degrees and place 2.8 cm for the filter, 10 degrees and 2.8 cm for the last reading. 200 demos at
 64 px are few for the sensor, and the 90 % intervals hold 76 %. This arm follows its commands well: the last command
 alone is off by 1.4 degrees. The study, with a larger sensor and more demos, reaches 1.5 degrees from pictures alone.
 """
