@@ -82,6 +82,14 @@ print(*sorted({{'mujoco', 'dm_control', 'cv2', 'matplotlib'}} & (set(sys.modules
     assert set(result.stdout.split()) <= may - {"mujoco"}
 
 
+@pytest.mark.parametrize("package", ["torch_denkf", "torch_denkf.data"])
+def test_importing_all_names_warns_of_none(package):
+    code = (
+        f"import torch, torchrl.envs, warnings; warnings.simplefilter('error'); from {package} import *; LeRobotReplay"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_every_public_name_is_there():
     for name in (
         "functional",

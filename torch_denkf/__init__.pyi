@@ -1,5 +1,6 @@
 from .data.kitti.replay import KITTIOdometryExperienceReplay
-from .data.lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
+from .data.lerobot.replay import LeRobotExperienceReplay as LeRobotExperienceReplay
+from .data.lerobot.replay import LeRobotReplay
 from .data.recordings.frames import Images, Video
 from .data.recordings.replay import Recording, RecordingReplay
 from .data.recordings.tables import Table
@@ -58,7 +59,6 @@ __all__ = [
     "KalmanFilter",
     "LSTMFilter",
     "LastAction",
-    "LeRobotExperienceReplay",
     "LeRobotReplay",
     "LinearGaussianEnv",
     "MissingFrames",

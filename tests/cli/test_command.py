@@ -45,6 +45,20 @@ def test_wrong_words_are_one_line(capsys):
         assert err.endswith(f"see denkf {words[0]} --help\n")
 
 
+@pytest.mark.parametrize("command", ["train", "evaluate", "odometry"])
+def test_numbers_out_of_range_are_mistakes(command, capsys):
+    for word, value, text in (("--threads", "0", "at least 1, got 0"), ("--seed", "-1", "at least 0, got -1")):
+        assert main([command, word, value]) == 2
+        assert f"error: argument {word}: must be {text}; see denkf {command} --help" in capsys.readouterr().err
+    assert main([command, "--seed", "x"]) == 2
+    assert "argument --seed: invalid whole number value: 'x'" in capsys.readouterr().err
+
+
+def test_a_device_that_is_not_there(tmp_path, capsys):
+    assert main(["train", "--out", str(tmp_path), "--rendered", "3", "--device", "nowhere"]) == 2
+    assert "error: --device nowhere cannot be used here: " in capsys.readouterr().err
+
+
 def raising(error):
     def run(args):
         raise error

@@ -202,3 +202,17 @@ def test_height_scales_the_path_and_cannot_be_seen(moving):
         roads = [image_motion(*pair, calibration_of(moving), height=height)[1] for pair in pairwise(images)]
         motions.append(np.median([ROAD_SHIFTS[road.max(0).argmax()] for road in roads]))
     assert motions[1] == pytest.approx(1.5 * motions[0], rel=0.15)
+
+
+def test_a_damaged_frame_of_a_video_is_missing(tmp_path):
+    """It does not end the video."""
+    file = tmp_path / "run.mkv"
+    writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
+    for number in range(8):
+        writer.write(np.random.default_rng(number).integers(0, 255, (240, 320, 3), np.uint8))
+    writer.release()
+    data = bytearray(file.read_bytes())
+    starts = [k for k in range(len(data)) if data[k : k + 3] == b"\xff\xd8\xff"]
+    data[starts[5] : starts[5] + 2000] = bytes(2000)
+    file.write_bytes(data)
+    assert [frame is None for frame in read_frames(file)] == [k == 5 for k in range(8)]

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-__all__ = ["Command", "say"]
+__all__ = ["Command", "say", "whole"]
 
 
 class _Parser(argparse.ArgumentParser):
@@ -99,6 +99,24 @@ class Command:
         except KeyboardInterrupt:
             sys.stderr.write(f"interrupted{'; the same command goes on from here' if self.resumable else ''}\n")
             return 130
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, at least so large.
+
+    Example:
+        >>> whole(1)("3")
+        3
+    """
+
+    def read(text: str) -> int:
+        number = int(text)
+        if number < least:
+            raise argparse.ArgumentTypeError(f"must be at least {least}, got {number}")
+        return number
+
+    read.__name__ = "whole number"  # argparse names it for what is no number
+    return read
 
 
 def say(text: str) -> None:

@@ -26,7 +26,7 @@ import sys
 from pathlib import Path
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.data.ur5 import files
 from torch_denkf.envs.ur5.collect import EPISODE, collect_ur5_demos
 from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
@@ -43,7 +43,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--no-pixels", action="store_true", help="states and actions alone")
     add("--domain", choices=DOMAIN_NAMES, default="sim", help="of the environment")
     add("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="in turn")
-    add("--seed", type=int, default=0, help="another one gives other demos")
+    add("--seed", type=whole(0), default=0, help="another one gives other demos")
     add("--max-steps", type=int, default=EPISODE, help="of each demo that are kept")
     add("--noise", type=float, default=0.0, help="of the expert's joint targets, rad")
     add("--processes", type=int, default=os.cpu_count() or 1, help="that collect at a time")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -29,10 +29,10 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up, rad")
     add("--missing", type=float, default=0.0, help="share of the frames to lose")
-    add("--draws", type=int, default=8, help="of the filter's noise, over which errors are averaged")
-    add("--window", type=int, default=100, help="steps of the end point errors")
-    add("--seed", type=int, default=0, help="of the noise")
-    add("--threads", type=int, default=1, help="of torch and OpenCV")
+    add("--draws", type=whole(1), default=8, help="of the filter's noise, over which errors are averaged")
+    add("--window", type=whole(1), default=100, help="steps of the end point errors")
+    add("--seed", type=whole(0), default=0, help="of the noise")
+    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
 
 
 def _run(args: argparse.Namespace) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -35,9 +35,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--times", type=Path, metavar="FILE", help="a time in s for each frame, a row each")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
-    add("--seed", type=int, default=0, help="of the filter's noise")
+    add("--seed", type=whole(0), default=0, help="of the filter's noise")
     add("--no-pictures", action="store_true", help="leave the pictures out")
-    add("--threads", type=int, default=1, help="of torch and OpenCV")
+    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -54,7 +54,7 @@ def _run(args: argparse.Namespace) -> None:
     car, source = load_car_filter(args.checkpoint), read_frames(args.frames)
     folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
     calibration = read_camera(args.calibration, args.camera or folder)
-    times, fps = _times(args.times, source), args.fps or source.fps
+    times, fps = _times(args.times, source), source.fps if args.fps is None else args.fps
     if times is None and fps is None:
         raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
     beliefs = track(

@@ -19,7 +19,7 @@ import argparse
 import os
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command
+from torch_denkf.cli._command import Command, whole
 from torch_denkf.data.kitti.render import GREY_OR_COLOUR, render_drives
 from torch_denkf.simulation.street.camera import KITTI_FOCAL
 
@@ -33,7 +33,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--names", nargs="+", help="drives: all pose files, or 00 to 10 when invented")
     add("--size", nargs=2, type=int, default=(50, 150), metavar=("H", "W"), help="of the images")
     add("--frames", type=int, help="at most so many images a drive; 300 when invented")
-    add("--seed", type=int, default=0, help="another one gives other scenes")
+    add("--seed", type=whole(0), default=0, help="another one gives other scenes")
     add("--camera", choices=GREY_OR_COLOUR, default="image_2", help="image_0 is grey")
     add("--focal", type=float, default=KITTI_FOCAL, help="focal length as a share of the width")
     add("--processes", type=int, default=os.cpu_count() or 1, help="that draw at a time")

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -33,9 +33,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--filter-updates", type=int, default=300, help="of the filter on its readings")
     add("--end-to-end-updates", type=int, default=40, help="of both together")
     add("--length", type=int, default=24, help="steps of the windows that the filter learns from")
-    add("--seed", type=int, default=0, help="of all random numbers")
+    add("--seed", type=whole(0), default=0, help="of all random numbers")
     add("--device", default="cpu", help="that the networks run on")
-    add("--threads", type=int, default=1, help="of torch and OpenCV; the networks are small")
+    add("--threads", type=whole(1), default=1, help="of torch and OpenCV; the networks are small")
     add("--processes", type=int, default=1, help="that render at a time")
 
 
@@ -47,6 +47,10 @@ def _run(args: argparse.Namespace) -> None:
 
     from torch_denkf.odometry import Updates, read_config, train_car_filter
 
+    try:
+        torch.empty(0, device=args.device)
+    except (AssertionError, RuntimeError) as error:
+        raise ValueError(f"--device {args.device} cannot be used here: {str(error).splitlines()[0]}") from error
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
     train_car_filter(

@@ -6,7 +6,8 @@ from .kitti.mirror import mirror_drive
 from .kitti.motion import with_motion
 from .kitti.render import random_drive, render_drives, roadside_scene, write_drives
 from .kitti.replay import KITTIOdometryExperienceReplay
-from .lerobot.replay import LeRobotExperienceReplay, LeRobotReplay
+from .lerobot.replay import LeRobotExperienceReplay as LeRobotExperienceReplay
+from .lerobot.replay import LeRobotReplay
 from .lerobot.rows import recording_from_rows
 from .options import ReplayOptions
 from .recordings.frames import Images, Video
@@ -22,7 +23,6 @@ __all__ = [
     "EpisodeReplay",
     "Images",
     "KITTIOdometryExperienceReplay",
-    "LeRobotExperienceReplay",
     "LeRobotReplay",
     "Recording",
     "RecordingReplay",

@@ -28,12 +28,12 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
     """(height, width) as whole numbers.
 
     Raises:
-        ValueError: if one is not positive.
+        ValueError: if they are not two, or one is not positive.
     """
-    height, width = (int(side) for side in size)
-    if height < 1 or width < 1:
-        raise ValueError(f"size is (height, width) in pixels and must be positive, got {tuple(size)}")
-    return height, width
+    sides = [int(side) for side in size] if isinstance(size, Sequence) else []
+    if len(sides) != 2 or min(sides) < 1:
+        raise ValueError(f"size is (height, width) in pixels and must be positive, got {size}")
+    return sides[0], sides[1]
 
 
 def text_of_size(size: Sequence[int]) -> str:
@@ -100,6 +100,10 @@ class JoinedPictures:
         self.stores = list(stores)
         lengths = torch.tensor([len(store) for store in self.stores], dtype=torch.int64)
         self._ends = lengths.cumsum(0)
+
+    def __deepcopy__(self, memo: dict) -> JoinedPictures:
+        # Nothing writes pictures, and torch cannot copy memory-mapped ones.
+        return self
 
     @property
     def shape(self) -> torch.Size:

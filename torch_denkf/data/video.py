@@ -75,9 +75,12 @@ def _codec(capture: cv2.VideoCapture) -> str:
 
 
 def _by_opencv(capture: cv2.VideoCapture) -> Iterator[tuple[float, np.ndarray]]:
-    # A failed read is the end, or a damaged frame in the middle: then further reads go on behind it.
-    for _ in range(max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))):
+    # A failed read is the end, or a damaged frame in the middle: then further reads go on behind it. The count is a
+    # guess, too low where the rate varies, so that the end is the first failure after it.
+    expected, read, there = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, True
+    while there or read < expected:
         there, frame = capture.read()
+        read += 1
         if there:
             yield capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, frame[..., ::-1]
 

@@ -7,6 +7,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
 
 import cv2
@@ -132,11 +133,16 @@ class FrameSource:
     def _video(self) -> Iterator[np.ndarray | None]:
         video = cv2.VideoCapture(str(self.path))
         try:
-            while True:
+            # A failed read is the end, which comes before or after the guessed count, or a damaged frame before it.
+            expected, read, missing, there = video.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0, True
+            while there or read < expected:
                 there, image = video.read()
-                if not there:
-                    return
-                yield image
+                read += 1
+                missing += not there
+                if there:
+                    yield from repeat(None, missing)
+                    yield image
+                    missing = 0
         finally:
             video.release()
 
@@ -168,7 +174,10 @@ def read_frames(path: str | Path) -> FrameSource:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        files = sorted((f for f in path.iterdir() if f.suffix.lower() in _IMAGES), key=lambda f: _natural(f.name))
+        files = sorted(
+            (f for f in path.iterdir() if f.suffix.lower() in _IMAGES and not f.name.startswith(".")),
+            key=lambda f: _natural(f.name),
+        )
         if not files:
             raise FileNotFoundError(f"no images in {path}; expected png, jpg, bmp, tif, pgm, ppm or webp files")
         numbers = [int(file.stem) if file.stem.isdigit() else -1 for file in files]

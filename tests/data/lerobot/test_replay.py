@@ -201,8 +201,8 @@ def test_the_second_open_reads_the_cache(root, tmp_path, monkeypatch):
         patch.setattr(recording_module, "read_table", None)
         again = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
         parts = [LeRobotReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
-    assert isinstance(again._images, MemoryMappedTensor)
-    assert again._images.dtype == torch.uint8
+    assert isinstance(again._images.stores[0], MemoryMappedTensor)
+    assert again._images.stores[0].dtype == torch.uint8
     assert "pixels" not in again._storage[:]
     assert (again[:] == first[:]).all()
     check_rows(again, LENGTHS)

@@ -31,3 +31,4 @@ def write_images(folder, names):
 def write_csv(file, **columns):
     lines = [",".join(columns), *(",".join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True))]
     file.write_text("\n".join(lines) + "\n")
+    return file

@@ -65,8 +65,8 @@ def test_videos(tmp_path):
     write_csv(tmp_path / "run.csv", time=np.arange(5) / 10 + 1e6, x=np.arange(5))
     fails(
         ValueError,
-        r"recording 'run': the streams have fewer than two rows in common: camera from 0 to 0.4 s, state from 1e\+06 "
-        r"to 1e\+06 s; .* pass start=",
+        r"recording 'run': the streams have fewer than two rows in common: camera from 0 to 0.4 s, state from 1000000 "
+        r"to 1000000.4 s; .* pass start=",
         camera=Video(tmp_path / "run.mkv"),
         state=state,
     )
@@ -74,8 +74,11 @@ def test_videos(tmp_path):
     write_video(tmp_path / "six.mkv", 6)
     fails(ValueError, r"run.csv has 5 times, but .*six.mkv has 6 pictures",
           camera=Video(tmp_path / "six.mkv", times=tmp_path / "run.csv"))  # fmt: skip
-    fails(ValueError, r"picture 1 \(from 0\) of .*run.mkv: 'time' goes from 3 to 2 s",
+    fails(ValueError, r"times\[1\]: 'time' goes from 3 to 2 s",
           camera=Video(tmp_path / "run.mkv", times=[3, 2, 1, 0, -1]))  # fmt: skip
+    fails(ValueError, r"times\[2\]: 'time' is nan", camera=Video(tmp_path / "run.mkv", times=[0, 1, np.nan, 3, 4]))
+    with pytest.raises(ValueError, match="start is a time in s, got nan"):
+        Video(tmp_path / "run.mkv", start=np.nan)
     (tmp_path / "run.mkv").write_bytes(b"nothing")
     fails(ValueError, r"no frame of .*run.mkv can be decoded.*AV1", camera=Video(tmp_path / "run.mkv"))
 
@@ -85,7 +88,11 @@ def test_images(tmp_path):
     write_images(tmp_path / "run", ["a.png", "b.png"])
     fails(ValueError, r"nothing says when the images in .*run were taken: .*'a.png'.*pass times= or rate=",
           camera=Images(tmp_path / "run"))  # fmt: skip
-    fails(ValueError, r"rate is .* positive, got 0", camera=Images(tmp_path / "run", rate=0.0))
+    for rate in (0.0, np.inf):
+        with pytest.raises(ValueError, match=r"rate is .* positive, got"):
+            Images(tmp_path / "run", rate=rate)
+    with pytest.raises(ValueError, match="times or rate, not both"):
+        Images(tmp_path / "run", rate=1.0, times=[0.0, 1.0])
     cv2.imwrite(str(tmp_path / "run/c.png"), np.zeros((5, 7, 3), np.uint8))
     fails(ValueError, r"c.png is 7 pixels wide and 5 high, but .*a.png is 32 pixels wide",
           camera=Images(tmp_path / "run", rate=1.0))  # fmt: skip
@@ -100,7 +107,13 @@ def test_streams_and_clocks(tmp_path):
         ValueError, "clock is a stream, one of .*'state'.*, or a rate in Hz; got 'camera'", state=table, clock="camera"
     )
     fails(ValueError, "a positive rate in Hz, got 0", state=table, clock=0)
-    fails(ValueError, "an entry 'time' of its own", time=table)
+    for name in ("time", "_row", "_reset", "reward", "recorded", "belief"):
+        fails(ValueError, f"an entry '{name}' of its own", **{name: table})
+    fails(TypeError, "name is that of the recording, got Table", name=table, state=table)
+    with pytest.raises(TypeError, match="a list of them; got Table"):
+        RecordingReplay([table])
+    fails(ValueError, "10 rows a second from 0 to 200000000 s are more than 1e\\+08; .*unit=", clock=10.0,
+          state=Table(write_csv(tmp_path / "ms.csv", time=[0, 1e8, 2e8], x=[1, 2, 3])))  # fmt: skip
     fails(ValueError, "an entry 'imu_observed' of its own", imu_observed=table)
     fails(ValueError, r"one camera, got \['left', 'right'\]", left=Video("a.mp4"), right=Video("b.mp4"))
     fails(TypeError, "stream 'state' is a Video, Images or Table, got str", state="run.csv")

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_denkf.data.episodes import Episode
 from torch_denkf.data.lerobot.recording import DecodedRecording, read_recording
 from torch_denkf.data.options import ReplayOptions, check_options
-from torch_denkf.data.pictures import check_size, float_pictures
+from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
 
@@ -138,7 +138,7 @@ class LeRobotReplay(EpisodeReplay):
                 progress=options.get("progress", True),
             )
         self.fps, self.names = recording.fps, recording.names
-        self._images = recording.rows["image"]
+        self._images = JoinedPictures([recording.rows["image"]])
         numbers, lengths = torch.unique_consecutive(recording.rows["episode"], return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
         super().__init__(

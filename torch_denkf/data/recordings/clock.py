@@ -11,6 +11,7 @@ __all__ = ["Way", "interpolate", "last_reading", "nearest_reading", "row_times"]
 
 Way = Literal["last", "nearest", "linear"]
 SLACK = 1e-6  # s: times that differ by less are the same
+MOST_ROWS = 10**8  # of one recording: eleven days at 100 Hz
 
 
 def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarray:
@@ -21,7 +22,7 @@ def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarr
         clock: the stream whose times are the rows', or a rate in Hz.
 
     Raises:
-        ValueError: if the streams do not overlap by two rows.
+        ValueError: if the streams do not overlap by two rows, or by so many that the times cannot be in s.
 
     Examples:
         >>> row_times({"camera": np.array([0.0, 0.5, 1.0, 1.5]), "state": np.array([0.4, 1.1])}, "camera")
@@ -36,9 +37,14 @@ def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarr
             times = streams[clock]
             rows = times[(times >= begin - SLACK) & (times <= end + SLACK)]
         else:
+            if (end - begin) * clock > MOST_ROWS:
+                raise ValueError(
+                    f"{clock:g} rows a second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a "
+                    "lower clock=, or unit= for tables whose times are not in s"
+                )
             rows = begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
     if len(rows) < 2:
-        spans = ", ".join(f"{name} from {times[0]:.6g} to {times[-1]:.6g} s" for name, times in streams.items())
+        spans = ", ".join(f"{name} from {times[0]:.15g} to {times[-1]:.15g} s" for name, times in streams.items())
         raise ValueError(
             f"the streams have fewer than two rows in common: {spans}; their clocks must be the same: pass start= or "
             "times= for pictures, and unit= for tables whose times are not in s"

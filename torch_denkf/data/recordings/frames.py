@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +24,7 @@ from torch_denkf.data.video import NOT_DECODED, decoded_frames
 
 __all__ = ["Frames", "Images", "Video"]
 
-_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 
@@ -45,7 +46,8 @@ class Frames:
             row's time with ``"nearest"``.
 
     Raises:
-        ValueError: for an unknown ``unit`` or ``sample``, and tolerances that are not positive.
+        ValueError: for an unknown ``unit`` or ``sample``, tolerances that are not positive, and a ``start`` that is no
+            time.
     """
 
     file: str | Path
@@ -58,6 +60,8 @@ class Frames:
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
+        if not isinstance(self.start, Real) or not np.isfinite(self.start):
+            raise ValueError(f"start is a time in s, got {self.start!r}")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
         """All pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64 ``[F]``, s.
@@ -104,6 +108,7 @@ class Frames:
             check_times(times * SECONDS[self.unit], where, self.time)
         else:
             times = np.asarray(given, dtype=np.float64).reshape(-1)
+            check_times(times * SECONDS[self.unit], "times[{}]".format, self.time)
         # Damaged pictures are not stored: the place of each tells which time is its own.
         place, there = stored["place"].numpy(), int(stored["count"][0])
         if len(times) != there:
@@ -165,7 +170,10 @@ class Images(Frames):
     """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
 
     Args:
-        rate: pictures a second, from ``start`` on, where neither ``times`` nor the names say when they were taken.
+        rate: pictures a second, from ``start`` on, in the place of ``times`` and of the numbers in the names.
+
+    Raises:
+        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` beside it.
 
     Examples:
         >>> Images("run1/images", rate=10.0).sample
@@ -174,10 +182,23 @@ class Images(Frames):
 
     rate: float | None = None
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.rate is None:
+            return
+        if self.times is not None:
+            raise ValueError("pass times or rate, not both")
+        if not 0 < self.rate < np.inf:
+            raise ValueError(f"rate is the number of pictures a second and must be positive, got {self.rate}")
+
     def _files(self, source: Path) -> list[Path]:
         if not source.is_dir():
             raise FileNotFoundError(f"no folder {source}; check the path")
-        files = [file for file in source.iterdir() if file.suffix.lower() in _SUFFIXES]
+        files = [
+            file  # hidden ones, such as ._1.png, are a file manager's
+            for file in source.iterdir()
+            if file.suffix.lower() in _SUFFIXES and not file.name.startswith(".") and file.is_file()
+        ]
         if not files:
             raise ValueError(f"no images in {source}; expected names that end in {', '.join(_SUFFIXES)}")
         return sorted(files, key=_in_order)
@@ -189,8 +210,6 @@ class Images(Frames):
     def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
         place = stored["place"].numpy()
         if self.rate is not None:
-            if not self.rate > 0:
-                raise ValueError(f"rate is the number of pictures a second and must be positive, got {self.rate}")
             return place / self.rate
         times = [_number(file) for file in self._files(source)]
         if None in times:

@@ -24,6 +24,7 @@ from torch_denkf.data.statistics import picture_statistics
 
 __all__ = ["Recording", "RecordingReplay"]
 
+_PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
 _TAKEN = (
     "episode",
     "step",
@@ -36,6 +37,9 @@ _TAKEN = (
     "terminated",
     "truncated",
     "index",
+    "reward",
+    "recorded",
+    "belief",
 )
 
 
@@ -63,13 +67,19 @@ class Recording:
     """
 
     def __init__(self, *, name: str | None = None, **streams: Frames | Table):
+        if not (name is None or isinstance(name, str)):
+            raise TypeError(f"name is that of the recording, got {type(name).__name__}; give the stream another name")
         if not streams:
             raise ValueError("a recording needs streams, such as camera=Video('run1.mp4'), state=Table('run1.csv')")
         for key, stream in streams.items():
             if not isinstance(stream, (Frames, Table)):
                 raise TypeError(f"stream {key!r} is a Video, Images or Table, got {type(stream).__name__}")
-            if key.endswith("_observed") or (key in _TAKEN and not isinstance(stream, Frames)):
-                raise ValueError(f"the data set has an entry {key!r} of its own; give the stream another name")
+            taken = key in _TAKEN or key.startswith("_")
+            if key.endswith("_observed") or (taken and not isinstance(stream, Frames)):
+                raise ValueError(
+                    f"the data set, or an environment or a filter that reads it, has an entry {key!r} of its own; give "
+                    "the stream another name"
+                )
         cameras = [key for key, stream in streams.items() if isinstance(stream, Frames)]
         if len(cameras) > 1:
             raise ValueError(f"a recording has one camera, got {cameras}; make a data set for each")
@@ -176,14 +186,14 @@ class RecordingReplay(EpisodeReplay):
             self._check_columns(recording, streams)
             part, begin = _on_clock(recording, streams, clock)
             if recording.camera is not None:
-                frame = part["picture"]
-                part["picture"] = torch.where(frame >= 0, frame + sum(map(len, pictures)), -1)
+                frame = part[_PICTURE]
+                part[_PICTURE] = torch.where(frame >= 0, frame + sum(map(len, pictures)), -1)
                 pictures.append(streams[recording.camera]["pixels"])
             episodes.append(RecordingEpisode(recording.name, sum(map(len, rows)), len(part), begin))
             rows.append(part)
         together: TensorDict = torch.cat(rows)
         self._numbers = tuple(self.columns)
-        self._picture, self._pictures = together.pop("picture", None), JoinedPictures(pictures)
+        self._picture, self._pictures = together.pop(_PICTURE, None), JoinedPictures(pictures)
         super().__init__(
             together,
             episodes,
@@ -220,6 +230,9 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
     """
     if not recordings:
         raise ValueError("there are no recordings; pass one, or a list of them")
+    strange = [type(recording).__name__ for recording in recordings if not isinstance(recording, Recording)]
+    if strange:
+        raise TypeError(f"RecordingReplay reads a Recording, or a list of them; got {strange[0]}")
     first, names = recordings[0], [recording.name for recording in recordings]
     if len(set(names)) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -236,7 +249,7 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
         return first.camera or next(iter(first.streams))
     if isinstance(clock, str) and clock not in first.streams:
         raise ValueError(f"clock is a stream, one of {list(first.streams)}, or a rate in Hz; got {clock!r}")
-    if not isinstance(clock, str) and not clock > 0:
+    if not isinstance(clock, str) and not 0 < clock < np.inf:
         raise ValueError(f"clock is a stream or a positive rate in Hz, got {clock}")
     return clock
 
@@ -259,7 +272,7 @@ def _on_clock(recording: Recording, streams: Mapping[str, Any], clock: str | flo
             choose = last_reading if stream.sample == "last" else nearest_reading
             index, seen = choose(times[key], rows, stream.tolerance)
             if not isinstance(read, Readings):
-                out["picture"] = torch.from_numpy(np.where(seen, index, -1))
+                out[_PICTURE] = torch.from_numpy(np.where(seen, index, -1))
                 out["observed"] = torch.from_numpy(seen[:, None])
                 continue
             values = np.where((index >= 0)[:, None], read.values[index], 0.0)

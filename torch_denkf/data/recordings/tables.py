@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ __all__ = ["Readings", "Table", "Unit", "check_times", "read_numbers"]
 
 Unit = Literal["s", "ms", "us", "ns"]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Readings(NamedTuple):
@@ -84,6 +87,8 @@ class Table:
         if isinstance(self.columns, str):
             raise ValueError(f"columns is a list of names, such as [{self.columns!r}]; got {self.columns!r}")
         names, numbers, place = read_numbers(Path(self.file).expanduser(), self.time, columns)
+        if not names:
+            raise ValueError(f"{self.file} has no column to read beside {self.time!r}; leave the stream out")
         times = numbers[:, 0] * SECONDS[self.unit]
         check_times(times, place, self.time)
         return Readings(times, numbers[:, 1:], names)
@@ -112,15 +117,18 @@ def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> 
         column: name of their column.
 
     Raises:
-        ValueError: if there are none, or one does not ascend.
+        ValueError: if there are none, or one is not finite or does not ascend.
     """
     if not len(times):
         raise ValueError(f"{place(-1)} has no rows; leave the stream out")
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        raise ValueError(f"{place(int(bad[0]))}: {column!r} is {times[bad[0]]}; times are finite numbers")
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         k = int(back[0]) + 1
         raise ValueError(
-            f"{place(k)}: {column!r} goes from {times[k - 1]:.9g} to {times[k]:.9g} s; times must ascend: sort the "
+            f"{place(k)}: {column!r} goes from {times[k - 1]:.15g} to {times[k]:.15g} s; times must ascend: sort the "
             "rows, or take those out that are there twice"
         )
 
@@ -143,9 +151,33 @@ def _choose(file: Path, there: Sequence[str], time: str, columns: Sequence[str] 
     names = [time, *([name for name in there if name != time] if columns is None else columns)]
     missing = [name for name in names if name not in there]
     if missing:
-        hint = "pass time= for the column of times" if time in missing else "pass columns= of those"
-        raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {hint}")
+        raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {_hint(there, time, missing)}")
+    twice = [name for name in names if there.count(name) > 1]
+    if twice:
+        raise ValueError(f"{file} has two columns {twice[0]!r}; give one another name, or pass columns= without it")
     return names
+
+
+def _hint(there: Sequence[str], time: str, missing: Sequence[str]) -> str:
+    """What to do about columns that are not there."""
+    if len(there) == 1 and set(missing) & set(re.split(r"[;\t |]+", there[0])):
+        return "separate columns by commas, or by tabs in a .tsv"
+    if there and all(map(_is_number, there)):
+        return "its first line must name the columns"
+    return "pass time= for the column of times" if time in missing else "pass columns= of those"
+
+
+def _number(text: str) -> float:
+    """A finite number that float32 can hold; NaN for what is none."""
+    try:
+        number = float(text)
+    except ValueError:
+        return math.nan
+    return number if abs(number) <= LARGEST and "_" not in text else math.nan
+
+
+def _is_number(text: str) -> bool:
+    return not math.isnan(_number(text))
 
 
 def _no_number(place: str, column: str, value: object) -> ValueError:
@@ -160,25 +192,30 @@ def _read_csv(file: Path, time: str, columns: Sequence[str] | None):
         raise FileNotFoundError(f"no table {file}; check the path")
     numbers: list[list[float]] = []
     lines: list[int] = []
-    with file.open(newline="", encoding="utf-8-sig") as opened:
-        reader = csv.reader(opened, delimiter="\t" if file.suffix.lower() == ".tsv" else ",")
-        there = [name.strip() for name in next(reader, [])]
-        names = _choose(file, there, time, columns)
-        where = [there.index(name) for name in names]
-        for row in reader:
-            if not row:
-                continue
-            values = []
-            for column, name in zip(where, names, strict=True):
-                text = row[column] if column < len(row) else ""
-                try:
-                    values.append(float(text))
-                except ValueError as error:
-                    raise _no_number(f"{file}:{reader.line_num}", name, text) from error
-                if not np.isfinite(values[-1]):
-                    raise _no_number(f"{file}:{reader.line_num}", name, text)
-            numbers.append(values)
-            lines.append(reader.line_num)
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as opened:
+            reader = csv.reader(opened, delimiter="\t" if file.suffix.lower() == ".tsv" else ",")
+            filled = (row for row in reader if any(map(str.strip, row)))
+            there = [name.strip() for name in next(filled, [])]
+            names = _choose(file, there, time, columns)
+            where = [there.index(name) for name in names]
+            for row in filled:
+                place = f"{file}:{reader.line_num}"
+                if any(map(str.strip, row[len(there) :])):
+                    raise ValueError(
+                        f"{place}: {len(row)} cells for {len(there)} columns; write decimals with points, and name "
+                        "every column in the first line"
+                    )
+                texts = [row[column] if column < len(row) else "" for column in where]
+                numbers.append([_number(text) for text in texts])
+                if math.isnan(sum(numbers[-1])):
+                    name, text = next(pair for pair in zip(names, texts, strict=True) if not _is_number(pair[1]))
+                    raise _no_number(place, name, text)
+                lines.append(reader.line_num)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is no text in UTF-8 ({error}); store it anew as CSV in UTF-8") from error
+    except csv.Error as error:
+        raise ValueError(f"{file}:{reader.line_num}: {error}; store it anew as CSV") from error
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(names))
     return tuple(names[1:]), table, lambda row: f"{file}:{lines[row]}" if lines else str(file)
 
@@ -189,13 +226,19 @@ def _read_parquet(file: Path, time: str, columns: Sequence[str] | None):
     names = _choose(file, table.column_names, time, columns)
     numbers = np.empty((table.num_rows, len(names)))
     for column, name in enumerate(names):
+        values = table[name].to_numpy()
+        if values.dtype.kind == "M":  # it would become a count of days, or of milliseconds
+            raise ValueError(
+                f"{file}: {name!r} holds {table[name].type}; store it as a number, such as the ns since 1970, and "
+                "pass unit='ns'"
+            )
         try:
-            numbers[:, column] = table[name].to_numpy().astype(np.float64)
+            numbers[:, column] = values.astype(np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"{file}: {name!r} holds {table[name].type}, not a number a row; pass columns= without it"
             ) from error
-        bad = np.flatnonzero(~np.isfinite(numbers[:, column]))
+        bad = np.flatnonzero(~(np.abs(numbers[:, column]) <= LARGEST))
         if len(bad):
             raise _no_number(f"{file}, row {bad[0]} (from 0)", name, table[name][int(bad[0])].as_py())
     return tuple(names[1:]), numbers, lambda row: f"{file}, row {row} (from 0)" if table.num_rows else str(file)

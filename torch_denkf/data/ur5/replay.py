@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_denkf._progress import progress_bar
 from torch_denkf.data.options import ReplayOptions, check_options
-from torch_denkf.data.pictures import float_pictures
+from torch_denkf.data.pictures import JoinedPictures, float_pictures
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.ur5.cache import read_demos, read_entries
 from torch_denkf.data.ur5.rows import UR5Episode, demo_episodes, demo_rows, is_for_tests
@@ -94,7 +94,9 @@ class UR5ExperienceReplay(EpisodeReplay):
             demo_rows(demos["rows"]),
             demo_episodes(demos["rows"], entries),
             for_tests=lambda episode: is_for_tests(episode.demo),
-            pictures=None if self._frames is None else partial(_pixels, self._frames["pixels"], self._frame),
+            pictures=None
+            if self._frames is None
+            else partial(_pixels, JoinedPictures([self._frames["pixels"]]), self._frame),
             single=self._frame >= 0 if frames_only else None,
             root=folder,
             **options,
@@ -112,5 +114,5 @@ class UR5ExperienceReplay(EpisodeReplay):
         return {"mean": mean[:, None, None] / 255, "std": std[:, None, None] / 255}
 
 
-def _pixels(pictures: Tensor, frame: Tensor, row: Tensor) -> dict[str, Tensor]:
+def _pixels(pictures: JoinedPictures, frame: Tensor, row: Tensor) -> dict[str, Tensor]:
     return float_pictures(pictures, frame[row])

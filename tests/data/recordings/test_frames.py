@@ -1,0 +1,54 @@
+"""Pictures of videos whose rate varies, of folders with other files, and copies of data sets."""
+
+from copy import deepcopy
+from fractions import Fraction
+from pickle import dumps, loads
+
+import numpy as np
+import pytest
+
+from tests.data.recordings.own_files import SIZE, grey, write_csv, write_images
+from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
+from torch_denkf.envs import ReplayEnv
+
+
+def write_varying(av, file, times):
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("ffv1", rate=2)  # as the file says, from which the number of frames is guessed
+        stream.width, stream.height, stream.pix_fmt = SIZE[1], SIZE[0], "bgr0"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(grey(number), format="rgb24")
+            frame.pts, frame.time_base = round(time * 1000), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
+    av = pytest.importorskip("av")
+    times = np.array([0.0, 0.5, 1.0, *(1.5 + np.arange(40) / 200)])
+    write_varying(av, tmp_path / "run.mkv", times)
+    data = RecordingReplay(Recording(camera=Video(tmp_path / "run.mkv")), size=SIZE, cache=None)
+    np.testing.assert_allclose(data[:]["time"].squeeze(-1), times, atol=1e-6)
+    red = [int(grey(number)[0, 0, 0]) for number in range(43)]
+    assert (data[:]["pixels"][:, 0, 0, 0] * 255).round().int().tolist() == red
+
+
+def test_hidden_files_are_no_pictures(tmp_path):
+    write_images(tmp_path / "run", ["0.png", "1.png", "._1.png", "2.png"])
+    (tmp_path / "run" / "thumbnails.png").mkdir()
+    data = RecordingReplay(Recording(camera=Images(tmp_path / "run", rate=1.0)), size=SIZE, cache=None)
+    assert data[:]["time"].squeeze(-1).tolist() == [0, 1, 2]
+    assert data[:]["observed"].all()
+
+
+def test_copies_show_the_same(tmp_path):
+    """Also of pictures that are memory-mapped, which torch itself cannot copy."""
+    write_images(tmp_path / "run", [f"{k}.png" for k in range(6)])
+    write_csv(tmp_path / "run.csv", time=range(6), x=range(6))
+    run = Recording(camera=Images(tmp_path / "run"), picture=Table(tmp_path / "run.csv"))
+    data = RecordingReplay(run, size=SIZE, cache=tmp_path / "cache")
+    assert data[:]["picture"].squeeze(-1).tolist() == list(range(6))
+    for copy in (deepcopy(data), loads(dumps(data)), deepcopy(ReplayEnv(data)).data):
+        for key in ("pixels", "picture", "observed"):
+            assert copy[:][key].equal(data[:][key]), key
