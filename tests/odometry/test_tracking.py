@@ -4,13 +4,14 @@ import warnings
 import weakref
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from torch_denkf.data import bridge_gaps, read_kitti_drive, render_drives, with_motion
-from torch_denkf.odometry import car_filter, load_car_filter, track
+from torch_denkf.odometry import car_filter, load_car_filter, read_frames, track
 from torch_denkf.odometry.tracking import _Clock
 from torch_denkf.vision import ROAD_SHIFTS, image_motion
 

@@ -8,7 +8,6 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -60,7 +59,7 @@ class Frames:
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
-        if not isinstance(self.start, Real) or not np.isfinite(self.start):
+        if not np.isfinite(self.start):
             raise ValueError(f"start is a time in s, got {self.start!r}")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
