@@ -22,10 +22,10 @@ from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, Trans
 from torchrl.envs.transforms import Transform
 from tqdm import tqdm
 
-from torch_denkf.filters import DEnKF
+from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform
+from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform
+from torch_denkf.plots import plot_bands
 
 NOISE, DT = 0.05, 0.02  # encoder noise in rad; control step in s
 
@@ -109,32 +109,19 @@ def compare(rollout: TensorDict) -> str:
     ):
         errors = [(a - b).square().mean().sqrt() for a, b in ((position, truth[:, :2]), (velocity, truth[:, 2:]))]
         lines.append(f"| {name} | {errors[0]:.4f} | {errors[1]:.3f} |")
-    inside = ((mean - truth).abs() <= 1.645 * var.sqrt()).float().mean()
+    inside = interval_coverage(mean, var, truth, level=0.9).mean()
     return "\n".join(lines) + f"\n\n90 % intervals of the belief hold {100 * inside:.0f} % of the truth."
 
 
 def draw(rollout: TensorDict, file: Path) -> None:
-    """Draws the joint velocities over time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    fig, axes = plt.subplots(2, 1, figsize=(10, 5), sharex=True, layout="constrained")
-    seconds = torch.arange(len(rollout)) * DT
-    mean, std = rollout["next", "belief", "mean"], rollout["next", "belief", "var"].sqrt()
-    differences = rollout["next", "encoder"].diff(dim=0) / DT
-    for joint, axis in enumerate(axes):
-        dim = joint + 2
-        axis.plot(seconds[1:], differences[:, joint], "r.", markersize=2, alpha=0.5, label="encoder differences")
-        low, high = (mean[:, dim] + sign * 1.645 * std[:, dim] for sign in (-1, 1))
-        axis.fill_between(seconds, low, high, alpha=0.3, label="90 % of the belief")
-        axis.plot(seconds, rollout["next", "state"][:, dim], "k-", linewidth=1, label="truth")
-        axis.plot(seconds, mean[:, dim], "b-", linewidth=1, label="DEnKF")
-        axis.set(ylabel=f"joint {joint + 1}, rad/s", ylim=(-12, 12))
-    axes[0].legend(ncols=4, loc="upper right")
-    axes[1].set(xlabel="s")
-    fig.savefig(file, dpi=110)
+    """Draws the joint velocities over time, beside differences of the encoders."""
+    seen = rollout["next"]
+    differences = seen["encoder"].diff(dim=0, prepend=seen["encoder"][:1]) / DT
+    names, dots = ["joint 1, rad/s", "joint 2, rad/s"], {dim: differences[:, dim - 2] for dim in (2, 3)}
+    axes = plot_bands(seen, dims=[2, 3], names=names, readings=dots, time=DT)
+    for axis in axes:
+        axis.set_ylim(-12, 12)
+    axes[0].figure.savefig(file, dpi=110)
 
 
 def main() -> None:

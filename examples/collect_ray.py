@@ -32,9 +32,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase, InitTracker, StepCounter
 from tqdm import tqdm
 
-from torch_denkf.filters import DEnKF
+from torch_denkf import DEnKF, DEnKFLoss
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
-from torch_denkf.objectives import DEnKFLoss
 
 WINDOW = 25  # steps that are back-propagated through
 EPISODE = 200  # steps; a filter that has learned little goes astray in long ones

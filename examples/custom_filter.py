@@ -20,8 +20,7 @@ from torchrl.envs import Compose, RenameTransform, TransformedEnv
 from torchrl.envs.transforms import Transform
 from tqdm import tqdm
 
-from torch_denkf.envs import LinearGaussianEnv
-from torch_denkf.filters import Filter
+from torch_denkf import DEnKFLoss, DEnKFTransform, Filter, LinearGaussianEnv
 from torch_denkf.modules import (
     ConstantNoise,
     DiagonalNoise,
@@ -31,8 +30,6 @@ from torch_denkf.modules import (
     SubModel,
     VectorSensor,
 )
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform
 
 DT, ENSEMBLE = 0.5, 32
 BEACONS = torch.tensor([[30.0, 0.0], [-20.0, 25.0], [-20.0, -25.0]])  # m

@@ -41,8 +41,7 @@ def export(path: Path, compiled: bool) -> float:
     """Writes the package; returns the milliseconds that the same step takes here, eagerly."""
     from tensordict import TensorDict
 
-    from torch_denkf.deployment import export_step
-    from torch_denkf.filters import DEnKF
+    from torch_denkf import DEnKF, export_step
     from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select
 
     filter = DEnKF(

@@ -26,11 +26,10 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
+from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, KITTIReplayEnv
 from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
-from torch_denkf.envs import KITTIReplayEnv
-from torch_denkf.filters import DEnKF
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.metrics import dead_reckoning, kitti_endpoint_error
+from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_endpoint_error
 from torch_denkf.modules import (
     AroundState,
     DiagonalNoise,
@@ -42,8 +41,8 @@ from torch_denkf.modules import (
     UnicycleTransition,
     convolutional_trunk,
 )
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.transforms import DEnKFTransform
+from torch_denkf.plots import plot_bands, plot_path
+from torch_denkf.training import hold_last
 
 TRUNK = ((24, 5, 2), (32, 3, 2), (48, 3, 2), (64, 3, 2))  # a third of the work of Table I's, which is the default
 ENSEMBLE, VELOCITIES = 32, [3, 4]  # members; dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
@@ -182,26 +181,17 @@ def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
     return env.rollout(len(drive))["next"]
 
 
-def held_readings(rollout: TensorDict, missing_value: torch.Tensor | None) -> torch.Tensor:
-    """The sensor's mean readings [T, 2]; where a frame is missing, ``missing_value`` or the last reading."""
-    readings, last = [], rollout["state"][0, VELOCITIES]
-    for reading, observed in zip(rollout["sensor", "ensemble"].mean(1), rollout["observed"], strict=True):
-        value = reading if observed else (last if missing_value is None else missing_value)
-        readings.append(value)
-        last = value if missing_value is None else last
-    return torch.stack(readings)
-
-
 def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dict[str, torch.Tensor]:
     """The states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
-    start = rollout["state"][0, :3]
+    start, readings, observed = rollout["state"][0, :3], rollout["sensor", "ensemble"].mean(1), rollout["observed"]
+    held = hold_last(readings, observed, rollout["state"][0, VELOCITIES])
 
     def integrated(velocity: torch.Tensor) -> torch.Tensor:
         return torch.cat([dead_reckoning(velocity, start, dt), velocity], -1)
 
     return {
-        "sensor alone (training mean where it is blind)": integrated(held_readings(rollout, mean_velocity)),
-        "dead reckoning (last reading where it is blind)": integrated(held_readings(rollout, None)),
+        "sensor alone (training mean where it is blind)": integrated(readings.where(observed, mean_velocity)),
+        "dead reckoning (last reading where it is blind)": integrated(held),
         "**DEnKF**": rollout["belief", "mean"],
         "floor: dead reckoning with the true velocities": integrated(rollout["state"][:, VELOCITIES]),
     }
@@ -221,11 +211,9 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
             scores.append([float(error.translation), float(error.rotation), *velocity.tolist()])
         translation, rotation, v, theta_dot = torch.tensor(scores).mean(0).tolist()
         lines.append(f"| {name} | {translation:.3f} | {rotation:.3f} | {v:.2f} | {theta_dot * 57.2958:.2f} |")
-    inside = [
-        (r["belief", "mean"] - r["state"]).abs()[:, VELOCITIES] <= 1.645 * r["belief", "var"][:, VELOCITIES].sqrt()
-        for r in rollouts
-    ]
-    v, theta_dot = 100 * torch.cat(inside).float().mean(0)
+    together = torch.cat([r.select("state", "belief") for r in rollouts])
+    belief, truth = together["belief"], together["state"]
+    v, theta_dot = 100 * interval_coverage(belief["mean"], belief["var"], truth, level=0.9)[VELOCITIES]
     blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
     lines.append(
         f"\nThe sensor is blind in {blind:.0f} % of the steps. The DEnKF's 90 % intervals hold {v:.0f} % of v and "
@@ -234,37 +222,25 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
 
 
 def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:
-    """Draws the path on the ground plane with the belief's uncertainty, and the velocities over time."""
+    """Draws the path on the ground plane with its ensemble, and the velocities over time with their 90 % bands."""
     import matplotlib
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
 
-    truth, members = rollout["state"], rollout["belief", "ensemble"]
-    sensor, _, belief, _ = estimates.values()
     fig, axes = plt.subplot_mosaic("pv;pw", figsize=(13, 6), width_ratios=[1, 1.4], layout="constrained")
-    axes["p"].plot(-members[..., 1], members[..., 0], color="tab:blue", alpha=0.08, linewidth=1)
-    for name, path, style in (("truth", truth, "k-"), ("DEnKF", belief, "b-"), ("sensor alone", sensor, "r--")):
-        axes["p"].plot(-path[:, 1], path[:, 0], style, label=name)
-    axes["p"].plot([], [], color="tab:blue", alpha=0.4, label="ensemble members")
-    axes["p"].set(xlabel="right, m", ylabel="forward, m", title="path on the ground plane")
-    axes["p"].axis("equal")
-    axes["p"].legend()
-    seconds = torch.arange(len(truth)) * dt
-    seen = rollout["observed"].squeeze(-1)
-    for axis, dim, unit, factor in (("v", 3, "v, m/s", 1.0), ("w", 4, "theta_dot, deg/s", 57.2958)):
-        mean = belief[:, dim] * factor
-        band = 1.645 * rollout["belief", "var"][:, dim].sqrt() * factor
-        reading = rollout["sensor", "ensemble"][..., dim - 3].mean(1) * factor
-        axes[axis].fill_between(
-            seconds, mean - band, mean + band, color="tab:blue", alpha=0.25, label="90 % of the belief"
-        )
-        axes[axis].plot(seconds[seen], reading[seen], "r.", markersize=3, label="sensor readings")
-        axes[axis].plot(seconds, truth[:, dim] * factor, "k-", linewidth=1, label="truth")
-        axes[axis].plot(seconds, mean, "b-", linewidth=1, label="DEnKF")
-        axes[axis].set(xlabel="s", ylabel=unit)
-    axes["v"].legend(ncols=4, loc="lower center")
-    unseen = 100 * (1 - seen.float().mean())
+    plot_path(rollout, others={"sensor alone": next(iter(estimates.values()))}, forward_up=True, ax=axes["p"])
+    readings = rollout["sensor", "ensemble"].mean(1)
+    plot_bands(
+        rollout,
+        dims=VELOCITIES,
+        names=["v, m/s", "theta_dot, deg/s"],
+        factors=[1.0, 57.2958],
+        readings={dim: readings[:, number] for number, dim in enumerate(VELOCITIES)},
+        time=dt,
+        ax=[axes["v"], axes["w"]],
+    )
+    unseen = 100 * (1 - rollout["observed"].float().mean())
     fig.suptitle(f"An unseen drive; missing frames leave the sensor blind in {unseen:.0f} % of the steps")
     fig.savefig(file, dpi=110)
 

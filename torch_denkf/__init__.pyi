@@ -1,5 +1,4 @@
 from .data.kitti.replay import KITTIOdometryExperienceReplay
-from .data.lerobot.replay import LeRobotExperienceReplay as LeRobotExperienceReplay
 from .data.lerobot.replay import LeRobotReplay
 from .data.recordings.frames import Images, Video
 from .data.recordings.replay import Recording, RecordingReplay

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.common.scores import cost, counted
 from benchmarks.kitti.folds import VELOCITIES, Part
-from benchmarks.kitti.readings import all_frames, lose_frames, read_spans
+from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import REACH, KITTIRecipe
 from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
 from benchmarks.kitti.training import FLOOR, run_filter
@@ -30,6 +30,7 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
+from torch_denkf.odometry.streams import all_frames, lose_frames
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.kitti.streams import DISTURBANCES, Stream, mirror, rows
+from torch_denkf.odometry.batches import with_start
 
 VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 # Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
@@ -179,12 +180,3 @@ class FrameSampler:
             frames = rows(data, index(len(data)), self.sensor)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
         return chosen
-
-
-def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
-    """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
-    noise = torch.randn(len(windows), 1, 5, generator=generator)
-    windows["start"] = windows["state"] + start_std * noise
-    is_init = torch.zeros(*windows.batch_size, 1, dtype=torch.bool)
-    is_init[:, 0] = True
-    return windows.set("is_init", is_init)

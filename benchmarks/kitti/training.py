@@ -11,13 +11,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.common.scores import SensorLoss, belief_crps, coverage
+from benchmarks.common.scores import belief_crps, coverage
 from benchmarks.common.training import fit_filter, read_filter
 from benchmarks.kitti.folds import VELOCITIES, Fold, FrameSampler, Statistics
-from benchmarks.kitti.readings import ReadingSampler, all_frames, lose_frames, read_spans
+from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
 from torch_denkf.filters import Filter
+from torch_denkf.odometry.batches import ReadingSampler
+from torch_denkf.odometry.scores import EndToEndLoss
+from torch_denkf.odometry.streams import all_frames, lose_frames
 from torch_denkf.training import Stage, parameters_without, read_checkpoint
 
 INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4)
@@ -69,19 +72,6 @@ def gain_error(fold: Fold, base: SensorOfFold) -> float:
             read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
             logarithms.append((read.sum() / driven.sum()).clamp(0.5, 2.0).log())
     return float(torch.stack(logarithms).square().mean().sqrt())
-
-
-class EndToEndLoss(nn.Module):
-    """The filter's objective, and the sensor's own beside it."""
-
-    def __init__(self, objective: nn.Module, sensor: SensorLoss):
-        super().__init__()
-        self.objective, self.sensor = objective, sensor
-
-    def forward(self, frames: TensorDict) -> dict[str, Tensor]:
-        """All terms."""
-        own = {f"loss_sensor_{name[5:]}": 0.5 * value for name, value in self.sensor(frames.copy()).items()}
-        return {**self.objective(frames), **own}
 
 
 def train_filter(

@@ -10,7 +10,6 @@ from tensordict import TensorDict
 from benchmarks.common.tables import pick
 from benchmarks.kitti.evaluation import errors, integrate, last_velocities
 from benchmarks.kitti.folds import Fold, Part, Statistics, make_fold, with_disturbances
-from benchmarks.kitti.readings import ReadingSampler, all_frames, lose_frames, take_spans
 from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold
 from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
@@ -18,6 +17,8 @@ from benchmarks.kitti.study import rows_of
 from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
 from benchmarks.kitti.training import gain_error, run_filter
 from torch_denkf.metrics import dead_reckoning
+from torch_denkf.odometry.batches import ReadingSampler
+from torch_denkf.odometry.streams import all_frames, lose_frames, take_spans
 
 
 def streams(*drives, cameras=("image_0",)):
@@ -156,7 +157,7 @@ def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
 
 
 def test_windows_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"windows of 50 rows do not fit in readings of \[5\] rows"):
+    with pytest.raises(ValueError, match=r"windows of 50 steps do not fit in drives of 5 frames"):
         ReadingSampler([readings([[0.0, 0.0]] * 5)], [1.0], 50, 0.0)
 
 

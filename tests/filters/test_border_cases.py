@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import FrameSkipTransform, TransformedEnv
 
+from tests.filters.beliefs_for_tests import BELIEF, COV, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
     FixedEnsemble,
     linear_denkf,
@@ -21,15 +22,6 @@ from torch_denkf.modules import (
     LearnedObservation,
 )
 from torch_denkf.transforms import DEnKFTransform
-
-ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
-BELIEF = [ENSEMBLE, MEAN, VAR]
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
-
 
 # --------------------------------------------------------------------------------------------------- stored beliefs
 

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 from torchrl.modules import set_recurrent_mode
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.filters import LSTMFilter, ParticleFilter
@@ -57,11 +57,6 @@ FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "L
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
-def assert_same(first, second, keys, atol=0.0):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
-
-
 def readings(*batch, width=1):
     """Readings, masks, and starts that differ between rows."""
     frames = TensorDict({"observation": torch.randn(*batch, 2)}, batch)
@@ -69,6 +64,12 @@ def readings(*batch, width=1):
     frames["is_init"] = torch.rand(*batch, 1) < 0.2
     frames["is_init"][..., 0, :] = True
     return frames
+
+
+def with_noise(name, *batch, width=1):
+    """A filter, and readings with the noise of all its steps."""
+    filter = FILTERS[name]()
+    return filter, filter.draw_noise(readings(*batch, width=width))
 
 
 def filtered(name, **kwargs):
@@ -97,24 +98,22 @@ def test_rows_that_reset_start_anew_and_the_others_go_on(name):
 @every_filter
 @pytest.mark.parametrize("width", [1, 2])
 def test_steps_are_the_sequence(float64, name, width):
-    filter, frames = FILTERS[name](), readings(3, 9, width=width)
-    filter.draw_noise(frames)
+    filter, frames = with_noise(name, 3, 9, width=width)
     expected = filter.sequence(frames.copy())
     row, rows = filter.initialise(frames[:, 0].copy()), []
     for t in range(9):
         row = frames[:, t].copy().update(row.select(*filter.carry_keys))
         row = filter(row)  # a start starts anew
         rows.append(row)
-    assert_same(torch.stack(rows, 1), expected, filter.belief_keys, atol=1e-10)
+    assert_equal(torch.stack(rows, 1), expected, filter.belief_keys, atol=1e-10)
     with set_recurrent_mode(True):
-        assert_same(filter(frames.copy()), expected, filter.belief_keys)
+        assert_equal(filter(frames.copy()), expected, filter.belief_keys)
 
 
 @every_filter
 def test_compiled_is_eager(float64, name):
     """Forward and backward. What inductor makes of a graph is tested in test_compiled.py."""
-    filter, frames = FILTERS[name](), readings(3, 5, width=2)
-    filter.draw_noise(frames)
+    filter, frames = with_noise(name, 3, 5, width=2)
     frames["observation"].requires_grad_()
     outs = []
     for chunk in (0, 2):
@@ -128,19 +127,18 @@ def test_compiled_is_eager(float64, name):
         if isinstance(eager, torch.Tensor):
             torch.testing.assert_close(compiled, eager, rtol=0, atol=1e-11)
         else:
-            assert_same(compiled, eager, filter.out_keys, atol=1e-11)
+            assert_equal(compiled, eager, filter.out_keys, atol=1e-11)
 
 
 @every_filter
 @pytest.mark.parametrize("width", [1, 2])
 def test_what_is_not_observed_may_be_anything(float64, name, width):
-    filter, frames = FILTERS[name](), readings(3, 9, width=width)
-    filter.draw_noise(frames)
+    filter, frames = with_noise(name, 3, 9, width=width)
     expected = filter.sequence(frames.copy())
     frames["observation"] = torch.where(frames["observed"], frames["observation"], torch.nan).requires_grad_()
     leaf = frames["observation"]
     broken = filter.sequence(frames.copy())
-    assert_same(broken, expected, filter.belief_keys)
+    assert_equal(broken, expected, filter.belief_keys)
     broken["belief", "mean"].sum().backward()
     assert leaf.grad.isfinite().all()
 
@@ -163,9 +161,8 @@ def test_unobserved_doubt_grows_and_a_reading_shrinks_it(float64, name):
 @every_filter
 @pytest.mark.parametrize("copy", [lambda f: pickle.loads(pickle.dumps(f)), deepcopy])
 def test_copies_compute_the_same(name, copy):
-    filter, frames = FILTERS[name](), readings(2, 5)
-    filter.draw_noise(frames)
-    assert_same(copy(filter).sequence(frames.copy()), filter.sequence(frames.copy()), filter.belief_keys)
+    filter, frames = with_noise(name, 2, 5)
+    assert_equal(copy(filter).sequence(frames.copy()), filter.sequence(frames.copy()), filter.belief_keys)
 
 
 @every_filter
@@ -176,7 +173,7 @@ def test_seeds_decide_and_nothing_is_kept_between_rollouts(name):
         env.set_seed(3)
         torch.manual_seed(3)
         rollouts.append(env.rollout(8, break_when_any_done=False))
-    assert_same(*rollouts, FILTERS[name]().belief_keys)
+    assert_equal(*rollouts, FILTERS[name]().belief_keys)
 
 
 @every_filter
@@ -193,6 +190,6 @@ def test_the_primer_carries_the_belief_of_a_policy(float64, name):
         return
     frames = rollout.select("observation", "observed", "is_init", "action")
     assert rollout["is_init"].sum() == 4, "each row starts anew once"
-    assert_same(filter.sequence(frames), rollout, filter.belief_keys, atol=1e-10)
+    assert_equal(filter.sequence(frames), rollout, filter.belief_keys, atol=1e-10)
     resumed = filter.sequence(rollout[:, 2:].exclude("belief"))
-    assert_same(resumed, rollout[:, 2:], filter.belief_keys, atol=1e-10)
+    assert_equal(resumed, rollout[:, 2:], filter.belief_keys, atol=1e-10)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_denkf,
@@ -14,14 +15,6 @@ from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
 )
-
-ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
-BELIEF = [ENSEMBLE, MEAN, VAR]
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
 
 
 class Reversed(NoisyLinear):

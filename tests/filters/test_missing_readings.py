@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.filters.beliefs_for_tests import BELIEF, ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_denkf,
@@ -22,14 +23,7 @@ from torch_denkf.modules import (
     LinearObservation,
 )
 
-ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
 LOG_WEIGHT = ("belief", "log_weight")
-BELIEF = [ENSEMBLE, MEAN, VAR]
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("make", [linear_denkf, linear_kalman, lambda: bootstrap(50)])

@@ -4,20 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 
 FILTERS = {"DEnKF": linear_denkf, "Kalman": linear_kalman}
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    torch.manual_seed(0)
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def policy_data(filter, *, anew=()):

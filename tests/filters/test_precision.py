@@ -5,6 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.filters.beliefs_for_tests import COV, MEAN, VAR, close
 from tests.filters.factories import (
     NoisyLinear,
     linear_system,
@@ -21,14 +22,6 @@ from torch_denkf.modules import (
     Select,
     StochasticMLP,
 )
-
-ENSEMBLE, MEAN, COV, VAR = (("belief", name) for name in ("ensemble", "mean", "cov", "var"))
-BELIEF = [ENSEMBLE, MEAN, VAR]
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
 
 
 def test_float64_matrices_beside_float32_are_refused():

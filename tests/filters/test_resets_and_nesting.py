@@ -6,13 +6,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
+from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf
+from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
-    LinearObservation,
     PairObservation,
     Select,
     UnicycleMotion,
@@ -20,14 +21,6 @@ from torch_denkf.modules import (
     WithHistory,
 )
 from torch_denkf.transforms import DEnKFTransform
-
-ENSEMBLE, MEAN, VAR = (("belief", name) for name in ("ensemble", "mean", "var"))
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol)
-
 
 # ------------------------------------------------------------------------------------------------ resets that update
 
@@ -74,25 +67,13 @@ def test_elements_without_a_belief_before_them_do_not_count_as_steps():
 
 
 def blocks(**info):
-    plain, (_, _, H, R) = linear_denkf(), linear_system()
-
-    def block(index, before, after):
-        return TensorDictSequential(
-            LinearObservation(H[[index]], in_key=(before, "ensemble"), out_key=f"p{index}"),
-            EnsembleAnalysis(
-                "etkf",
-                forecast_key=(before, "ensemble"),
-                predicted_key=f"p{index}",
-                sensor_key=f"y{index}",
-                noise_variance_key=f"r{index}",
-                belief_key=after,
-                **({"info_key": f"info{index}"} if info else {}),
-            ),
-        )
-
-    noises = {f"r{i}": ConstantNoise(R[[i]].sqrt(), in_key=f"y{i}", out_key=f"r{i}") for i in (0, 1)}
-    parts = {"first": block(0, "forecast", "mid"), "second": block(1, "mid", "belief")}
-    return Filter({**noises, "transition": plain["transition"], **parts}, initial=plain.initial)
+    plain, prefixes = linear_denkf(), ["forecast", "mid", "belief"]
+    noises, blocks = {}, {}
+    for i, name in enumerate(["first", "second"]):
+        keys = {"info_key": f"info{i}"} if info else {}
+        parts = parts_of_reading(i, prefixes[i], prefixes[i + 1], **keys)
+        noises[f"r{i}"], blocks[name] = parts[f"r{i}"], TensorDictSequential(parts[f"h{i}"], parts[f"a{i}"])
+    return Filter({**noises, "transition": plain["transition"], **blocks}, initial=plain.initial)
 
 
 def test_analyses_inside_sequences_count_all_or_are_refused(float64):

@@ -6,40 +6,16 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
+from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import linear_denkf, linear_system
+from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel
+from torch_denkf.modules import SubModel
 
-ENSEMBLE, MEAN, VAR = (("belief", name) for name in ("ensemble", "mean", "var"))
 TOTALS = [("info", "nis"), ("info", "log_likelihood")]
 
 
-@pytest.fixture(autouse=True)
-def _double(float64):
-    torch.manual_seed(0)
-
-
-def close(first, second, keys, atol=1e-12):
-    for key in keys:
-        torch.testing.assert_close(first[key], second[key], rtol=0, atol=atol, msg=lambda m, k=key: f"{k}: {m}")
-
-
-def parts(index, before, after, **kwargs):
-    """Noise, observation and analysis of one of two readings."""
-    _, _, H, R = linear_system()
-    return {
-        f"r{index}": ConstantNoise(R[[index]].sqrt(), in_key=f"y{index}", out_key=f"r{index}"),
-        f"h{index}": LinearObservation(H[[index]], in_key=(before, "ensemble"), out_key=f"p{index}"),
-        f"a{index}": EnsembleAnalysis(
-            "etkf",
-            forecast_key=(before, "ensemble"),
-            predicted_key=f"p{index}",
-            sensor_key=f"y{index}",
-            noise_variance_key=f"r{index}",
-            belief_key=after,
-            **kwargs,
-        ),
-    }
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def readings(*batch):
@@ -51,7 +27,11 @@ def test_their_diagnostics_add_up_to_those_of_all_readings():
     """The chain rule: a density of two readings is that of one times that of the other, given the first."""
     both = linear_denkf()
     filter = Filter(
-        {"transition": both["transition"], **parts(0, "forecast", "mid"), **parts(1, "mid", "belief")},
+        {
+            "transition": both["transition"],
+            **parts_of_reading(0, "forecast", "mid"),
+            **parts_of_reading(1, "mid", "belief"),
+        },
         initial=both.initial,
     )
     frames = readings(3, 6)
@@ -77,17 +57,17 @@ def test_analyses_side_by_side_may_be_put_together():
     filter = Filter(
         {
             "transition": plain["transition"],
-            **parts(0, "forecast", "one"),
-            **parts(1, "forecast", "two"),
+            **parts_of_reading(0, "forecast", "one"),
+            **parts_of_reading(1, "forecast", "two"),
             "middle": Middle(),
         },
         initial=plain.initial,
     )
     td = filter.initialise(readings())
     single = [
-        Filter({"transition": plain["transition"], **parts(i, "forecast", "belief")}, initial=plain.initial).step(
-            td.copy()
-        )
+        Filter(
+            {"transition": plain["transition"], **parts_of_reading(i, "forecast", "belief")}, initial=plain.initial
+        ).step(td.copy())
         for i in (0, 1)
     ]
     close(filter.step(td), {ENSEMBLE: (single[0][ENSEMBLE] + single[1][ENSEMBLE]) / 2}, [ENSEMBLE])

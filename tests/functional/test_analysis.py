@@ -304,6 +304,7 @@ def test_vmap_equals_the_batch(scheme, space):
         ({"predicted": torch.zeros(4, 3)}, r"predicted must be \[\*B, E, O\] = \[5, 3\], got \[4, 3\]"),
         ({"observation": torch.zeros(2)}, r"observation must be \[\*B, O\] = \[3\], got \[2\]"),
         ({"observation": torch.zeros(3)}, "'sensor' needs one observation a member"),
+        ({"observation": torch.zeros(4, 3)}, "got 4 samples; give the sensor the ensemble_size"),
         ({"noise": torch.zeros(1)}, r"noise must be \[\*B, O\]"),
         ({"observed": torch.ones(2, dtype=torch.bool)}, "observed must be"),
         ({"observed": torch.ones(3)}, r"pass observed.bool\(\)"),

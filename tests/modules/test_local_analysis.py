@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.simulation.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import Neighbours, gaspari_cohn, relax_to_prior_spread
 from torch_denkf.modules import (
@@ -16,6 +15,7 @@ from torch_denkf.modules import (
     LocalEnsembleAnalysis,
     Select,
 )
+from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 E, S = 6, 12
 PLACES = torch.arange(S, dtype=torch.float64).unsqueeze(-1)
@@ -169,7 +169,7 @@ def lorenz_run(variables, batch, steps):
 
 
 def test_seven_members_follow_forty_variables(float64):
-    """Readings err by 1.0; long runs err by 0.22 (benchmarks/lorenz96/results/schemes.md). Without localisation: 4 and more."""
+    """Readings err by 1.0, long runs by 0.22 (benchmarks/lorenz96/results/schemes.md), without localisation by 4."""
     run = lorenz_run(40, batch=4, steps=120)
     with torch.no_grad():
         out = lorenz_filter(40, members=7).sequence(run.clone())

@@ -203,7 +203,7 @@ def test_gradients_reach_the_past(float64):
 
 
 def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64):
-    """Its way is corrected by all innovations since; so is the filter's path, where the history is as long as the drive.
+    """Its way is corrected by all innovations since; so is the filter's path, if the history is as long as the drive.
 
     Without smoothing the way is the sum of filtered velocities, which lag behind: 4 m/s jumps to 6 and stays there.
     """

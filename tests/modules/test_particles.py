@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.distributions import Normal
 
 from torch_denkf.functional import (
     soft_resample,
@@ -21,7 +20,6 @@ from torch_denkf.modules import (
     FromSensor,
     GaussianLikelihood,
     GaussianPrior,
-    LearnedLikelihood,
     LearnedTransition,
     NoisyTransition,
     ParticleAnalysis,

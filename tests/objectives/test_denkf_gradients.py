@@ -6,7 +6,7 @@ import torch
 from tests.filters.differences_for_tests import central_difference
 from tests.filters.factories import S, toy_denkf
 from tests.objectives.denkf_for_tests import ONLY_STATE
-from tests.objectives.problem_for_tests import problem
+from tests.objectives.problem_for_tests import problem, train
 from torch_denkf.objectives import DEnKFLoss
 
 
@@ -54,12 +54,5 @@ def test_training_lowers_the_loss(float64):
     frames, _ = problem(filter, resets=False)
     frames["state"] = frames["measurement"][..., :S].cumsum(1)
     loss = DEnKFLoss(filter, **ONLY_STATE)
-    optimiser = torch.optim.Adam(loss.parameters(), 1e-2)
-    values = []
-    for _ in range(60):
-        value = loss(frames)["loss_state"]
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        values.append(value.item())
+    values = train(loss, frames, 1e-2)
     assert values[-1] < 0.8 * values[0]

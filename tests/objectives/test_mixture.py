@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from tensordict import TensorDict
 
-from tests.filters.factories import OBS, E, FixedEnsemble, NoisyLinear, S, toy_denkf, toy_frames
+from tests.filters.factories import OBS, E, FixedEnsemble, NoisyLinear, S, toy_denkf
 from tests.filters.particle_for_tests import toy_filter
 from tests.objectives.problem_for_tests import only, problem, stepped
 from torch_denkf.filters import ParticleFilter
@@ -112,19 +112,6 @@ def test_mean_sensor_and_nll_by_hand():
     pairs = sum((samples[..., i, :] - samples[..., j, :]).abs() for i in range(size) for j in range(size))
     crps = (samples.abs().mean(-2) - pairs / (2 * size * (size - 1))).mean(-1)
     torch.testing.assert_close(losses["loss_sensor"], crps[observed].mean(), **CLOSE)
-
-
-def test_one_sample_of_the_sensor_has_an_absolute_error():
-    filter = toy_filter()
-    filter["sensor"].ensemble_size = 1
-    frames = toy_frames((2, 7))
-    frames["state"], frames["target_observation"] = torch.randn(2, 7, S), torch.randn(2, 7, OBS)
-    filter.draw_noise(frames)
-    out = filter.sequence(frames.copy())
-    assert out["sensor", "ensemble"].shape == (2, 7, 1, OBS)
-    error = (out["sensor", "ensemble"].squeeze(-2) - frames["target_observation"]).abs().mean(-1)
-    value = MixtureLoss(filter, **only(TERMS, "sensor"))(frames)["loss_sensor"]
-    torch.testing.assert_close(value, error[frames["observed"].all(-1)].mean(), **CLOSE)
 
 
 def known_filter():

@@ -17,41 +17,30 @@ from torchrl.envs import (
 )
 
 from tests.filters.factories import assert_equal
-from tests.transforms.envs_for_tests import (
-    BELIEF,
-    PRIOR_MEAN,
-    STEPS,
-    base_env,
-    filtered_env,
-    fixed_filter,
-    known_start_filter,
-    random_filter,
-    random_rollout,
-    seeded_env,
-    toy_base_env,
-    toy_filter,
-)
+from tests.transforms import envs_for_tests as envs
 from torch_denkf.transforms import DEnKFTransform
 
 
 def test_plain_sequential_with_its_initial_belief():
-    filter = fixed_filter()
+    filter = envs.fixed_filter()
     plain = TensorDictSequential(*filter)
     rollouts = [
-        random_rollout(TransformedEnv(base_env(batch_size=[3], max_steps=[3, 5, 9]), transform))
+        envs.random_rollout(TransformedEnv(envs.base_env(batch_size=[3], max_steps=[3, 5, 9]), transform))
         for transform in (DEnKFTransform(filter), DEnKFTransform(plain, initial=filter.initial))
     ]
-    assert_equal(rollouts[0]["next"], rollouts[1]["next"], BELIEF)
+    assert_equal(rollouts[0]["next"], rollouts[1]["next"], envs.BELIEF)
 
 
 def test_store_ensemble_false_holds_the_same_numbers():
     rollouts = []
     for store in (True, False):
-        env = filtered_env(random_filter, transform={"store_ensemble": store}, batch_size=[3], max_steps=[3, 5, 30])
+        env = envs.filtered_env(
+            envs.random_filter, transform={"store_ensemble": store}, batch_size=[3], max_steps=[3, 5, 30]
+        )
         check_env_specs(env)
         torch.manual_seed(1)
         env.set_seed(1)
-        rollouts.append(random_rollout(env))
+        rollouts.append(envs.random_rollout(env))
     full, small = rollouts
     assert ("belief", "ensemble") in full.keys(True, True)
     for part in (small, small["next"]):
@@ -62,20 +51,22 @@ def test_store_ensemble_false_holds_the_same_numbers():
 
 
 def test_store_ensemble_false_outside_of_a_batched_environment():
-    plain = SerialEnv(2, [partial(seeded_env, n, max_steps=n) for n in STEPS])
-    env = TransformedEnv(plain, DEnKFTransform(known_start_filter(), store_ensemble=False))
+    plain = SerialEnv(2, [partial(envs.seeded_env, n, max_steps=n) for n in envs.STEPS])
+    env = TransformedEnv(plain, DEnKFTransform(envs.known_start_filter(), store_ensemble=False))
     check_env_specs(env)
-    rollout = random_rollout(env)
+    rollout = envs.random_rollout(env)
     assert set(rollout["next", "belief"].keys()) == {"mean", "var"}
-    assert (rollout["belief", "mean"][0, [0, 3, 6, 9]] == torch.tensor(PRIOR_MEAN)).all()
-    assert (rollout["belief", "mean"][0, [1, 2, 4, 5]] != torch.tensor(PRIOR_MEAN)).all()
+    assert (rollout["belief", "mean"][0, [0, 3, 6, 9]] == torch.tensor(envs.PRIOR_MEAN)).all()
+    assert (rollout["belief", "mean"][0, [1, 2, 4, 5]] != torch.tensor(envs.PRIOR_MEAN)).all()
 
 
 @pytest.mark.parametrize("use_buffers", [False, True])
 def test_store_ensemble_false_in_a_collector(use_buffers):
     def collect(store):
         torch.manual_seed(1)
-        env = filtered_env(random_filter, transform={"store_ensemble": store}, batch_size=[2], max_steps=[3, 5])
+        env = envs.filtered_env(
+            envs.random_filter, transform={"store_ensemble": store}, batch_size=[2], max_steps=[3, 5]
+        )
         collector = Collector(env, None, frames_per_batch=16, total_frames=32, use_buffers=use_buffers)
         data = [batch.clone() for batch in collector]
         collector.shutdown()
@@ -89,15 +80,15 @@ def test_store_ensemble_false_in_a_collector(use_buffers):
 
 
 def test_store_ensemble_false_inside_of_workers_raises():
-    make = partial(filtered_env, transform={"store_ensemble": False})
+    make = partial(envs.filtered_env, transform={"store_ensemble": False})
     with pytest.raises(RuntimeError, match="cannot live inside a SerialEnv or ParallelEnv"):
         SerialEnv(2, make).reset()
 
 
 @pytest.mark.parametrize("no_grad", [True, False])
 def test_gradients_through_a_rollout(no_grad):
-    filter = toy_filter()
-    env = TransformedEnv(toy_base_env(batch_size=[3]), DEnKFTransform(filter, no_grad=no_grad))
+    filter = envs.toy_filter()
+    env = TransformedEnv(envs.toy_base_env(batch_size=[3]), DEnKFTransform(filter, no_grad=no_grad))
     td, beliefs = env.reset(), []
     for _ in range(4):
         td = env.step(env.rand_action(td))["next"]
@@ -111,7 +102,7 @@ def test_gradients_through_a_rollout(no_grad):
 
 
 def test_prior_given_to_reset(float64):
-    env = filtered_env(known_start_filter, batch_size=[3])
+    env = envs.filtered_env(envs.known_start_filter, batch_size=[3])
     given = torch.randn(3, 6, 2)
     td = env.reset(TensorDict({("belief", "ensemble"): given}, [3]))
     assert td["belief", "ensemble"].equal(given)
@@ -120,12 +111,12 @@ def test_prior_given_to_reset(float64):
 
 
 def test_reset_of_some_rows_leaves_the_others(float64):
-    env = filtered_env(known_start_filter, batch_size=[3])
+    env = envs.filtered_env(envs.known_start_filter, batch_size=[3])
     td = env.rollout(3)[:, -1]["next"].clone()
     before = td["belief"].clone()
     td["_reset"] = torch.tensor([[False], [True], [False]])
     after = env.reset(td)["belief"]
-    assert (after["ensemble"][1] == torch.tensor(PRIOR_MEAN)).all()
+    assert (after["ensemble"][1] == torch.tensor(envs.PRIOR_MEAN)).all()
     assert after["ensemble"][[0, 2]].equal(before["ensemble"][[0, 2]])
     torch.testing.assert_close(after["mean"][[0, 2]], before["mean"][[0, 2]], rtol=0, atol=1e-15)
     assert (after["var"][1] == 0).all()
@@ -138,10 +129,10 @@ def test_reset_mask_of_the_transform_alone(float64, shape):
     mask = torch.tensor([False, True, False]).reshape(shape)
     td = TensorDict({("belief", "ensemble"): given, "_reset": mask}, [3])
     observed = TensorDict({"observation": torch.zeros(3, 2)}, [3])
-    transform = DEnKFTransform(known_start_filter())
+    transform = DEnKFTransform(envs.known_start_filter())
     out = transform._reset(td, observed.copy())
     expected = given.clone()
-    expected[1] = torch.tensor(PRIOR_MEAN)
+    expected[1] = torch.tensor(envs.PRIOR_MEAN)
     # Environments that reset by themselves hand over one tensordict for both.
     both = td.copy().update(observed)
     assert transform._reset_on_native_autoreset(both, both)["belief", "ensemble"].equal(expected)
@@ -153,20 +144,20 @@ def test_reset_mask_of_the_transform_alone(float64, shape):
 def test_nested_reset_key(float64):
     # done and _reset inside of a group, as in multi-agent environments: the mask is agent-wise.
     env = TransformedEnv(
-        base_env(batch_size=[3], max_steps=[3, 5, 30]),
+        envs.base_env(batch_size=[3], max_steps=[3, 5, 30]),
         Compose(
             RenameTransform(
                 in_keys=["done", "terminated", "truncated"],
                 out_keys=[("group", "done"), ("group", "terminated"), ("group", "truncated")],
                 create_copy=True,
             ),
-            DEnKFTransform(known_start_filter()),
+            DEnKFTransform(envs.known_start_filter()),
         ),
     )
-    rollout = random_rollout(env)
+    rollout = envs.random_rollout(env)
     start = torch.cat([torch.ones(3, 1, dtype=torch.bool), rollout["next", "done"][:, :-1].squeeze(-1)], 1)
     ensemble = rollout["belief", "ensemble"]
-    assert (ensemble[start] == torch.tensor(PRIOR_MEAN)).all()
+    assert (ensemble[start] == torch.tensor(envs.PRIOR_MEAN)).all()
     assert ensemble[:, 1:][~start[:, 1:]].equal(rollout["next", "belief", "ensemble"][:, :-1][~start[:, 1:]])
 
 
@@ -174,7 +165,7 @@ def test_nested_reset_key(float64):
 def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
     done = ["done", "terminated", "truncated"]
     groups = [RenameTransform(done, [(name, key) for key in done], create_copy=True) for name in ("one", "two")]
-    env = TransformedEnv(base_env(batch_size=[3]), Compose(*groups, DEnKFTransform(known_start_filter())))
+    env = TransformedEnv(envs.base_env(batch_size=[3]), Compose(*groups, DEnKFTransform(envs.known_start_filter())))
     given, masks = torch.randn(3, 6, 2), {"one": [0, 1, 0], "two": [0, 0, 1]}
     td = TensorDict({("belief", "ensemble"): given}, [3])
     for name, mask in masks.items():
@@ -183,15 +174,15 @@ def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
     out = env.transform[-1]._reset(td, TensorDict({"observation": torch.zeros(3, 2)}, [3]))
     expected = given.clone()
     for name in resetting:
-        expected[masks[name].index(1)] = torch.tensor(PRIOR_MEAN)
+        expected[masks[name].index(1)] = torch.tensor(envs.PRIOR_MEAN)
     assert out["belief", "ensemble"].equal(expected)
 
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
 def test_diagnostics(float64, update_at_reset):
     keys = [("info", "nis"), ("info", "innovation"), ("forecast", "ensemble")]
-    filter = fixed_filter(update_at_reset=update_at_reset)
-    env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(filter, diagnostics=keys))
+    filter = envs.fixed_filter(update_at_reset=update_at_reset)
+    env = TransformedEnv(envs.base_env(batch_size=[3]), DEnKFTransform(filter, diagnostics=keys))
     check_env_specs(env)
     rollout = env.rollout(6)
     expected = filter.sequence(rollout.select("observation", "observed"))
@@ -205,34 +196,34 @@ def test_diagnostics(float64, update_at_reset):
 
 
 def test_randomness_does_not_depend_on_the_mode():
-    transform = DEnKFTransform(toy_filter())
-    env, rollouts = TransformedEnv(toy_base_env(batch_size=[3]), transform), []
+    transform = DEnKFTransform(envs.toy_filter())
+    env, rollouts = TransformedEnv(envs.toy_base_env(batch_size=[3]), transform), []
     assert not transform.training
     for mode in (True, False):
         transform.train(mode)
         torch.manual_seed(1)
         env.set_seed(1)
         rollouts.append(env.rollout(4))
-    assert_equal(*rollouts, BELIEF)
+    assert_equal(*rollouts, envs.BELIEF)
     assert (rollouts[0]["next", "belief", "var"] > 0).all()
 
 
 def test_specs_use_up_no_random_numbers():
-    env = filtered_env(random_filter)
+    env = envs.filtered_env(envs.random_filter)
     state = torch.get_rng_state()
     _ = env.observation_spec, env.state_spec
     assert torch.get_rng_state().equal(state)
 
 
 def test_gradient_mode_in_a_replay_buffer():
-    filter = toy_filter()
+    filter = envs.toy_filter()
     frames = TensorDict({"observation": torch.randn(2, 5, 4), "action": torch.randn(2, 5, 2)}, [2, 5])
     assert not DEnKFTransform(filter)(frames.copy())["belief", "mean"].requires_grad
     assert DEnKFTransform(filter, no_grad=False)(frames.copy())["belief", "mean"].requires_grad
 
 
 def test_in_a_replay_buffer(float64):
-    filter = fixed_filter()
+    filter = envs.fixed_filter()
     buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=DEnKFTransform(filter), batch_size=3)
     frames = TensorDict(
         {"observation": torch.randn(4, 7, 2), "number": torch.arange(4).unsqueeze(-1).expand(4, 7)}, [4, 7]
@@ -240,4 +231,4 @@ def test_in_a_replay_buffer(float64):
     buffer.extend(frames)
     sample = buffer.sample()
     expected = filter.sequence(frames[sample["number"][:, 0]].clone())
-    assert_equal(sample, expected, BELIEF, atol=1e-14)
+    assert_equal(sample, expected, envs.BELIEF, atol=1e-14)

@@ -65,7 +65,11 @@ class Command:
         self.name, self.run, self.resumable = name, run, resumable
         self.mistakes: tuple[type[Exception], ...] = (ImportError, OSError, ValueError, *mistakes)
         self.parser = _Parser(
-            prog=f"denkf {name}", description=summary, epilog=f"example:\n  {example}", formatter_class=_Formatter
+            allow_abbrev=False,
+            prog=f"denkf {name}",
+            description=summary,
+            epilog=f"example:\n  {example}",
+            formatter_class=_Formatter,
         )
         arguments(self.parser)
 

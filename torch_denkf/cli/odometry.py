@@ -27,7 +27,13 @@ __all__ = ["main"]
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("frames", type=Path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
-    add("--calibration", required=True, type=Path, metavar="FILE", help="KITTI's calib.txt; or a file with fx fy cx cy")
+    add(
+        "--calibration",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
+    )
     add("--checkpoint", required=True, type=Path, metavar="FOLDER", help="that denkf train left")
     add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
@@ -43,6 +49,10 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> None:
     if args.fps is not None and args.times is not None:
         raise ValueError("pass --fps or --times, not both")
+    given = {"frames": args.frames, "calibration": args.calibration, "times": args.times}
+    missing = [f"{name} {path}" for name, path in given.items() if path is not None and not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"there is no such file or folder: {', '.join(missing)}")
     import cv2
     import torch
 
@@ -51,14 +61,14 @@ def _run(args: argparse.Namespace) -> None:
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
-    car, source = load_car_filter(args.checkpoint), read_frames(args.frames)
+    source = read_frames(args.frames)
     folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
     calibration = read_camera(args.calibration, args.camera or folder)
     times, fps = _times(args.times, source), source.fps if args.fps is None else args.fps
     if times is None and fps is None:
         raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
     beliefs = track(
-        car,
+        load_car_filter(args.checkpoint),
         _counted(source),
         calibration,
         times=times,

@@ -10,6 +10,7 @@ A repeated or interrupted command goes on with the drives that are missing. See
 
 >>> import tempfile
 >>> main(["--out", tempfile.mkdtemp(), "--names", "a", "--frames", "3", "--processes", "1"])
+1 drives in ...: a
 0
 """
 
@@ -19,7 +20,7 @@ import argparse
 import os
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, whole
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.data.kitti.render import GREY_OR_COLOUR, render_drives
 from torch_denkf.simulation.street.camera import KITTI_FOCAL
 
@@ -31,7 +32,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, help="folder that gets sequences/ and poses/")
     add("--poses", help="folder of pose files NAME.txt; without it the drives are invented")
     add("--names", nargs="+", help="drives: all pose files, or 00 to 10 when invented")
-    add("--size", nargs=2, type=int, default=(50, 150), metavar=("H", "W"), help="of the images")
+    add("--size", nargs=2, type=int, default=(50, 150), metavar=("H", "W"), help="of the images, such as --size 50 150")
     add("--frames", type=int, help="at most so many images a drive; 300 when invented")
     add("--seed", type=whole(0), default=0, help="another one gives other scenes")
     add("--camera", choices=GREY_OR_COLOUR, default="image_2", help="image_0 is grey")
@@ -43,7 +44,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> None:
     with progress_bar("rendering", None, unit=" images") as bar:
-        render_drives(
+        names = render_drives(
             args.out,
             poses=args.poses,
             names=args.names,
@@ -57,6 +58,7 @@ def _run(args: argparse.Namespace) -> None:
             overwrite=args.overwrite,
             progress=bar.update,
         )
+    say(f"{len(names)} drives in {args.out}: {', '.join(names)}")
 
 
 main = Command(

@@ -69,23 +69,24 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         pictures: maps numbers of ``rows``, int64 ``[m]``, to what is not stored in them, ``[m, ...]`` each.
         single: bool ``[N]``: only these rows are offered, each on its own (``is_init`` and done in all).
         root: the folder that was read; None for data that came from elsewhere.
-        **options:
-            split: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
-            validation_share: of the episodes that are not for tests, in [0, 1); none by default.
-            batch_size: rows of a sample, over all slices.
-            num_slices: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence.
-            slice_len: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
-            strict_length: False lets episodes that are shorter than a slice come as short slices.
-            sampler: by default slices if they are asked for, else single rows at random.
-            writer: by default one that refuses to write.
-            collate_fn: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
-            pin_memory: whether samples are pinned.
-            prefetch: samples to prepare in advance, by threads.
-            transform: applied to each sample after the pixels are made, in the sample's shape. A slice's own begin
-                and end are marked after it.
-            cache: folder of decoded pictures; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``; None
-                or False for none: all pictures are then in memory. Entries may be deleted at any time.
-            progress: whether a bar shows what is decoded.
+        **options: as follows.
+
+            * ``split``: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
+            * ``validation_share``: of the episodes that are not for tests, in [0, 1); none by default.
+            * ``batch_size``: rows of a sample, over all slices.
+            * ``num_slices``: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence.
+            * ``slice_len``: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
+            * ``strict_length``: False lets episodes that are shorter than a slice come as short slices.
+            * ``sampler``: by default slices if they are asked for, else single rows at random.
+            * ``writer``: by default one that refuses to write.
+            * ``collate_fn``: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
+            * ``pin_memory``: whether samples are pinned.
+            * ``prefetch``: samples to prepare in advance, by threads.
+            * ``transform``: applied to each sample after the pixels are made, in the sample's shape. A slice's own
+              begin and end are marked after it.
+            * ``cache``: folder of decoded pictures; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``;
+              None or False for none: all pictures are then in memory. Entries may be deleted at any time.
+            * ``progress``: whether a bar shows what is decoded.
 
     Attributes:
         episodes: what each ``"episode"`` is: an :class:`~torch_denkf.data.Episode` with its name, first row and length.

@@ -1,5 +1,6 @@
 """Filters: compositions of sub-models on one base."""
 
+from torch_denkf.filters._gaussian import GaussianOptions
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
@@ -21,4 +22,5 @@ __all__ = [
     "MixtureParticleFilter",
     "PFM",
     "LSTMFilter",
+    "GaussianOptions",
 ]

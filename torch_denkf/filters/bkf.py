@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functools import partial
 from typing import Any, Unpack
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 
 __all__ = ["BackpropKF"]
 
 
-class BackpropKF(Filter):
+class BackpropKF(GaussianFilter):
     r"""Linear-Gaussian filter of :math:`x_t = A x_{t-1} + B a + N(0, Q)`, :math:`z_t = C x_t + N(0, R_t)`.
 
     A sensor network reads :math:`z_t` from the frame and a noise network :math:`R_t`; both are trained through the
@@ -35,12 +34,8 @@ class BackpropKF(Filter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
-            by it without bound.
-        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
-            ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and ``check_finite`` of :class:`Filter`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
+            :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition where ``control`` is given.
 
     Reference:
         Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,
@@ -68,25 +63,12 @@ class BackpropKF(Filter):
         initial: TensorDictModuleBase,
         control: torch.Tensor | None = None,
         trainable: bool = False,
-        inflation: float = 1.0,
-        observation_key: NestedKey = ("sensor", "ensemble"),
-        observed_key: NestedKey = "observed",
-        **kwargs: Unpack[FilterOptions],
+        **options: Unpack[GaussianOptions],
     ):
         action: dict[str, Any] = {}
         if control is not None:
-            action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
-        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(
-            noise=noise,
-            transition=LinearTransition(transition, process_noise, trainable=trainable, **action),
-            analysis=KalmanAnalysis(
-                observation,
-                None,
-                inflation=inflation,
-                observation_key=observation_key,
-                noise_variance_key=noise.out_keys[0],
-                observed_key=observed_key,
-            ),
+            action = {"control": control, "action_key": options.get("control_keys", ("action",))[0]}
+        forecast = LinearTransition(transition, process_noise, trainable=trainable, **action)
+        super().__init__(
+            sensor, noise, forecast, partial(KalmanAnalysis, observation, None), initial=initial, **options
         )
-        super().__init__(modules, initial=initial, **kwargs)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import partial
 from typing import Unpack
 
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.process_noise import as_process_noise
 
 __all__ = ["EKF"]
 
 
-class EKF(Filter):
+class EKF(GaussianFilter):
     """Extended Kalman filter whose transition, sensor, observation and noise models may all be learned (dEKF).
 
     It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise: what an ensemble filter's
@@ -35,13 +34,8 @@ class EKF(Filter):
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
-            by it without bound.
-        angles: components of the observation that are angles in radians.
-        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
+            :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -75,25 +69,8 @@ class EKF(Filter):
         *,
         initial: TensorDictModuleBase,
         stop_jacobian_gradient: bool = False,
-        inflation: float = 1.0,
-        angles: Sequence[int] = (),
-        observation_key: NestedKey = ("sensor", "ensemble"),
-        observed_key: NestedKey = "observed",
-        **kwargs: Unpack[FilterOptions],
+        **options: Unpack[GaussianOptions],
     ):
-        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(
-            noise=noise,
-            transition=EKFTransition(
-                transition, as_process_noise(process_noise, initial), stop_jacobian_gradient=stop_jacobian_gradient
-            ),
-            analysis=EKFAnalysis(
-                observation,
-                inflation=inflation,
-                angles=angles,
-                observation_key=observation_key,
-                noise_variance_key=noise.out_keys[0],
-                observed_key=observed_key,
-            ),
-        )
-        super().__init__(modules, initial=initial, **kwargs)
+        q = as_process_noise(process_noise, initial)
+        forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient)
+        super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import partial
 from typing import Unpack
 
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 
 __all__ = ["UKF"]
 
 
-class UKF(Filter):
+class UKF(GaussianFilter):
     """Unscented Kalman filter whose transition, sensor, observation and noise models may all be learned (dUKF).
 
     It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise, and has the belief of
@@ -24,24 +23,17 @@ class UKF(Filter):
     through the observation model.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
-        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
-            :mod:`torch_denkf.modules.process_noise`.
-        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
-            reading is in the tensordict, under ``observation_key``.
-        observation: observes ensembles, writes ``("forecast", "observation")``.
-        noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        initial: the initial belief, see :class:`~torch_denkf.filters.EKF`; its covariance may be singular.
+        transition: see :class:`~torch_denkf.filters.EKF`.
+        process_noise: likewise.
+        sensor: likewise.
+        observation: likewise.
+        noise: likewise.
+        initial: likewise; its covariance may be singular.
         alpha: see :func:`torch_denkf.functional.unscented_weights`.
         beta: likewise.
         kappa: likewise. Covariances stay positive where no weight is negative, as by default.
-        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
-            by it without bound.
-        angles: components of the observation that are angles in radians.
-        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; the observation model may write it.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
+            :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -74,28 +66,9 @@ class UKF(Filter):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
-        inflation: float = 1.0,
-        angles: Sequence[int] = (),
-        observation_key: NestedKey = ("sensor", "ensemble"),
-        observed_key: NestedKey = "observed",
-        **kwargs: Unpack[FilterOptions],
+        **options: Unpack[GaussianOptions],
     ):
-        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(
-            noise=noise,
-            transition=UKFTransition(
-                transition, as_process_noise(process_noise, initial), alpha=alpha, beta=beta, kappa=kappa
-            ),
-            analysis=UKFAnalysis(
-                observation,
-                alpha=alpha,
-                beta=beta,
-                kappa=kappa,
-                inflation=inflation,
-                angles=angles,
-                observation_key=observation_key,
-                noise_variance_key=noise.out_keys[0],
-                observed_key=observed_key,
-            ),
-        )
-        super().__init__(modules, initial=initial, **kwargs)
+        q = as_process_noise(process_noise, initial)
+        forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa)
+        update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)
+        super().__init__(sensor, noise, forecast, update, initial=initial, **options)

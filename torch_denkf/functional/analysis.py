@@ -223,6 +223,11 @@ def _check(forecast, predicted, observation, noise, scheme, observed, perturbati
     check_shape("predicted", predicted, (*batch, size, dim), "[*B, E, O]")
     check_shape("noise", noise, (*batch, dim), "[*B, O]")
     if observation.ndim == forecast.ndim:
+        if observation.shape[-2] != size:
+            raise ValueError(
+                f"observation must be [*B, E, O], a sample for each of E = {size} members, got {observation.shape[-2]} "
+                "samples; give the sensor the ensemble_size of the initial belief"
+            )
         check_shape("observation", observation, (*batch, size, dim), "[*B, E, O]")
     else:
         check_shape("observation", observation, (*batch, dim), "[*B, O]")

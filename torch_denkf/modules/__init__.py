@@ -4,9 +4,10 @@ Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSenso
 """
 
 from torch_denkf.modules._base import Call, SubModel, reads, run_module
+from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
+from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.calibration import MemberGain
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
@@ -14,7 +15,7 @@ from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 from torch_denkf.modules.motion_noise import NoisyTransition
-from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, ScaledNoise
+from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, MemberGain, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
@@ -81,4 +82,7 @@ __all__ = [
     "LSTMTransition",
     "LSTMUpdate",
     "UnicyclePose",
+    "EnsembleAnalysisKeys",
+    "GaussianAnalysisOptions",
+    "GaussianTransitionKeys",
 ]

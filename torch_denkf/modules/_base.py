@@ -43,7 +43,7 @@ class SubModel(TensorDictModule):
     """A part of a filter: a function of tensors, and the keys of what it reads and writes.
 
     A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
-    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead, which costs less.
+    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead: it costs less.
     Noise that it finds there is used instead of fresh noise: in a filter under ``("noise", place)``, by itself under
     ``("noise", "self")``.
 
@@ -233,7 +233,7 @@ class SubModel(TensorDictModule):
         given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
         if len(own | set(given.values())) > 1 and any(word in str(error) for word in ("dtype", "scalar type")):
             raise TypeError(
-                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'the precision of its inputs'} and got "
+                f"{type(self).__name__} computes in {', '.join(map(str, own)) or 'what it is given'} and got "
                 + ", ".join(f"{key!r} in {dtype}" for key, dtype in given.items())
                 + ". Convert the data (torchrl's DoubleToFloat(), or tensordict.float()) or the filter "
                 "(filter.double())."
@@ -268,7 +268,9 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
                 tensordict.set(("noise", own, name) if name else ("noise", own), value)
     missing = [key for key in keys if key not in entries]
     if missing and isinstance(module, TensorDictModule) and not isinstance(module, SubModel):
-        raise KeyError(f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}.")
+        raise KeyError(
+            f"{type(module).__name__} reads {missing}, which is missing; there is {sorted(map(str, entries))}."
+        )
     tensordict = module(tensordict)
     return {key: tensordict.get(key) for key in map(unravel_key, module.out_keys)}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TypedDict
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -13,12 +14,42 @@ from torch_denkf.functional import GaussianUpdate, mean_observation
 from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
-
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 
 
+class GaussianTransitionKeys(TypedDict, total=False):
+    """The keys that a forecast of mean and covariance takes.
+
+    Attributes:
+        belief_key: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``"belief"`` by
+            default.
+        forecast_key: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
+        ensemble_key: what the transition reads, ``("belief", "ensemble")`` by default.
+        forecast_ensemble_key: what it writes, ``("forecast", "ensemble")`` by default.
+    """
+
+    belief_key: str
+    forecast_key: str
+    ensemble_key: NestedKey
+    forecast_ensemble_key: NestedKey
+
+
 class GaussianTransition(SubModel):
-    """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`."""
+    """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
+
+    Args:
+        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.UnicycleTransition`.
+        process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
+            :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
+        belief_key: see :class:`GaussianTransitionKeys`, like the other keys.
+        forecast_key: likewise.
+        ensemble_key: likewise.
+        forecast_ensemble_key: likewise.
+
+    Raises:
+        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
+            draws its own noise.
+    """
 
     def __init__(
         self,
@@ -61,8 +92,60 @@ class GaussianTransition(SubModel):
             return run_module(self.module, {**entries, self.ensemble_key: states}, call)[self.forecast_ensemble_key]
 
 
+class GaussianAnalysisOptions(TypedDict, total=False):
+    """What an update of mean and covariance takes beside the observation model.
+
+    Attributes:
+        inflation: factor on the belief's standard deviations, where anything is observed; 1 by default, for none. What
+            is never observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
+        angles: components of the observation that are angles in radians; their innovation is wrapped to [-pi, pi).
+        observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``;
+            ``("sensor", "ensemble")`` by default.
+        noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; ``("sensor", "noise")`` by default.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, read after the observation model has run;
+            ``"observed"`` by default.
+        forecast_key: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
+        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``; ``"belief"`` by
+            default.
+        info_key: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``; ``"info"`` by
+            default.
+        ensemble_key: what the observation model reads, ``("forecast", "ensemble")`` by default.
+        predicted_key: what it writes, ``("forecast", "observation")`` by default.
+    """
+
+    inflation: float
+    angles: Sequence[int]
+    observation_key: NestedKey
+    noise_variance_key: NestedKey
+    observed_key: NestedKey
+    forecast_key: str
+    belief_key: str
+    info_key: str
+    ensemble_key: NestedKey
+    predicted_key: NestedKey
+
+
 class GaussianAnalysis(SubModel):
-    """Updates mean and covariance through an observation model of ensembles; a subclass writes :meth:`_update`."""
+    """Updates mean and covariance through an observation model of ensembles; a subclass writes :meth:`_update`.
+
+    Args:
+        observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
+            leaves in a copy of the tensordict.
+        inflation: see :class:`GaussianAnalysisOptions`, like all that follows.
+        angles: likewise.
+        observation_key: likewise.
+        noise_variance_key: likewise.
+        observed_key: likewise.
+        forecast_key: likewise.
+        belief_key: likewise.
+        info_key: likewise.
+        ensemble_key: likewise.
+        predicted_key: likewise.
+
+    Raises:
+        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        KeyError: if an entry is missing.
+    """
 
     def __init__(
         self,
@@ -110,9 +193,7 @@ class GaussianAnalysis(SubModel):
         """The update, and the mask that it used."""
         raise NotImplementedError
 
-    def _observe(
-        self, entries: Entries, states: torch.Tensor, call: Call
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _observe(self, entries: Entries, states: torch.Tensor, call: Call) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
-from tensordict import NestedKey, unravel_key
-from torch import nn
+from tensordict import unravel_key
 
 from torch_denkf.functional import (
     align_angles,
@@ -19,12 +18,12 @@ from torch_denkf.functional import (
     random_rotation,
     relax_to_prior_spread,
 )
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 
 __all__ = ["EnsembleAnalysis"]
 
 
-class EnsembleAnalysis(SubModel):
+class EnsembleAnalysis(EnsembleUpdate):
     """Updates the forecast ensemble with the observation; the mathematics is :func:`~torch_denkf.functional.analyse`.
 
     Args:
@@ -38,15 +37,7 @@ class EnsembleAnalysis(SubModel):
             nothing about a component of the state but what E members happen to show, the factor is 0.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        forecast_key: forecast ensemble ``[*B, E, S]``.
-        predicted_key: predicted observations ``[*B, E, O]``.
-        sensor_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]`` (not for ``"sensor"``).
-        noise_variance_key: variances ``[*B, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed.
-        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``.
-        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
-            Where a filter holds several analyses of one prefix, each has its own, ``(info_key, place, ...)``, and
-            ``nis`` and ``log_likelihood`` under the prefix are their sums.
+        **keys: see :class:`EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned observations, not one reading.
 
     Raises:
         ValueError: on an unknown scheme.
@@ -72,32 +63,18 @@ class EnsembleAnalysis(SubModel):
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
         angles: Sequence[int] = (),
         covariance: bool = False,
-        forecast_key: NestedKey = ("forecast", "ensemble"),
-        predicted_key: NestedKey = ("forecast", "observation"),
-        sensor_key: NestedKey = ("sensor", "ensemble"),
-        noise_variance_key: NestedKey = ("sensor", "noise"),
-        observed_key: NestedKey = "observed",
-        belief_key: str = "belief",
-        info_key: str = "info",
+        **keys: Unpack[EnsembleAnalysisKeys],
     ):
         if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
             raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
         if rotate and scheme != "etkf":
             raise ValueError(f'rotate=True belongs to scheme="etkf"; got {scheme!r}.')
         super().__init__(
-            nn.Identity(),
-            [forecast_key, predicted_key, sensor_key, noise_variance_key],
-            [(belief_key, name) for name in ("ensemble", "mean", "var")]
-            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
-            + [(belief_key, "cov")] * covariance,
-            optional_keys=[observed_key],
+            inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, covariance=covariance, **keys
         )
-        self.scheme, self.rotate = scheme, rotate
+        self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             self.register_buffer(name, factors, persistent=False)
-        self.inflation, self.relaxation = inflation, relaxation
-        self.angles, self.covariance, self.info_key = list(angles), covariance, info_key
-        self.reading_keys, self.noise_variance_key = self.in_keys[2:], unravel_key(noise_variance_key)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -125,7 +102,9 @@ class EnsembleAnalysis(SubModel):
         noise = torch.zeros_like(predicted) if self.scheme == "perturbed" else None
         if self.rotate:
             size = forecast.shape[-2]
-            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(*forecast.shape[:-2], size, size)
+            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(
+                *forecast.shape[:-2], size, size
+            )
         ones = torch.ones_like(predicted[..., 0, :])
         return self.compute(forecast, predicted, torch.zeros_like(predicted), ones, unseen, noise=noise)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Unpack
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import kalman_update, wrap_angles
 from torch_denkf.modules._base import Call, Entries, reads
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
 
@@ -28,10 +28,7 @@ class EKFTransition(GaussianTransition):
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
         stop_jacobian_gradient: F is a constant to the gradient (as in Kloss et al. 2021).
-        belief_key: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
-        ensemble_key: what the transition reads.
-        forecast_ensemble_key: what it writes.
+        **keys: see :class:`GaussianTransitionKeys`.
 
     Raises:
         ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
@@ -52,19 +49,9 @@ class EKFTransition(GaussianTransition):
         process_noise: TensorDictModuleBase,
         *,
         stop_jacobian_gradient: bool = False,
-        belief_key: str = "belief",
-        forecast_key: str = "forecast",
-        ensemble_key: NestedKey = ("belief", "ensemble"),
-        forecast_ensemble_key: NestedKey = ("forecast", "ensemble"),
+        **keys: Unpack[GaussianTransitionKeys],
     ):
-        super().__init__(
-            transition,
-            process_noise,
-            belief_key=belief_key,
-            forecast_key=forecast_key,
-            ensemble_key=ensemble_key,
-            forecast_ensemble_key=forecast_ensemble_key,
-        )
+        super().__init__(transition, process_noise, **keys)
         self.stop_jacobian_gradient = stop_jacobian_gradient
 
     def _forecast(self, entries, mean, cov, call):
@@ -85,17 +72,7 @@ class EKFAnalysis(GaussianAnalysis):
     Args:
         observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
             leaves in a copy of the tensordict.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
-            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        angles: components of the observation that are angles in radians; their innovation is wrapped to [-pi, pi).
-        observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``.
-        noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, read after ``observation`` has run.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
-        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
-        info_key: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
-        ensemble_key: what the observation model reads.
-        predicted_key: what it writes.
+        **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
         ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.

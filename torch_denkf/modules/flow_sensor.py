@@ -24,9 +24,9 @@ class _MotionTrunk(nn.Module):
     """Distance and turn between two frames by geometry, and features that say how to correct them.
 
     The road's correlations become a distribution over pitch and distance, by a small convolutional network that may
-    look at the neighbours of each and by the direction of travel: the road lies along it, so it tells the camera's pitch,
-    which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a network
-    trusts that more, as on an empty motorway.
+    look at the neighbours of each, and by the direction of travel: the road lies along it, so it tells the camera's
+    pitch, which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a
+    network trusts that more, as on an empty motorway.
     """
 
     distances: torch.Tensor

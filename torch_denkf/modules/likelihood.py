@@ -122,15 +122,15 @@ class LearnedLikelihood(SubModel):
         network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
-        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by default, as
-            in the papers.
+        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by default,
+            as in the papers.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
             be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
     Raises:
-        ValueError: on an unknown ``bound``, with both ``loc`` and ``reading_key``, or with angles and no ``reading_key``.
+        ValueError: on an unknown ``bound``, with both ``loc`` and ``reading_key``, or angles without ``reading_key``.
         KeyError: if an entry is missing.
 
     Reference:

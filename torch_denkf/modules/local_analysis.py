@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Unpack
 
 import torch
-from tensordict import NestedKey
-from torch import nn
 
 from torch_denkf.functional import (
     Neighbours,
@@ -20,18 +19,22 @@ from torch_denkf.functional import (
     random_rotation,
     relax_to_prior_spread,
 )
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 
 __all__ = ["LocalEnsembleAnalysis"]
 
 
-class LocalEnsembleAnalysis(SubModel):
+class LocalEnsembleAnalysis(EnsembleUpdate):
     """Updates each component of the state from the observations near it; the mathematics is
     :func:`~torch_denkf.functional.letkf`.
 
     For fields, where a few members stand for thousands of components: what they show of a covariance far away is
     chance. It takes the place of :class:`EnsembleAnalysis` and reads and writes the same keys. Nothing of size S x O is
     kept; S local systems, E x E each, are solved ``tile`` at a time.
+
+    ``nis`` and ``log_likelihood`` take each observation by itself, with the variance of its own forecast plus R: the
+    correlations that E members show between observations are what localisation does not believe. The expectation of
+    ``nis`` is the number of observations, if the filter is consistent.
 
     Args:
         near: which observations count where: :class:`~torch_denkf.functional.Neighbours`, or a taper ``[S, O]``. From
@@ -43,17 +46,8 @@ class LocalEnsembleAnalysis(SubModel):
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch, with L
             neighbours.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
-        forecast_key: forecast ensemble ``[*B, E, S]``.
-        predicted_key: predicted observations ``[*B, E, O]``.
-        sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is taken.
-        noise_variance_key: variances ``[*B, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; elsewhere readings and
-            variances may be NaN.
-        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``.
-        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
-            The last two take each observation by itself, with the variance of its own forecast plus R: the
-            correlations that E members show between observations are what localisation does not believe. The
-            expectation of ``nis`` is the number of observations, if the filter is consistent.
+        **keys: see :class:`EnsembleAnalysisKeys`. Of learned observations the mean is taken. What is not observed may
+            be NaN, readings and variances alike.
 
     Raises:
         ValueError: if a taper is not a matrix, or the sizes do not fit.
@@ -83,27 +77,14 @@ class LocalEnsembleAnalysis(SubModel):
         rotate: bool = False,
         tile: int = 4096,
         angles: Sequence[int] = (),
-        forecast_key: NestedKey = ("forecast", "ensemble"),
-        predicted_key: NestedKey = ("forecast", "observation"),
-        sensor_key: NestedKey = ("sensor", "ensemble"),
-        noise_variance_key: NestedKey = ("sensor", "noise"),
-        observed_key: NestedKey = "observed",
-        belief_key: str = "belief",
-        info_key: str = "info",
+        **keys: Unpack[EnsembleAnalysisKeys],
     ):
-        super().__init__(
-            nn.Identity(),
-            [forecast_key, predicted_key, sensor_key, noise_variance_key],
-            [(belief_key, name) for name in ("ensemble", "mean", "var")]
-            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
-            optional_keys=[observed_key],
-        )
+        super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
-        self.inflation, self.relaxation, self.rotate, self.tile = inflation, relaxation, rotate, tile
-        self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
+        self.tile = tile
 
     @classmethod
     def around(

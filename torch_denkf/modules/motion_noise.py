@@ -80,9 +80,7 @@ class NoisyTransition(SubModel):
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
-    def draw_noise(
-        self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_
-    ):
+    def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
         """Draws standard-normal values ``[*batch_size, E, N]``; ``None`` where E or the state's size is not known."""
         size = state_dim if self.dims is None else len(self.dims)
         if members is None or size is None:

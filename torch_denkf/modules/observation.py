@@ -9,8 +9,8 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._members import MemberNetwork
 from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules.transition import MemberNetwork
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
 

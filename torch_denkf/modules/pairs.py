@@ -20,7 +20,21 @@ from torch_denkf.modules._base import SubModel, reads, run_module
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "WithHistory"]
 
 
-class WithHistory(SubModel):
+class _WithPast(SubModel):
+    """An initial belief that also holds the last ``lags`` steps, under its own keys or under ``further_keys``."""
+
+    def __init__(self, initial: TensorDictModuleBase, lags: int, *further_keys: NestedKey):
+        if lags < 1:
+            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, [*initial.out_keys, *further_keys], optional_keys=optional)
+
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+
+class WithHistory(_WithPast):
     """An initial belief with a past: each member has had its present velocities all along.
 
     Args:
@@ -48,16 +62,9 @@ class WithHistory(SubModel):
         ensemble_key: NestedKey = ("belief", "ensemble"),
         history_key: NestedKey = ("belief", "history"),
     ):
-        if lags < 1:
-            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, [*initial.out_keys, history_key], optional_keys=optional)
+        super().__init__(initial, lags, history_key)
         self.ensemble_key, self.lags = unravel_key(ensemble_key), lags
         self.ensemble_size, self.state_dim = initial.ensemble_size, 5
-
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
 
     def on_entries(self, entries, call):
         """The belief and its history."""
@@ -140,7 +147,7 @@ class PairObservation(SubModel):
         return self.module(way), torch.cat([forecast[..., :5], history.flatten(-2)], -1), readable
 
 
-class ClonedPrior(SubModel):
+class ClonedPrior(_WithPast):
     """An initial belief whose state also holds the velocities of past steps, all equal to the present ones.
 
     Args:
@@ -160,19 +167,12 @@ class ClonedPrior(SubModel):
     """
 
     def __init__(self, initial: TensorDictModuleBase, lags: int):
-        if lags < 1:
-            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, initial.out_keys, optional_keys=optional)
+        super().__init__(initial, lags)
         self.input_dim, self.state_dim = 5, 5 + 2 * lags
         if getattr(initial, "ensemble_size", None) is not None:
             self.ensemble_size = initial.ensemble_size
         eye = torch.eye(5, dtype=torch.get_default_dtype())
         self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
-
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
 
     def on_entries(self, entries, call):
         """The belief."""

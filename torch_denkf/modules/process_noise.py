@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from torch_denkf.functional import unicycle_jacobians
 from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant, variance_and_floor
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.modules.unicycle import keys_of_dt
@@ -111,18 +111,12 @@ class CholeskyNoise(SubModel):
             nn.Identity() if constant else StochasticMLP(in_features, size, num_cells, layer="none", output_gain=0.0)
         )
         super().__init__(network, [in_key], [out_key])
-        variance = as_floating(r).expand(dim) ** 2
-        floor = 0.01 * variance if floor is None else as_floating(floor).expand(dim)
-        if not (variance > 0).all() or not (floor < variance).all() or not (floor >= 0).all():
-            raise ValueError(
-                f"CholeskyNoise needs r > 0 and 0 <= floor < r^2; got r^2 = {variance.tolist()}, "
-                f"floor = {floor.tolist()}."
-            )
+        variance, floor = variance_and_floor("CholeskyNoise", dim, r, floor)
         self.dim, self.constant = dim, constant
         if constant:
             self.raw = nn.Parameter(torch.zeros(size, dtype=variance.dtype))
-        self.register_buffer("std", (variance - floor).sqrt())
-        self.register_buffer("floor", floor.clone())
+        self.register_buffer("std", variance.sqrt())
+        self.register_buffer("floor", floor)
         register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
         register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)

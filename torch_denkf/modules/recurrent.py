@@ -276,7 +276,12 @@ class UnicyclePose(SubModel):
     """
 
     def __init__(
-        self, dt: float | NestedKey, *, velocity_key: str = "velocity", forecast_key: str = "forecast", belief_key: str = "belief"
+        self,
+        dt: float | NestedKey,
+        *,
+        velocity_key: str = "velocity",
+        forecast_key: str = "forecast",
+        belief_key: str = "belief",
     ):
         in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS] + keys_of_dt(dt)
         super().__init__(nn.Identity(), in_keys, [(belief_key, name) for name in (*_MOMENTS, "var")])

@@ -182,9 +182,7 @@ class ImageSensor(_Sensor):
         with torch.no_grad():
             features = trunk(torch.zeros(1, *image_shape)).shape[-1]
         head = StochasticMLP(features, observation_dim, num_cells, layer=layer, rate=rate)
-        super().__init__(
-            trunk, head, ensemble_size, in_key, out_key, encoding_key, loc, scale, 3, observed_key
-        )
+        super().__init__(trunk, head, ensemble_size, in_key, out_key, encoding_key, loc, scale, 3, observed_key)
         self.image_shape = tuple(image_shape)
         self.trunk_memory, self.recompute, self.trunk_dtype = trunk_memory, recompute, trunk_dtype
         self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
@@ -259,6 +257,4 @@ class VectorSensor(_Sensor):
         observed_key: NestedKey = "observed",
     ):
         head = StochasticMLP(in_features, observation_dim, num_cells, layer=layer, rate=rate)
-        super().__init__(
-            nn.Identity(), head, ensemble_size, in_key, out_key, None, loc, scale, 1, observed_key
-        )
+        super().__init__(nn.Identity(), head, ensemble_size, in_key, out_key, None, loc, scale, 1, observed_key)

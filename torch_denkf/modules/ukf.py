@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Unpack
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.functional.unscented import (
@@ -15,7 +14,12 @@ from torch_denkf.functional.unscented import (
     unscented_update,
     unscented_weights,
 )
-from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.modules._gaussian import (
+    GaussianAnalysis,
+    GaussianAnalysisOptions,
+    GaussianTransition,
+    GaussianTransitionKeys,
+)
 
 __all__ = ["UKFAnalysis", "UKFTransition"]
 
@@ -41,21 +45,15 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
     ``UnicycleTransition(drift=False)`` with a network that depends on the velocity, mixes the sigma points.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``.
-        process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
-            :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
+        transition: see :class:`EKFTransition`.
+        process_noise: likewise.
         alpha: see :func:`torch_denkf.functional.unscented_weights`.
         beta: likewise.
         kappa: likewise.
-        belief_key: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``cov`` may be
-            singular.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
-        ensemble_key: what the transition reads.
-        forecast_ensemble_key: what it writes.
+        **keys: see :class:`GaussianTransitionKeys`. The covariance of the last analysis may be singular.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
-            draws its own noise.
+        ValueError: where :class:`EKFTransition` does.
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,19 +73,9 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
-        belief_key: str = "belief",
-        forecast_key: str = "forecast",
-        ensemble_key: NestedKey = ("belief", "ensemble"),
-        forecast_ensemble_key: NestedKey = ("forecast", "ensemble"),
+        **keys: Unpack[GaussianTransitionKeys],
     ):
-        super().__init__(
-            transition,
-            process_noise,
-            belief_key=belief_key,
-            forecast_key=forecast_key,
-            ensemble_key=ensemble_key,
-            forecast_ensemble_key=forecast_ensemble_key,
-        )
+        super().__init__(transition, process_noise, **keys)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _forecast(self, entries, mean, cov, call):
@@ -99,32 +87,24 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
     """The update of mean and covariance by fresh sigma points of the forecast, through an observation model.
 
     Args:
-        observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
-            leaves in a copy of the tensordict.
+        observation: see :class:`EKFAnalysis`.
         alpha: see :func:`torch_denkf.functional.unscented_weights`.
         beta: likewise.
         kappa: likewise.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
-            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        angles: components of the observation that are angles in radians.
-        observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``.
-        noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, read after ``observation`` has run.
-        **keys: see :class:`EKFAnalysis`.
+        **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
-        KeyError: if an entry is missing.
+        ValueError: where :class:`EKFAnalysis` does.
+        KeyError: likewise.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import Select
-        >>> td = TensorDict({
-        ...     "forecast": {"mean": torch.zeros(2), "cov": torch.eye(2)},
-        ...     "sensor": {"ensemble": torch.ones(1), "noise": torch.ones(1)},
-        ... })
-        >>> UKFAnalysis(Select([1]))(td)["belief", "mean"].round(decimals=4)
-        tensor([0.0000, 0.5000])
+        >>> from torch_denkf.modules import LearnedObservation
+        >>> forecast = {"mean": torch.zeros(1), "cov": torch.eye(1)}
+        >>> reading = {"ensemble": torch.tensor([4.0]), "noise": torch.ones(1)}
+        >>> td = TensorDict({"forecast": forecast, "sensor": reading})
+        >>> UKFAnalysis(LearnedObservation(torch.square))(td)["info", "innovation"].round(decimals=4)  # 4 - E x^2
+        tensor([3.])
     """
 
     def __init__(
@@ -134,22 +114,9 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
-        inflation: float = 1.0,
-        angles: Sequence[int] = (),
-        observation_key: NestedKey = ("sensor", "ensemble"),
-        noise_variance_key: NestedKey = ("sensor", "noise"),
-        observed_key: NestedKey = "observed",
-        **keys: NestedKey,
+        **options: Unpack[GaussianAnalysisOptions],
     ):
-        super().__init__(
-            observation,
-            inflation=inflation,
-            angles=angles,
-            observation_key=observation_key,
-            noise_variance_key=noise_variance_key,
-            observed_key=observed_key,
-            **keys,
-        )
+        super().__init__(observation, **options)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _update(self, entries, mean, cov, observation, noise, call):

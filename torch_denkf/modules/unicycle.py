@@ -10,9 +10,9 @@ from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._members import MemberNetwork
 from torch_denkf.modules._tensors import register_constant
 from torch_denkf.modules.pairs import within_pair
+from torch_denkf.modules.transition import MemberNetwork
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
 

@@ -97,12 +97,8 @@ class DEnKFLoss(SequenceLoss):
         kl: float = 0.0,
         **options: Unpack[SequenceOptions],
     ):
-        super().__init__(
-            filter,
-            dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True)),
-            score=score,
-            **options,
-        )
+        weights = dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True))
+        super().__init__(filter, weights, score=score, **options)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:

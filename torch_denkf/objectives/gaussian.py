@@ -86,12 +86,8 @@ class GaussianLoss(DimensionsLoss):
         nll: float = 0.0,
         **options: Unpack[DimensionsOptions],
     ):
-        super().__init__(
-            filter,
-            dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True)),
-            score=score,
-            **options,
-        )
+        weights = dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True))
+        super().__init__(filter, weights, score=score, **options)
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 

@@ -106,12 +106,8 @@ class MixtureLoss(DimensionsLoss):
         nll: float = 0.0,
         **options: Unpack[DimensionsOptions],
     ):
-        super().__init__(
-            filter,
-            dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True)),
-            score=score,
-            **options,
-        )
+        weights = dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True))
+        super().__init__(filter, weights, score=score, **options)
         self.register_scale("component_std", component_std)
         if not (self.component_std > 0).all():
             raise ValueError(f"component_std is the width of each component, positive; got {component_std}.")

@@ -84,12 +84,7 @@ class SensorLoss(PartLoss, ReadingsLoss):
         noise: float = 0.0,
         **options: Unpack[ReadingsOptions],
     ):
-        super().__init__(
-            filter,
-            {"sensor": sensor, "noise": noise},
-            score=score,
-            **options,
-        )
+        super().__init__(filter, {"sensor": sensor, "noise": noise}, score=score, **options)
 
     def _trained(self):
         return self.filter.frame_modules

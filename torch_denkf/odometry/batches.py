@@ -52,7 +52,7 @@ class PairSampler:
             first = int(torch.randint(1, len(data) - length + 1, (), generator=generator))
             frames = rows(data, torch.arange(first, first + length), self.longest)
             chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return _with_start(TensorDict.stack(chosen), start_std, generator)
+        return with_start(TensorDict.stack(chosen), start_std, generator)
 
 
 class ReadingSampler:
@@ -100,10 +100,10 @@ class ReadingSampler:
         windows = take_spans(windows, steps_between(kept, longest)[:, 1:])
         windows["state"][..., VELOCITIES] *= speed
         windows["sensor", "ensemble"] *= (speed * gain).unsqueeze(-2)
-        return _with_start(windows, start_std, generator)
+        return with_start(windows, start_std, generator)
 
 
-def _with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
+def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
     """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
     windows["start"] = windows["state"] + start_std * torch.randn(len(windows), 1, 5, generator=generator)
     return mark_start(windows)

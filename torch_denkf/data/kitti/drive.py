@@ -126,7 +126,7 @@ def read_kitti_drive(
     sequence = f"{sequence:02d}" if isinstance(sequence, int) else sequence
     height, width = check_size(size)
     folder, poses = root / "sequences" / sequence, root / "poses" / f"{sequence}.txt"
-    camera = _choose_camera(folder, camera)
+    camera = choose_camera(folder, camera)
     files = _frame_files(folder / camera)
     if not files:
         raise FileNotFoundError(f"no images FFFFFF.png in {folder / camera}; pass another camera, or download them")
@@ -144,7 +144,8 @@ def read_kitti_drive(
     return _cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
 
 
-def _choose_camera(folder: Path, camera: str | None) -> str:
+def choose_camera(folder: Path, camera: str | None) -> str:
+    """Name of the folder of a drive's images: the one that is asked for, or the first that there is."""
     if not folder.is_dir():
         names = sorted(e.name for e in folder.parent.iterdir() if e.is_dir()) if folder.parent.is_dir() else []
         raise FileNotFoundError(

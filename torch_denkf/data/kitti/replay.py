@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.data.episodes import hashed_tests
-from torch_denkf.data.kitti.drive import _choose_camera
+from torch_denkf.data.kitti.drive import choose_camera
 from torch_denkf.data.kitti.episodes import KITTIEpisode, find_cameras, find_drives, read_drives
 from torch_denkf.data.kitti.frames import MOTION_KEYS, frames_at
 from torch_denkf.data.kitti.gaps import steps_at
@@ -109,7 +109,7 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         sources = []
         for name in find_drives(folder, drives):
             for camera in find_cameras(folder, name, cameras):
-                sources.append((name, _choose_camera(folder / "sequences" / name, camera)))
+                sources.append((name, choose_camera(folder / "sequences" / name, camera)))
         cache, progress = options.get("cache", True), options.get("progress", True)
         self._drives = read_drives(folder, sources, size=size, colour=colour, cache=cache, flow=flow, progress=progress)
         episodes: list[KITTIEpisode] = []

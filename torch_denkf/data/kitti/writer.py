@@ -75,8 +75,13 @@ class Job:
         if ours == self.options:
             return True
         if ours is None or not overwrite:
-            hint = "choose another name or folder" if ours is None else "pass overwrite=True or choose another name"
-            raise FileExistsError(f"{self.target} is there and is another drive ({ours or 'not rendered'}); {hint}")
+            if ours is None:
+                raise FileExistsError(f"{self.target} is there and was not rendered; choose another name or folder")
+            other = ", ".join(f"{key} {ours.get(key)!r}" for key in self.options if ours.get(key) != self.options[key])
+            raise FileExistsError(
+                f"{self.target} is there and was rendered with other options ({other}); choose another name, or "
+                "overwrite=True (--overwrite) to replace it"
+            )
         return False
 
     def renderer(self) -> Renderer:

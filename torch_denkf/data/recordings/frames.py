@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -60,11 +59,7 @@ class Frames:
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
-        try:
-            known = math.isfinite(self.start)
-        except TypeError:
-            known = False
-        if not known:
+        if not np.isfinite(self.start):
             raise ValueError(f"start is a time in s, got {self.start!r}")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:

@@ -1,0 +1,129 @@
+"""The command line of the study: ``python -m benchmarks.odometry --help``."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean, median
+
+import torch
+
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import Columns, head, line, report
+from torch_denkf.cli.main import main as denkf
+from torch_denkf.data import list_kitti_drives, write_drives
+from torch_denkf.data.kitti.drive import choose_camera
+from torch_denkf.data.kitti.files import read_poses, read_times
+from torch_denkf.metrics import kitti_devkit_error, kitti_endpoint_error
+from torch_denkf.odometry import read_path
+from torch_denkf.vision import KITTI_HEIGHT, poses_to_state
+
+WINDOW = 100  # steps of an end point error; half of a shorter drive
+COLUMNS = Columns(
+    names=(
+        "drive",
+        "height_m",
+        "frames",
+        "window",
+        "translation_m_per_m",
+        "rotation_deg_per_m",
+        "devkit_percent",
+        "devkit_deg_per_100m",
+        "scale",
+        "seconds",
+    ),
+    text=("drive",),
+    whole=("frames", "window"),
+    order=lambda row: (row["height_m"], row["drive"]),
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """``denkf odometry`` on drives with known paths, at the right height of the camera and at wrong ones."""
+
+    root: Path | None = None  # folder with sequences and poses
+    out: Path = Path("runs/odometry")
+    drives: tuple[str, ...] = ()  # all that are found
+    heights: tuple[float, ...] = (KITTI_HEIGHT, 1.4, 2.0)  # m; KITTI's is 1.65
+    checkpoint: Path | None = None  # a folder that denkf train left; by default the weights that come with the package
+    smoke: bool = False  # a tiny run on a rendered drive
+
+
+def track(study: Study, root: Path, drive: str, height: float) -> dict:
+    """One run of the command, and its errors."""
+    folder = root / "sequences" / drive
+    camera = choose_camera(folder, None)
+    out = study.out / f"{drive}-{height:g}"
+    words: list[str] = [str(folder / camera), "--calibration", str(folder / "calib.txt"), "--camera", camera]
+    words += ["--times", str(folder / "times.txt"), "--height", f"{height:g}", "--out", str(out), "--no-pictures"]
+    if study.checkpoint is not None:
+        words += ["--checkpoint", str(study.checkpoint)]
+    begun = time.time()
+    if denkf(["odometry", *words]) != 0:
+        raise SystemExit(f"denkf odometry {' '.join(words)} failed")
+    seconds = time.time() - begun
+    path = read_path(out / "path.csv")
+    poses = read_poses(root / "poses" / f"{drive}.txt")
+    _, dt = read_times(folder / "times.txt", len(poses))
+    truth = torch.from_numpy(poses_to_state(poses, dt))[path["frame"].squeeze(-1)][:, :3]
+    believed = path["belief", "mean"][:, :3]
+    window = WINDOW if len(truth) > WINDOW else (len(truth) - 1) // 2
+    error = kitti_endpoint_error(believed, truth, window=window)
+    way = (truth[1:, :2] - truth[:-1, :2]).norm(dim=-1).sum()
+    row = {
+        "drive": drive,
+        "height_m": height,
+        "frames": len(truth),
+        "window": window,
+        "translation_m_per_m": float(error.translation),
+        "rotation_deg_per_m": float(error.rotation),
+        "scale": float((believed[1:, :2] - believed[:-1, :2]).norm(dim=-1).sum() / way),
+        "seconds": seconds,
+    }
+    if way > 100:
+        devkit = kitti_devkit_error(believed, truth)
+        row |= {"devkit_percent": float(devkit.translation), "devkit_deg_per_100m": 100 * float(devkit.rotation)}
+    return row
+
+
+def page(rows: Sequence[dict]) -> str:
+    """A table of all drives at the first height, and the means at each."""
+    heights = list(dict.fromkeys(row["height_m"] for row in rows))
+    right = [row for row in rows if row["height_m"] == heights[0]]
+    lines = [f"`{command('odometry')}`", "", f"Camera {heights[0]:g} m over the road, as it is:", ""]
+    lines += head("drive", "frames", "window", "m/m", "deg/m", "devkit, %", "deg/100 m", "length / true", "frames/s")
+    for row in right:
+        devkit = [f"{row[key]:.2f}" if key in row else "" for key in ("devkit_percent", "devkit_deg_per_100m")]
+        errors = [f"{row['translation_m_per_m']:.3f}", f"{row['rotation_deg_per_m']:.3f}"]
+        speed = f"{row['frames'] / row['seconds']:.0f}"
+        lines.append(line(row["drive"], row["frames"], row["window"], *errors, *devkit, f"{row['scale']:.3f}", speed))
+    lines += ["", "A height that is guessed wrong scales the path; means and medians over the drives:", ""]
+    lines += head("height given, m", "m/m, mean", "m/m, median", "deg/m, mean", "length / true")
+    for height in heights:
+        some = [row for row in rows if row["height_m"] == height]
+        way = [row["translation_m_per_m"] for row in some]
+        turn, scale = fmean(row["rotation_deg_per_m"] for row in some), fmean(row["scale"] for row in some)
+        lines.append(line(f"{height:g}", f"{fmean(way):.3f}", f"{median(way):.3f}", f"{turn:.3f}", f"{scale:.3f}"))
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Runs the study."""
+    study = parse(Study)
+    if study.smoke:
+        root = Path(tempfile.mkdtemp(prefix="odometry-"))
+        write_drives(root, ["town"], frames=12, size=(100, 300))
+        study = replace(study, root=root, out=root / "out", heights=study.heights[:2])
+    if study.root is None:
+        raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
+    drives = study.drives or list_kitti_drives(study.root)
+    rows = [track(study, study.root, drive, height) for height in study.heights for drive in drives]
+    report(study.out, COLUMNS, rows, page(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""What the filters with a mean, a covariance and a learned sensor share: their modules' order and their options."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Unpack
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.filters.base import Filter, FilterOptions
+
+__all__ = ["GaussianFilter", "GaussianOptions"]
+
+
+class GaussianOptions(FilterOptions, total=False):
+    """What the filters with a mean, a covariance and a learned sensor take beside their models.
+
+    They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
+    ``check_finite`` of :class:`Filter`.
+
+    Attributes:
+        inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never
+            observed grows by it without bound.
+        angles: components of the observation that are angles in radians; none by default.
+        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; ``("sensor", "ensemble")`` by default.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
+            may write it.
+    """
+
+    inflation: float
+    angles: Sequence[int]
+    observation_key: NestedKey
+    observed_key: NestedKey
+
+
+class GaussianFilter(Filter):
+    """A sensor and its noise, the two steps of a Kalman filter, and a Gaussian initial belief.
+
+    Args:
+        sensor: writes the reading; ``None`` where it is in the tensordict.
+        noise: writes R.
+        transition: forecasts mean and covariance.
+        analysis: makes the module that updates them, from ``inflation``, ``angles``, ``observation_key``,
+            ``observed_key`` and ``noise_variance_key``.
+        initial: the initial belief.
+        inflation: see :class:`GaussianOptions`.
+        angles: likewise.
+        observation_key: likewise.
+        observed_key: likewise.
+        **kwargs: of :class:`Filter`.
+    """
+
+    def __init__(
+        self,
+        sensor: TensorDictModuleBase | None,
+        noise: TensorDictModuleBase,
+        transition: TensorDictModuleBase,
+        analysis: Callable[..., TensorDictModuleBase],
+        *,
+        initial: TensorDictModuleBase,
+        inflation: float = 1.0,
+        angles: Sequence[int] = (),
+        observation_key: NestedKey = ("sensor", "ensemble"),
+        observed_key: NestedKey = "observed",
+        **kwargs: Unpack[FilterOptions],
+    ):
+        update = analysis(
+            inflation=inflation,
+            angles=angles,
+            observation_key=observation_key,
+            noise_variance_key=noise.out_keys[0],
+            observed_key=observed_key,
+        )
+        modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
+        modules.update(noise=noise, transition=transition, analysis=update)
+        super().__init__(modules, initial=initial, **kwargs)

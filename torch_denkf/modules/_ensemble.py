@@ -1,0 +1,85 @@
+"""What the updates of an ensemble share: the entries they read and write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypedDict
+
+from tensordict import NestedKey
+from torch import nn
+
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
+
+
+class EnsembleAnalysisKeys(TypedDict, total=False):
+    """The keys that an update of an ensemble takes.
+
+    Attributes:
+        forecast_key: forecast ensemble ``[*B, E, S]``; ``("forecast", "ensemble")`` by default.
+        predicted_key: predicted observations ``[*B, E, O]``; ``("forecast", "observation")`` by default.
+        sensor_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``; ``("sensor", "ensemble")`` by
+            default.
+        noise_variance_key: variances ``[*B, O]``; ``("sensor", "noise")`` by default.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; ``"observed"`` by default.
+        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``;
+            ``"belief"`` by default.
+        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``;
+            ``"info"`` by default. Where a filter holds several analyses of one prefix, each has its own,
+            ``(info_key, place, ...)``, and ``nis`` and ``log_likelihood`` under the prefix are their sums.
+    """
+
+    forecast_key: NestedKey
+    predicted_key: NestedKey
+    sensor_key: NestedKey
+    noise_variance_key: NestedKey
+    observed_key: NestedKey
+    belief_key: str
+    info_key: str
+
+
+class EnsembleUpdate(SubModel):
+    """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
+
+    Args:
+        inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
+        rotate: random mean-preserving rotation of the anomalies.
+        angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
+        forecast_key: see :class:`EnsembleAnalysisKeys`, like the other keys.
+        predicted_key: likewise.
+        sensor_key: likewise.
+        noise_variance_key: likewise.
+        observed_key: likewise.
+        belief_key: likewise.
+        info_key: likewise.
+    """
+
+    def __init__(
+        self,
+        *,
+        inflation: float,
+        relaxation: float,
+        rotate: bool,
+        angles: Sequence[int],
+        covariance: bool = False,
+        forecast_key: NestedKey = ("forecast", "ensemble"),
+        predicted_key: NestedKey = ("forecast", "observation"),
+        sensor_key: NestedKey = ("sensor", "ensemble"),
+        noise_variance_key: NestedKey = ("sensor", "noise"),
+        observed_key: NestedKey = "observed",
+        belief_key: str = "belief",
+        info_key: str = "info",
+    ):
+        moments = [(belief_key, name) for name in ("ensemble", "mean", "var")]
+        diagnostics = [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
+        super().__init__(
+            nn.Identity(),
+            [forecast_key, predicted_key, sensor_key, noise_variance_key],
+            [*moments, *diagnostics, *[(belief_key, "cov")] * covariance],
+            optional_keys=[observed_key],
+        )
+        self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
+        self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
