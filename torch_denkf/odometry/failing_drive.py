@@ -19,13 +19,13 @@ __all__ = ["drive_scores", "track_failing_drive", "usual_failures"]
 
 
 def usual_failures(frames: int) -> list[CameraFailure]:
-    """A missing stretch, a black one and a covered camera, each a tenth or more of a drive of so many frames.
+    """A missing stretch, a black one and one with a box, of a drive of so many frames.
 
     Example:
         >>> [(failure.kind, failure.first, failure.last) for failure in usual_failures(100)]
-        [('missing', 22, 31), ('black', 48, 57), ('box', 72, 87)]
+        [('missing', 24, 29), ('black', 50, 55), ('box', 74, 87)]
     """
-    spans = {"missing": (0.22, 0.32), "black": (0.48, 0.58), "box": (0.72, 0.88)}
+    spans = {"missing": (0.24, 0.3), "black": (0.5, 0.56), "box": (0.74, 0.88)}
     return [
         CameraFailure(kind, round(first * frames), round(last * frames) - 1)  # type: ignore[arg-type]
         for kind, (first, last) in spans.items()

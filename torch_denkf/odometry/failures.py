@@ -1,4 +1,4 @@
-"""Cameras that fail, with and without saying so: frames that do not arrive, are black, or are covered in part."""
+"""Cameras that fail, with and without saying so: frames that do not arrive, are black, or are hidden in part."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.transforms import OccludingBox
 
 __all__ = ["CameraFailure", "fail_frames"]
 
@@ -15,7 +19,7 @@ class CameraFailure(NamedTuple):
 
     Attributes:
         kind: ``"missing"`` (the frames do not arrive, and that is known), ``"black"`` (they arrive, black) or
-            ``"box"`` (something covers the middle of the picture).
+            ``"box"`` (:class:`torch_denkf.transforms.OccludingBox`: something hides a part of each picture).
         first: number of the first frame.
         last: number of the last frame.
     """
@@ -53,6 +57,7 @@ def fail_frames(
     """
     if unknown := [failure.kind for failure in failures if failure.kind not in ("missing", "black", "box")]:
         raise ValueError(f"a camera fails in the ways 'missing', 'black' and 'box'; got {unknown}")
+    box = OccludingBox()
     for number, frame in enumerate(frames):
         failure = next((each for each in failures if each.first <= number <= each.last), None)
         if failure is None or frame is None:
@@ -62,12 +67,10 @@ def fail_frames(
         elif failure.kind == "black":
             yield np.zeros_like(frame)
         else:
-            yield _with_box(frame)
+            yield _covered(frame, box)
 
 
-def _with_box(frame: np.ndarray) -> np.ndarray:
-    """A grey box over a quarter of the width and three fifths of the height, on the road and what is beside it."""
-    rows, columns = frame.shape[:2]
-    covered = frame.copy()
-    covered[round(0.4 * rows) :, round(0.3 * columns) : round(0.55 * columns)] = 90
-    return covered
+def _covered(frame: np.ndarray, box: OccludingBox) -> np.ndarray:
+    picture = torch.from_numpy(np.ascontiguousarray(frame).reshape(*frame.shape[:2], -1)).permute(2, 0, 1)
+    covered = box(TensorDict({"pixels": picture.clone()}))["pixels"].permute(1, 2, 0)
+    return np.ascontiguousarray(covered.numpy()).reshape(frame.shape)
