@@ -51,10 +51,10 @@ def _run(args: argparse.Namespace) -> None:
     import cv2
     import torch
 
+    from torch_denkf.cli._car import load_car
     from torch_denkf.data import read_kitti_drive, render_drives
     from torch_denkf.odometry import drive_scores, fail_frames, track_failing_drive, usual_failures
     from torch_denkf.plots import NamedSpan, drive_animation, drive_picture
-    from torch_denkf.pretrained import from_pretrained
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
@@ -76,7 +76,7 @@ def _run(args: argparse.Namespace) -> None:
     failures = usual_failures(len(drive))
     with progress_bar("tracking the car", len(drive), unit=" frames", every=3) as bar:
         tracked = track_failing_drive(
-            from_pretrained("car-odometry"),  # type: ignore[arg-type]
+            load_car("car-odometry"),
             drive,
             failures,
             height=args.height,
@@ -99,11 +99,15 @@ def _run(args: argparse.Namespace) -> None:
 def _table(scores: dict[str, float]) -> str:
     """Three lines on a drive."""
     way = scores["way_m"]
-    lines = [f"{'':16}{'off at the end':>18}{'off on average':>18}   after {way:.0f} m with a camera that failed 3 times"]
+    lines = [
+        f"{'':16}{'off at the end':>18}{'off on average':>18}   after {way:.0f} m with a camera that failed 3 times"
+    ]
     for label, name in (("DEnKF", "filter"), ("dead reckoning", "reckoned")):
         end, mean = scores[f"{name}_end_m"], scores[f"{name}_mean_m"]
         lines.append(f"{label:16}{f'{end:.1f} m ({100 * end / way:.1f} %)':>18}{f'{mean:.1f} m':>18}")
-    held = f"{100 * scores['held_v']:.0f} % of the true speeds, {100 * scores['held_theta_dot']:.0f} % of the turn rates"
+    held = (
+        f"{100 * scores['held_v']:.0f} % of the true speeds, {100 * scores['held_theta_dot']:.0f} % of the turn rates"
+    )
     return "\n".join([*lines, f"The DEnKF's 90 % intervals hold {held}."])
 
 

@@ -28,7 +28,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("frames", type=Path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
     add("--calibration", required=True, type=Path, metavar="FILE", help="KITTI's calib.txt; or a file with fx fy cx cy")
-    add("--checkpoint", required=True, type=Path, metavar="FOLDER", help="that denkf train left")
+    add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
     add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
     add("--fps", type=float, help="frames in a second; that of a video by default")
@@ -36,6 +36,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
     add("--seed", type=int, default=0, help="of the filter's noise")
+    add("--black-level", type=int, help="frames none of whose pixels is brighter, of 255, count as missing")
     add("--no-pictures", action="store_true", help="leave the pictures out")
     add("--threads", type=int, default=1, help="of torch and OpenCV")
 
@@ -46,12 +47,13 @@ def _run(args: argparse.Namespace) -> None:
     import cv2
     import torch
 
+    from torch_denkf.cli._car import load_car
     from torch_denkf.data import write_trajectory
-    from torch_denkf.odometry import load_car_filter, read_camera, read_frames, track, write_path
+    from torch_denkf.odometry import read_camera, read_frames, track, write_path
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
-    car, source = load_car_filter(args.checkpoint), read_frames(args.frames)
+    car, source = load_car(args.checkpoint), read_frames(args.frames)
     folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
     calibration = read_camera(args.calibration, args.camera or folder)
     times, fps = _times(args.times, source), args.fps or source.fps
@@ -65,6 +67,7 @@ def _run(args: argparse.Namespace) -> None:
         fps=None if times is not None else fps,
         height=args.height,
         pitch=args.pitch,
+        black_level=args.black_level,
         seed=args.seed,
     )
     means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading

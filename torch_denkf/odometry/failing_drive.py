@@ -73,8 +73,7 @@ def track_failing_drive(
         >>> tracked["observed"].flatten().tolist()
         [False, True, True, True, False, False, True, True]
     """
-    images = (np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1]) for image in drive["image"])
-    frames = _counted(fail_frames(images, failures), progress)
+    frames = _counted(fail_frames(map(_for_opencv, drive["image"]), failures), progress)
     dt = float(drive["dt"][0, 0])
     beliefs = list(
         track(
@@ -125,6 +124,12 @@ def drive_scores(tracked: TensorDict, level: float = 0.9) -> dict[str, float]:
     scores |= {f"{name}_mean_m": float(error.mean()) for name, error in errors.items()}
     way = float(truth[:, :2].diff(dim=0).norm(dim=-1).sum())
     return {"way_m": way, **scores, "held_v": float(held[0]), "held_theta_dot": float(held[1])}
+
+
+def _for_opencv(image: Tensor) -> np.ndarray:
+    """Grey ``[H, W]``, or ``[H, W, 3]`` in OpenCV's order."""
+    array = image.permute(1, 2, 0).numpy()
+    return array[..., 0] if array.shape[-1] == 1 else np.ascontiguousarray(array[..., ::-1])
 
 
 def _counted(frames, progress):

@@ -34,9 +34,7 @@ class CameraFailure(NamedTuple):
         return self.kind == "missing"
 
 
-def fail_frames(
-    frames: Iterable[np.ndarray | None], failures: Sequence[CameraFailure]
-) -> Iterator[np.ndarray | None]:
+def fail_frames(frames: Iterable[np.ndarray | None], failures: Sequence[CameraFailure]) -> Iterator[np.ndarray | None]:
     """The frames of a camera that fails.
 
     Args:

@@ -139,7 +139,12 @@ class _Drive:
         """Draws paths, members and failures; returns what can move."""
         parts: dict[str, Any] = {"members": [], "spans": []}
         for number, span in enumerate(self.spans):
-            style: dict[str, Any] = {"color": _SHADES[number % 3], "linewidth": 15, "solid_capstyle": "butt", "zorder": 0}
+            style: dict[str, Any] = {
+                "color": _SHADES[number % 3],
+                "linewidth": 15,
+                "solid_capstyle": "butt",
+                "zorder": 0,
+            }
             part = self.truth[span.first : span.last + 1]
             parts["spans"].append(axes.plot(-part[:, 1], part[:, 0], **style)[0])
         for index in range(self.members.shape[1]):

@@ -95,9 +95,7 @@ class UR5TableFilter(DEnKF):
             transition=_ArmTransition(s),
             sensor=sensor,
             observation=Select(range(STATE)),
-            noise=DiagonalNoise(
-                STATE, r=s.sensor_std, in_features=s.num_cells[-1], in_key=("sensor", "encoding")
-            ),
+            noise=DiagonalNoise(STATE, r=s.sensor_std, in_features=s.num_cells[-1], in_key=("sensor", "encoding")),
             analysis=analysis,
             initial=GaussianPrior(s.state_mean, s.state_std, ensemble_size=s.ensemble_size),
             update_at_reset=True,

@@ -1,1 +1,1 @@
-"""The programs that trained the filters of the library: ``python -m torch_denkf.pretrained.train NAME --out FOLDER``."""
+"""How the filters of the library were trained: ``python -m torch_denkf.pretrained.train NAME --out FOLDER``."""

@@ -16,6 +16,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -33,31 +34,37 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("name", choices=["reacher", "ur5-table"])
-    parser.add_argument("--out", type=Path, required=True, help="folder of the filter, with all that its training needs")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the filter, with all that its training needs"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers")
     parser.add_argument("--threads", type=int, default=1, help="of torch")
     parser.add_argument("--evaluate", action="store_true", help="test the library's filter and train none")
     args = parser.parse_args(words)
     torch.set_num_threads(args.threads)
-    command = f"{parser.prog} {shlex.join(words)}"
-    if args.name == "reacher":
-        from torch_denkf.pretrained.train.reacher import evaluate_reacher, train_reacher
-
-        model = from_pretrained("reacher") if args.evaluate else train_reacher(args.out, seed=args.seed, command=command)
-        scores = evaluate_reacher(model)  # type: ignore[arg-type]
-    else:
-        from torch_denkf.pretrained.train.ur5_table import evaluate_ur5_table, test_demos, train_ur5_table
-
-        model = from_pretrained("ur5-table") if args.evaluate else train_ur5_table(
-            args.out, seed=args.seed, command=command
-        )
-        demos, cache = test_demos(args.out), args.out / "cache"
-        scores = {
-            f"{share:.0%} of the frames missing": evaluate_ur5_table(model, demos, missing=share, cache=cache)  # type: ignore[arg-type]
-            for share in (0.0, 0.3)
-        }
+    options = {"seed": args.seed, "command": f"{parser.prog} {shlex.join(words)}"}
+    run = _reacher if args.name == "reacher" else _ur5_table
+    scores = run(args.out, args.evaluate, options)
     sys.stdout.write(json.dumps(scores, indent=1) + "\n")
     return 0
+
+
+def _reacher(out: Path, evaluate: bool, options: dict[str, Any]) -> dict[str, Any]:
+    from torch_denkf.pretrained.train.reacher import evaluate_reacher, train_reacher
+
+    model = from_pretrained("reacher") if evaluate else train_reacher(out, **options)
+    return evaluate_reacher(model)
+
+
+def _ur5_table(out: Path, evaluate: bool, options: dict[str, Any]) -> dict[str, Any]:
+    from torch_denkf.pretrained.train.ur5_table import evaluate_ur5_table, train_ur5_table, whole_demos
+
+    model = from_pretrained("ur5-table") if evaluate else train_ur5_table(out, **options)
+    demos = whole_demos(out)
+    return {
+        f"{share:.0%} of the frames missing": evaluate_ur5_table(model, demos, missing=share, cache=out / "cache")
+        for share in (0.0, 0.3)
+    }
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from torch_denkf._progress import progress_bar
 from torch_denkf.metrics import interval_coverage
@@ -41,7 +42,7 @@ def train_reacher(
         for _ in range(episodes):
             rollouts.append(env.rollout(200).select("state", "encoder", "action"))
             bar.update()
-    data = torch.stack(rollouts)
+    data = TensorDict.stack(rollouts)
     states = data["state"].flatten(0, 1)
     model = reacher(
         encoder_std=ENCODER_STD, state_mean=tuple(states.mean(0).tolist()), state_std=tuple(states.std(0).tolist())
@@ -70,7 +71,7 @@ def evaluate_reacher(model: ReacherFilter, *, episodes: int = 10, steps: int = 4
     """
     torch.manual_seed(seed)
     env = reacher_env(seed)
-    data = torch.stack([env.rollout(steps).select("state", "encoder", "action") for _ in range(episodes)])
+    data = TensorDict.stack([env.rollout(steps).select("state", "encoder", "action") for _ in range(episodes)])
     belief = model.sequence(data.clone())["belief"]
     mean, var, truth, encoder = belief["mean"][:, 1:], belief["var"][:, 1:], data["state"][:, 1:], data["encoder"]
     raw = encoder.diff(dim=1) / _DT

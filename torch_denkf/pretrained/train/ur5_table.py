@@ -22,7 +22,7 @@ from torch_denkf.pretrained.ur5_table import JOINTS, UR5TableFilter, UR5TableSet
 from torch_denkf.training import Stage, choose_for_coverage, train_part
 from torch_denkf.training.trainer import FilterTrainer
 
-__all__ = ["evaluate_ur5_table", "test_demos", "train_ur5_table"]
+__all__ = ["evaluate_ur5_table", "whole_demos", "train_ur5_table"]
 
 UNIT = torch.tensor([0.02] * JOINTS + [0.0025] * 3)  # rad and m: what counts as an error of one
 _INFLATIONS = (1.0, 1.01, 1.02, 1.03, 1.05, 1.07, 1.1, 1.15, 1.2, 1.3)
@@ -80,7 +80,7 @@ def train_ur5_table(
     return model.eval()
 
 
-def test_demos(out: Path, sequences: int = 60, *, processes: int = 1, progress: bool = True) -> Path:
+def whole_demos(out: Path, sequences: int = 60, *, processes: int = 1, progress: bool = True) -> Path:
     """The folder of whole demos, of which the replay's hash puts a fifth on the test side; collects what is missing."""
     folder = out / "demos/sequences"
     _collect(folder, sequences, 0, processes, progress)
@@ -90,9 +90,7 @@ def test_demos(out: Path, sequences: int = 60, *, processes: int = 1, progress: 
 def _collect(folder: Path, demos: int, frames: int, processes: int, progress: bool) -> None:
     side = UR5TableSettings.pixels
     with progress_bar(f"collecting {folder.name}", demos, unit=" demos", shown=progress) as bar:
-        collect_ur5_demos(
-            folder, demos, size=(side, side), frames=frames, processes=processes, progress=bar.update
-        )
+        collect_ur5_demos(folder, demos, size=(side, side), frames=frames, processes=processes, progress=bar.update)
 
 
 def _frames(data: UR5ExperienceReplay, first: int) -> TensorDict:
@@ -226,8 +224,8 @@ def evaluate_ur5_table(
         progress: whether bars say how far it is.
 
     Returns:
-        Mean absolute errors over J1 to J7 in degrees and over x, y, z in cm, of the filter and of the sensor's mean; and
-        the share of the true state in the filter's 90 % intervals.
+        Mean absolute errors over J1 to J7 in degrees and over x, y, z in cm, of the filter, of the sensor's mean, and
+        of the last targets taken for the joints; and the share of the true state in the filter's 90 % intervals.
     """
     whole = _sequences(UR5ExperienceReplay(demos, split="test", cache=cache, progress=progress))
     readings = read_demos(model, whole)
@@ -239,10 +237,15 @@ def evaluate_ur5_table(
         ("filter", out["belief", "mean"]),
         ("sensor", readings["sensor", "ensemble"].mean(-2)),
     ]
-    rows = {}
+    rows: dict[str, dict[str, float]] = {}
+    targets = readings["action"][:, :-1] - truth[:, 1:, :JOINTS]
+    rows["last targets"] = {"joints, deg": float(targets.abs().mean().rad2deg())}
     for name, mean in estimates:
         error = (mean - truth).abs().mean((0, 1))
-        rows[name] = {"joints, deg": float(error[:JOINTS].mean().rad2deg()), "tool, cm": 100 * float(error[JOINTS:].mean())}
+        rows[name] = {
+            "joints, deg": float(error[:JOINTS].mean().rad2deg()),
+            "tool, cm": 100 * float(error[JOINTS:].mean()),
+        }
     parts = (out["belief", "mean"], out["belief", "var"], truth)
     covered = interval_coverage(*(part.flatten(0, 1) for part in parts), level=0.9)
     return {**rows, "held by 90 % intervals": float(covered.mean()), "demos": len(truth)}
