@@ -62,7 +62,8 @@ def save_folder(
     json.dumps(config)  # before anything is written
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
-    save_file({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}, part)
+    # Copies: safetensors refuses tensors that share memory.
+    save_file({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()}, part)
     part.chmod(0o644)  # safetensors leaves files that only their owner reads
     config["sha256"] = _sha256(part)
     (folder / f"{CONFIG}.part").write_text(json.dumps(config, indent=1) + "\n")

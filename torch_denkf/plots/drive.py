@@ -162,7 +162,7 @@ class _Drive:
         parts["ellipse"] = self._ellipse(axes, len(self.mean) - 1)
         (parts["car"],) = axes.plot([-self.mean[-1, 1]], [self.mean[-1, 0]], "o", color=BELIEF, markersize=5, zorder=4)
         axes.plot([0], [0], "s", color="black", markersize=6, zorder=4)
-        axes.annotate("start", (0, 0), (7, -3), textcoords="offset points", fontsize=9)
+        axes.annotate("start", (0, 0), (0, -14), textcoords="offset points", fontsize=9, ha="center")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="to the right, m", ylabel="forward, m")
         axes.margins(0.1)
