@@ -87,7 +87,18 @@ def test_modules_is_a_relative_link():
     [
         (["functional", "metrics"], set()),
         (
-            ["vision", "modules", "filters", "transforms", "objectives", "training", "data", "envs", "odometry"],
+            [
+                "vision",
+                "modules",
+                "filters",
+                "transforms",
+                "objectives",
+                "training",
+                "data",
+                "envs",
+                "odometry",
+                "pretrained",
+            ],
             {"mujoco", "cv2"},
         ),
     ],

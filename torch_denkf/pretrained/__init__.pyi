@@ -1,11 +1,9 @@
 from .encoders import NoisyEncoders, reacher_env
 from .folders import available, from_pretrained, save_pretrained
-from .models import BUILDERS
 from .reacher import ReacherFilter, ReacherSettings, reacher
 from .ur5_table import UR5TableFilter, UR5TableSettings, ur5_table
 
 __all__ = [
-    "BUILDERS",
     "NoisyEncoders",
     "ReacherFilter",
     "ReacherSettings",

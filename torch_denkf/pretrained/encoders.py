@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite
@@ -48,7 +46,6 @@ def reacher_env(seed: int = 0) -> TransformedEnv:
         >>> sorted(reacher_env().rollout(2)["state"].shape)
         [2, 4]
     """
-    os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control is imported: nothing is rendered here
     env = TransformedEnv(
         DMControlEnv("reacher", "easy"),
         Compose(

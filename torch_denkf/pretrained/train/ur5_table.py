@@ -145,7 +145,8 @@ def _train_sensor(
     def error() -> dict[str, float]:
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            return {"crps": sum(float(loss(part.copy())["loss_sensor"]) for part in held_out.split(256)[:4]) / 4}
+            scores = [loss(part.copy())["loss_sensor"] for part in held_out.split(256)[:4]]
+            return {"crps": float(torch.stack(scores).mean())}
 
     stage = Stage("sensor", loss, sample, updates, lr=2e-3, weight_decay=0.02, validate=error)
     train_part(model["sensor"], stage, out=out, validate_every=max(updates // 8, 1), save_every=500, **trainer)
