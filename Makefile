@@ -12,7 +12,7 @@ NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 .PHONY: demo test test-nightly lint layers unit smoke bench docs clean
 
 demo: $(STAMP)
-	$(BIN)/python examples/quickstart.py --out runs/quickstart
+	$(BIN)/denkf demo --out runs/demo
 
 test: lint layers unit smoke
 

@@ -29,7 +29,11 @@ setup(
     ],
     python_requires=">=3.11",
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
-    package_data={"torch_denkf": ["py.typed", "**/*.pyi"], "torch_denkf.simulation.ur5": ["assets/*.xml"]},
+    package_data={
+        "torch_denkf": ["py.typed", "**/*.pyi"],
+        "torch_denkf.simulation.ur5": ["assets/*.xml"],
+        "torch_denkf.pretrained": ["weights/*/*"],
+    },
     entry_points={"console_scripts": ["denkf = torch_denkf.cli.main:main"]},
     install_requires=[
         "torch>=2.13",

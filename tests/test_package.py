@@ -1,5 +1,7 @@
 """The package as a user gets it: what a wheel holds, and what an import costs."""
 
+import json
+import os
 import subprocess
 import sys
 import warnings
@@ -9,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import torch_denkf
+from tests.pretrained import beliefs
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,13 +34,13 @@ def wheel(tmp_path_factory):
 
 
 # All that needs the wheel is in one test, so that pytest-xdist builds it in one process alone.
-def test_the_wheel_holds_the_package_alone(wheel):
+def test_the_wheel_holds_the_package_alone(wheel, tmp_path):
     names = wheel.namelist()
     top = {name.split("/")[0] for name in names}
     (info,) = (name for name in top if name.endswith(".dist-info"))
     assert top == {"torch_denkf", info}
     package = ROOT / "torch_denkf"
-    kinds = ("*.py", "*.pyi", "*.xml", "py.typed")
+    kinds = ("*.py", "*.pyi", "*.xml", "py.typed", "weights/*/*")
     sources = {str(path.relative_to(ROOT)) for kind in kinds for path in package.rglob(kind)}
     assert "torch_denkf/py.typed" in sources, "without it no type checker reads the annotations"
     assert {name for name in names if name.startswith("torch_denkf/")} == sources
@@ -50,6 +53,27 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert "Requires-Python: >=3.11\n" in metadata
     assert f"Version: {torch_denkf.__version__}\n" in metadata
     assert "Name: torch_denkf" in metadata or "Name: torch-denkf" in metadata
+    check_trained_filters(wheel, tmp_path)
+
+
+def check_trained_filters(wheel, folder):
+    """They are small, and believe in a fresh process, from the wheel's own files, what they believe here."""
+    weights = [each for each in wheel.infolist() if "/pretrained/weights/" in each.filename]
+    assert sum(each.file_size for each in weights) <= 1.5e6
+    names = torch_denkf.available()
+    assert names == ["car-odometry", "reacher", "ur5-table"]
+    files = {f"{name}/{file}" for name in names for file in ("card.md", "config.json", "weights.safetensors")}
+    assert {each.filename.split("/weights/")[1] for each in weights} == files
+    wheel.extractall(folder)
+    script = ROOT / "tests" / "pretrained" / "beliefs.py"
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    done = subprocess.run(
+        [sys.executable, script], env=environment, cwd=folder, capture_output=True, text=True, check=True
+    )
+    found = json.loads(done.stdout)
+    assert found.pop("package") == str(folder / "torch_denkf")
+    for name, values in beliefs.all_beliefs().items():
+        assert found[name] == pytest.approx(values, rel=1e-4, abs=1e-5), name
 
 
 def test_modules_is_a_relative_link():
@@ -64,7 +88,18 @@ def test_modules_is_a_relative_link():
     [
         (["functional", "metrics"], set()),
         (
-            ["vision", "modules", "filters", "transforms", "objectives", "training", "data", "envs", "odometry"],
+            [
+                "vision",
+                "modules",
+                "filters",
+                "transforms",
+                "objectives",
+                "training",
+                "data",
+                "envs",
+                "odometry",
+                "pretrained",
+            ],
             {"mujoco", "cv2"},
         ),
     ],
@@ -103,6 +138,7 @@ def test_every_public_name_is_there():
         "envs",
         "plots",
         "odometry",
+        "pretrained",
     ):
         package = __import__(f"torch_denkf.{name}", fromlist=["*"])
         for public in getattr(package, "__all__", ()):

@@ -24,6 +24,7 @@ from .filters import (
     ParticleFilter,
 )
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from .pretrained.folders import available, from_pretrained, save_pretrained
 from .training import FilterTrainer, Stage
 from .transforms import (
     BlackFrames,
@@ -82,6 +83,9 @@ __all__ = [
     "UR5Expert",
     "UR5TableEnv",
     "Video",
+    "available",
     "export_step",
+    "from_pretrained",
     "load_step",
+    "save_pretrained",
 ]

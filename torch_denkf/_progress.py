@@ -12,10 +12,13 @@ __all__ = ["progress_bar"]
 SECONDS = 10.0  # between two lines where there is no terminal; shorter work says nothing
 
 
-def progress_bar(name: str, total: int | None, done: int = 0, *, unit: str = "it", shown: bool = True) -> Any:
+def progress_bar(
+    name: str, total: int | None, done: int = 0, *, unit: str = "it", shown: bool = True, every: float = SECONDS
+) -> Any:
     """A bar over ``total`` pieces of work, of which ``done`` are made: tqdm's, and a context manager.
 
-    In a terminal it is drawn. Elsewhere, in a log file for example, a line is written to stderr every ten seconds.
+    In a terminal it is drawn. Elsewhere, in a log file for example, a line is written to stderr every ten seconds,
+    or as often as asked for.
 
     Args:
         name: what is done.
@@ -23,6 +26,7 @@ def progress_bar(name: str, total: int | None, done: int = 0, *, unit: str = "it
         done: pieces that were made before.
         unit: what a piece is.
         shown: whether anything is shown at all.
+        every: seconds between two lines where there is no terminal.
 
     Example:
         >>> with progress_bar("fit", 10, shown=False) as bar:
@@ -31,7 +35,7 @@ def progress_bar(name: str, total: int | None, done: int = 0, *, unit: str = "it
     """
     options: dict[str, Any] = {"total": total, "initial": done, "desc": name, "unit": unit, "disable": not shown}
     if not sys.stderr.isatty():
-        options |= {"file": _Lines(sys.stderr), "mininterval": SECONDS, "delay": SECONDS, "ascii": True, "ncols": 100}
+        options |= {"file": _Lines(sys.stderr), "mininterval": every, "delay": every, "ascii": True, "ncols": 100}
     return tqdm(**options)
 
 

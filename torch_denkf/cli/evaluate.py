@@ -20,7 +20,7 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--checkpoint", required=True, type=Path, help="folder that denkf train left")
+    add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
     add("--root", required=True, type=Path, help="folder in KITTI's layout, with sequences/ and poses/")
     add("--drives", nargs="+", metavar="NAME", help="drives below --root; all by default")
     add("--out", type=Path, help="folder for evaluation.csv and evaluation.md, and a cache of the optical flow")
@@ -39,12 +39,13 @@ def _run(args: argparse.Namespace) -> None:
     import cv2
     import torch
 
+    from torch_denkf.cli._car import load_car
     from torch_denkf.data import list_kitti_drives
-    from torch_denkf.odometry import evaluate_car_filter, load_car_filter, markdown_table, write_rows
+    from torch_denkf.odometry import evaluate_car_filter, markdown_table, write_rows
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
-    car = load_car_filter(args.checkpoint)
+    car = load_car(args.checkpoint)
     drives = args.drives or list_kitti_drives(args.root)
     if not drives:
         raise FileNotFoundError(f"no drive below {args.root} has both images and poses")

@@ -13,6 +13,7 @@ __all__ = ["main"]
 #: By name: the module whose ``main`` runs it, and what it does.
 COMMANDS = {
     "info": ("info", "versions, devices, OpenGL, cache, optional extras"),
+    "demo": ("demo", "watch a trained filter follow a car whose camera fails"),
     "render-kitti": ("render_kitti", "render drives in KITTI's layout"),
     "train": ("train", "train a car's filter on rendered or recorded drives"),
     "evaluate": ("evaluate", "errors of a trained filter on drives with known poses"),
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         lines = [f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items()]
-        end = "denkf COMMAND --help says more. For example: denkf train --rendered 20 --out runs/car"
+        end = "denkf COMMAND --help says more. For example: denkf demo --out runs/demo"
         sys.stdout.write("\n".join(["usage: denkf COMMAND ...", "", *lines, "", end, ""]))
         return 0
     if words[0] == "--version":

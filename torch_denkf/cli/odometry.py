@@ -34,7 +34,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
     )
-    add("--checkpoint", required=True, type=Path, metavar="FOLDER", help="that denkf train left")
+    add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
     add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
     add("--fps", type=float, help="frames in a second; that of a video by default")
@@ -42,6 +42,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
     add("--seed", type=whole(0), default=0, help="of the filter's noise")
+    add("--black-level", type=int, help="frames none of whose pixels is brighter, of 255, count as missing")
     add("--no-pictures", action="store_true", help="leave the pictures out")
     add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
 
@@ -56,8 +57,9 @@ def _run(args: argparse.Namespace) -> None:
     import cv2
     import torch
 
+    from torch_denkf.cli._car import load_car
     from torch_denkf.data import write_trajectory
-    from torch_denkf.odometry import load_car_filter, read_camera, read_frames, track, write_path
+    from torch_denkf.odometry import read_camera, read_frames, track, write_path
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
@@ -68,13 +70,14 @@ def _run(args: argparse.Namespace) -> None:
     if times is None and fps is None:
         raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
     beliefs = track(
-        load_car_filter(args.checkpoint),
+        load_car(args.checkpoint),
         _counted(source),
         calibration,
         times=times,
         fps=None if times is not None else fps,
         height=args.height,
         pitch=args.pitch,
+        black_level=args.black_level,
         seed=args.seed,
     )
     means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading

@@ -92,8 +92,10 @@ class CarFilter(Filter):
         settings: sizes and constants.
 
     Attributes:
-        settings: sizes and constants.
+        builder: name of the function that builds it, in a saved folder.
     """
+
+    builder = "car"
 
     def __init__(self, settings: CarSettings):
         s = settings
@@ -128,7 +130,12 @@ class CarFilter(Filter):
         )
         start = AroundState(s.start_std, ensemble_size=s.ensemble_size, state_key="start")
         super().__init__(modules, initial=WithHistory(start, s.lags))
-        self.settings = settings
+        self._settings = settings
+
+    @property
+    def settings(self) -> CarSettings:
+        """All numbers that it is built from, with the inflation as it is now."""
+        return replace(self._settings, inflation=self.inflation)
 
     @property
     def sensor(self) -> FlowSensor:

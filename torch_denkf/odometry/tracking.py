@@ -32,6 +32,8 @@ class TrackedBelief(NamedTuple):
         mean: x m forward, y m to the left (of the first pose), theta rad to the left, v m/s, theta_dot rad/s: ``[5]``.
         var: variances of them, ``[5]``.
         ensemble: members, ``[E, 5]``.
+        reading: mean (v m/s, theta_dot rad/s) that the sensor reads of the steps since the frame before, ``[2]``;
+            ``None`` where it could not compare.
     """
 
     frame: int
@@ -40,6 +42,7 @@ class TrackedBelief(NamedTuple):
     mean: Tensor
     var: Tensor
     ensemble: Tensor
+    reading: Tensor | None = None
 
 
 def track(
@@ -51,6 +54,7 @@ def track(
     fps: float | None = None,
     height: float = KITTI_HEIGHT,
     pitch: float = 0.0,
+    black_level: int | None = None,
     seed: int = 0,
 ) -> Iterator[TrackedBelief]:
     """Follows a car by its camera's images, one at a time, in a memory that does not grow.
@@ -74,6 +78,8 @@ def track(
         fps: frames in a second, in the place of ``times``. Without both, frames are one filter step apart.
         height: of the camera over the road, in m.
         pitch: how far the camera looks up from the road, in rad; -0.04 to 0.02 are found out without.
+        black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter
+            than this grey value, of 255. No street looks like that, not even at night. ``None`` checks nothing.
         seed: of the filter's noise.
 
     Returns:
@@ -100,7 +106,16 @@ def track(
         raise ValueError("pass times or fps, not both")
     if fps is not None and not 0 < fps < np.inf:
         raise ValueError(f"fps is the number of frames in a second; got {fps}")
+    if black_level is not None:
+        if not 0 <= black_level <= 255:
+            raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
+        frames = (None if frame is None or _is_black(frame, black_level) else frame for frame in frames)
     return _track(car, frames, calibration, times, fps, height, pitch, seed)
+
+
+def _is_black(frame: np.ndarray, level: int) -> bool:
+    """Whether hardly a pixel is brighter than the level."""
+    return float((frame > level).mean()) <= 1e-3
 
 
 def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterator[TrackedBelief]:
@@ -134,7 +149,7 @@ def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterato
             run.step(None, 0)
         run.step(reading, between)
         done = step
-        yield run.belief(number, clock.time, reading is not None)
+        yield run.belief(number, clock.time, reading is not None, between)
     if run is None:
         raise ValueError(f"there are no two frames at most {settings.longest} steps apart, which a path needs")
 
@@ -230,11 +245,16 @@ class _Run:
         with torch.no_grad():
             self.carry = self.car.step(self._noisy(frame))
 
-    def belief(self, frame: int, time: float, observed: bool) -> TrackedBelief:
+    def belief(self, frame: int, time: float, observed: bool, between: int = 1) -> TrackedBelief:
         """The belief, in the units of real time."""
         belief = self.carry["belief"]
         mean, var, ensemble = (belief[name] for name in ("mean", "var", "ensemble"))
-        return TrackedBelief(frame, time, observed, mean * self.units, var * self.units**2, ensemble * self.units)
+        reading = None
+        if observed:  # the sensor reads the sum over the steps of a pair
+            reading = self.carry["sensor", "ensemble"].mean(0) / between * self.units[VELOCITIES]
+        return TrackedBelief(
+            frame, time, observed, mean * self.units, var * self.units**2, ensemble * self.units, reading
+        )
 
     def _noisy(self, frame: TensorDict) -> TensorDict:
         return self.car.draw_noise(frame, generator=self.generator)

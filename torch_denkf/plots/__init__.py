@@ -11,13 +11,17 @@ Needs matplotlib and pillow, ``pip install "torch_denkf[plots]"``; importing thi
 from torch_denkf.plots.bands import plot_bands
 from torch_denkf.plots.calibration import plot_calibration
 from torch_denkf.plots.cost import plot_error_cost
+from torch_denkf.plots.drive import NamedSpan, drive_animation, drive_picture
 from torch_denkf.plots.path import plot_path
 from torch_denkf.plots.spread import plot_spread_error
 from torch_denkf.plots.video import belief_video, write_video
 from torch_denkf.plots.viewer import log_rollout
 
 __all__ = [
+    "NamedSpan",
     "belief_video",
+    "drive_animation",
+    "drive_picture",
     "log_rollout",
     "plot_bands",
     "plot_calibration",

@@ -25,7 +25,7 @@ from torch_denkf.vision.poses import KITTI_DT, poses_to_state
 
 FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"
-STRETCH = 500  # frames that a process draws at a time
+STRETCH = 40  # frames that a process draws at a time
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
 ABANDONED = 600.0  # s without a new image, after which a half drive is a killed run's
 

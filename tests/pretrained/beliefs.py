@@ -1,0 +1,33 @@
+"""Means and variances that each trained filter of the library believes after six steps of the same random readings."""
+
+import json
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+
+import torch_denkf
+from torch_denkf.vision import FLOW_SHAPE, ROAD_SHAPE
+
+_READINGS = {
+    "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},
+    "reacher": {"encoder": (2,), "action": (2,)},
+    "ur5-table": {"pixels": (3, 64, 64), "action": (7,)},
+}
+
+
+def all_beliefs():
+    """By name, the last mean and variance as one list."""
+    out = {}
+    for name in torch_denkf.available():
+        generator = torch.Generator().manual_seed(0)
+        data = {key: torch.rand(6, *shape, generator=generator) for key, shape in _READINGS[name].items()}
+        torch.manual_seed(0)
+        with torch.no_grad():
+            belief = torch_denkf.from_pretrained(name).sequence(TensorDict(data, [6]))["belief"][-1]
+        out[name] = [*belief["mean"].tolist(), *belief["var"].tolist()]
+    return out
+
+
+if __name__ == "__main__":
+    print(json.dumps({"package": str(Path(torch_denkf.__file__).parent), **all_beliefs()}))

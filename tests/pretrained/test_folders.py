@@ -1,0 +1,118 @@
+"""Filters by name and from folders: what is saved comes back; what is damaged, changed or unknown is named."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_denkf
+from torch_denkf import from_pretrained, save_pretrained
+from torch_denkf.filters import KalmanFilter
+from torch_denkf.odometry import load_car_filter
+from torch_denkf.pretrained import reacher, ur5_table
+
+WEIGHTS = Path(torch_denkf.__file__).parent / "pretrained" / "weights"
+
+
+def readings(seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"encoder": (2,), "action": (2,)}
+    return TensorDict({key: torch.rand(3, 6, *shape, generator=generator) for key, shape in shapes.items()}, [3, 6])
+
+
+def believe(model):
+    torch.manual_seed(1)
+    return model.sequence(readings())["belief", "ensemble"]
+
+
+def copy_of(name, folder):
+    shutil.copytree(WEIGHTS / name, folder / name)
+    return folder / name
+
+
+@pytest.mark.parametrize("name", torch_denkf.available())
+def test_each_comes_with_its_checksum_and_a_card(name):
+    config = json.loads((WEIGHTS / name / "config.json").read_text())
+    assert config["sha256"] == hashlib.sha256((WEIGHTS / name / "weights.safetensors").read_bytes()).hexdigest()
+    assert config["training"]["command"].split()[0] in ("denkf", "python")
+    card = (WEIGHTS / name / "card.md").read_text()
+    assert config["training"]["command"] in card
+    for heading in ("## Data", "## Training", "## Scores", "## Limits", "## Licence"):
+        assert heading in card
+    model = from_pretrained(name)
+    assert not model.training
+    assert {type(value) for value in config["settings"].values()} <= {int, float, list, str, type(None)}
+
+
+def test_what_is_saved_comes_back(tmp_path):
+    torch.manual_seed(0)
+    model = reacher(ensemble_size=8, num_cells=(8,))
+    save_pretrained(model, tmp_path, training={"seed": 0}, card="a card")
+    again = from_pretrained(tmp_path)
+    assert again.settings == model.settings
+    assert torch.equal(believe(model), believe(again))
+    assert (tmp_path / "card.md").read_text() == "a card"
+    arm = ur5_table(ensemble_size=8)
+    arm.inflation = 1.25  # chosen after the training
+    assert from_pretrained(save_pretrained(arm, tmp_path)).inflation == 1.25
+
+
+def test_the_same_folder_serves_both_loaders(tmp_path):
+    folder = copy_of("car-odometry", tmp_path)
+    by_name, by_folder, car = from_pretrained("car-odometry"), from_pretrained(folder), load_car_filter(folder)
+    assert by_name.settings == by_folder.settings == car.settings
+    for name, value in car.state_dict().items():
+        assert torch.equal(value, by_name.state_dict()[name])
+    with pytest.raises(ValueError, match="is of a filter that 'reacher' builds; expected 'car'"):
+        load_car_filter(copy_of("reacher", tmp_path))
+
+
+def test_own_builders(tmp_path):
+    def still(size):
+        eye = torch.eye(size)
+        return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
+
+    with pytest.raises(ValueError, match=r"not known what builds this KalmanFilter; pass builder=NAME"):
+        save_pretrained(still(2), tmp_path)
+    save_pretrained(still(2), tmp_path, builder="still", settings={"size": 2})
+    with pytest.raises(ValueError, match="is of a filter that 'still' builds"):
+        from_pretrained(tmp_path)
+    assert isinstance(from_pretrained(tmp_path, builders={"still": still}), KalmanFilter)
+    with pytest.raises(TypeError, match="JSON"):
+        save_pretrained(still(2), tmp_path / "none", builder="still", settings={"size": torch.ones(1)})
+    assert not (tmp_path / "none").exists()
+
+
+def test_mistakes_are_named(tmp_path):
+    names = "car-odometry, reacher, ur5-table"
+    with pytest.raises(FileNotFoundError, match=f"no trained filter 'car' and no such folder; .* comes with {names}"):
+        from_pretrained("car")
+    with pytest.raises(FileNotFoundError, match=r"no filter in .*: it has no config\.json"):
+        from_pretrained(tmp_path)
+    folder = copy_of("reacher", tmp_path)
+    weights, config = folder / "weights.safetensors", folder / "config.json"
+    good, text = weights.read_bytes(), config.read_text()
+
+    flipped = bytearray(good)
+    flipped[-5] ^= 1  # a bit of a number: safetensors itself would not notice
+    weights.write_bytes(flipped)
+    with pytest.raises(ValueError, match=r"weights\.safetensors is damaged, .*its SHA-256 is [0-9a-f]{64}, expected"):
+        from_pretrained(folder)
+    weights.write_bytes(good)
+    config.write_text(json.dumps({**json.loads(text), "sha256": 64 * "0"}))
+    with pytest.raises(ValueError, match=f"expected {64 * '0'}; restore both from a copy"):
+        from_pretrained(folder)
+    weights.write_bytes(b"nothing")
+    config.write_text(json.dumps({**json.loads(text), "sha256": hashlib.sha256(b"nothing").hexdigest()}))
+    with pytest.raises(ValueError, match=r"weights\.safetensors cannot be read"):
+        from_pretrained(folder)
+    weights.unlink()
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        from_pretrained(folder)
+    config.write_text("{")
+    with pytest.raises(ValueError, match="is not JSON"):
+        from_pretrained(folder)

@@ -1,0 +1,148 @@
+"""A trained filter as a folder: weights that are data only, and a text file that says what builds the filter."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+import torch_denkf
+
+__all__ = ["load_folder", "read_folder_config", "save_folder"]
+
+FORMAT = "torch_denkf.filter/1"
+WEIGHTS, CONFIG = "weights.safetensors", "config.json"
+
+
+def save_folder(
+    model: nn.Module,
+    folder: str | Path,
+    *,
+    builder: str,
+    settings: Mapping[str, Any],
+    training: Mapping[str, Any] | None = None,
+) -> Path:
+    """Writes a model to a folder.
+
+    ``weights.safetensors`` gets parameters and buffers; ``config.json`` gets the builder's name, its settings, the
+    SHA-256 of the weights, the versions that wrote both, and what is known of the training.
+
+    Args:
+        model: the model.
+        folder: made where it is not there; a model in it is replaced.
+        builder: name of the function that builds such a model from the settings.
+        settings: plain values.
+        training: command, seed, drives: plain values, for the record alone.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+        TypeError: if settings or training hold what JSON does not know.
+
+    Example:
+        >>> import tempfile
+        >>> folder = save_folder(nn.Linear(2, 1), tempfile.mkdtemp(), builder="line", settings={"size": 2})
+        >>> load_folder(folder, {"line": lambda size: nn.Linear(size, 1)})
+        Linear(in_features=2, out_features=1, bias=True)
+    """
+    folder = Path(folder).expanduser()
+    versions = {"torch_denkf": torch_denkf.__version__, "torch": str(torch.__version__)}
+    config = {"format": FORMAT, "builder": builder, "settings": dict(settings), "sha256": ""}
+    config |= {"versions": versions, "training": dict(training or {})}
+    json.dumps(config)  # before anything is written
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f"{WEIGHTS}.part"
+    # Copies: safetensors refuses tensors that share memory.
+    save_file({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()}, part)
+    part.chmod(0o644)  # safetensors leaves files that only their owner reads
+    config["sha256"] = _sha256(part)
+    (folder / f"{CONFIG}.part").write_text(json.dumps(config, indent=1) + "\n")
+    for name in (WEIGHTS, CONFIG):  # written whole or not at all
+        os.replace(folder / f"{name}.part", folder / name)
+    return folder
+
+
+def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
+    """What :func:`save_folder` wrote beside the weights.
+
+    Args:
+        folder: with ``config.json``.
+        builders: those that may be named.
+
+    Raises:
+        FileNotFoundError: if there is no filter in the folder.
+        ValueError: if the file is damaged, of another format, or names another builder.
+    """
+    file = Path(folder).expanduser() / CONFIG
+    if not file.is_file():
+        raise FileNotFoundError(f"no filter in {file.parent}: it has no {CONFIG}; `denkf train` leaves one")
+    try:
+        config = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file} is not JSON ({error}); restore it from a copy, or train anew") from error
+    if not isinstance(config, dict) or config.get("format") != FORMAT or not isinstance(config.get("settings"), dict):
+        raise ValueError(f"{file} does not describe a filter (format {FORMAT!r}); pass a folder of `denkf train`")
+    if config.get("builder") not in builders:
+        raise ValueError(
+            f"{file} is of a filter that {config.get('builder')!r} builds; expected {', '.join(map(repr, builders))}"
+        )
+    return config
+
+
+def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Module]]) -> nn.Module:
+    """Reads a model that :func:`save_folder` wrote. Nothing in the files is executed: they name one of ``builders``.
+
+    Args:
+        folder: with ``config.json`` and ``weights.safetensors``.
+        builders: by name, functions of the settings that return an untrained model.
+
+    Returns:
+        The model, on the CPU, in evaluation mode.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if a file is damaged, changed, of another format, or does not fit the other; the message names it.
+    """
+    folder = Path(folder).expanduser()
+    config = read_folder_config(folder, builders)
+    try:
+        values = {name: _as_tuples(value) for name, value in config["settings"].items()}
+        model = builders[config["builder"]](**values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{folder / CONFIG} does not make a filter: {error}") from error
+    file = folder / WEIGHTS
+    if not file.is_file():
+        raise FileNotFoundError(f"no weights {file}; restore the file from a copy, or train anew")
+    if _sha256(file) != config.get("sha256"):
+        raise ValueError(
+            f"{file} is damaged, or not the file that {CONFIG} describes: its SHA-256 is {_sha256(file)}, expected "
+            f"{config.get('sha256')}; restore both from a copy, install torch_denkf anew, or train anew"
+        )
+    try:
+        weights = load_file(file)
+    except (SafetensorError, ValueError) as error:
+        raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train anew") from error
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{file} does not fit {CONFIG} beside it: {reason}") from error
+    return model.eval()
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value

@@ -1,0 +1,6 @@
+"""Trained filters that come with the library, and folders of your own: weights as data, built from plain numbers."""
+
+import lazy_loader
+
+# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

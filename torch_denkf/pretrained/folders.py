@@ -1,0 +1,113 @@
+"""Trained filters by name, or from a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from torch_denkf.deployment.folder import CONFIG, load_folder, save_folder
+from torch_denkf.filters import Filter
+from torch_denkf.pretrained.models import BUILDERS
+
+__all__ = ["available", "from_pretrained", "save_pretrained"]
+
+_WEIGHTS = Path(__file__).parent / "weights"
+
+
+def available() -> list[str]:
+    """Names of the filters that come with the library, for :func:`from_pretrained`.
+
+    Example:
+        >>> available()
+        ['car-odometry', 'reacher', 'ur5-table']
+    """
+    return sorted(file.parent.name for file in _WEIGHTS.glob(f"*/{CONFIG}"))
+
+
+def from_pretrained(
+    name_or_folder: str | Path, *, builders: Mapping[str, Callable[..., Filter]] | None = None
+) -> Filter:
+    """A trained filter: one that comes with the library, or one that was saved to a folder. Nothing is downloaded.
+
+    The weights are data only, the filter is built by a function of this library from the numbers in ``config.json``,
+    and the weights' SHA-256 is compared with the one that stands there: no code of a file is executed.
+
+    Args:
+        name_or_folder: one of :func:`available`, or a folder that :func:`save_pretrained` or ``denkf train`` left.
+        builders: functions of your own by name, for folders that name them; see :func:`save_pretrained`.
+
+    Returns:
+        The filter, on the CPU, in evaluation mode; ``filter.settings`` are its numbers.
+
+    Raises:
+        FileNotFoundError: if there is no filter of that name and no such folder, or the weights are missing.
+        ValueError: if a file is damaged, changed, of another format, or does not fit the other; the message names it.
+
+    Example:
+        >>> from_pretrained("car-odometry").settings.dt
+        0.103
+    """
+    folder = Path(name_or_folder).expanduser()
+    if str(name_or_folder) in available():  # a folder of that name is loaded as "./car-odometry"
+        folder = _WEIGHTS / str(name_or_folder)
+    elif not folder.is_dir():
+        raise FileNotFoundError(
+            f"there is no trained filter {str(name_or_folder)!r} and no such folder; the library comes with "
+            f"{', '.join(available())}"
+        )
+    return load_folder(folder, {**BUILDERS, **(builders or {})})  # type: ignore[return-value]
+
+
+def save_pretrained(
+    model: Filter,
+    folder: str | Path,
+    *,
+    training: Mapping[str, Any] | None = None,
+    card: str | None = None,
+    builder: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Path:
+    """Writes a filter to a folder that :func:`from_pretrained` reads.
+
+    Args:
+        model: one that a function of this library built from settings, such as :func:`torch_denkf.odometry.car_filter`.
+            For another one pass ``builder`` and ``settings``.
+        folder: gets ``weights.safetensors`` and ``config.json``; a filter in it is replaced.
+        training: command, seed, data: plain values, for the record alone.
+        card: text of ``card.md``, for people: data, command, scores, limits, licence.
+        builder: name of your function of the settings that builds such a filter; pass the function itself to
+            :func:`from_pretrained`.
+        settings: its arguments, plain values.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: if it is not known what builds the filter.
+        OSError: if the folder cannot be written to.
+        TypeError: if ``training`` or ``settings`` hold what JSON does not know.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> def still(size):
+        ...     eye = torch.eye(size)
+        ...     return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
+        >>> folder = save_pretrained(still(2), tempfile.mkdtemp(), builder="still", settings={"size": 2})
+        >>> from_pretrained(folder, builders={"still": still}).carry_keys
+        [('belief', 'mean'), ('belief', 'cov')]
+    """
+    own = getattr(model, "settings", None)
+    if builder is None and settings is None and is_dataclass(own) and not isinstance(own, type):
+        builder, settings = getattr(model, "builder", None), asdict(own)
+    if builder is None or settings is None:
+        raise ValueError(
+            f"it is not known what builds this {type(model).__name__}; pass builder=NAME and settings={{...}} of a "
+            "function of yours, which from_pretrained then gets as builders={NAME: function}"
+        )
+    folder = save_folder(model, folder, builder=builder, settings=settings, training=training)
+    if card is not None:
+        (folder / "card.md").write_text(card)
+    return folder
