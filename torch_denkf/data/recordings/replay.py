@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +25,7 @@ from torch_denkf.data.statistics import picture_statistics
 
 __all__ = ["Recording", "RecordingReplay"]
 
+_LOST = 0.02  # a share of readings that may be lost without a word
 _PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
 _TAKEN = (
     "episode",
@@ -254,6 +256,18 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
     return clock
 
 
+def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np.ndarray, seen: np.ndarray) -> None:
+    """Warn where readings share rows although the clock has a row for each of them."""
+    inside = int(((times >= rows[0]) & (times <= rows[-1])).sum())
+    lost = inside - int(seen.sum())
+    if inside <= len(rows) and lost > _LOST * inside:
+        warnings.warn(
+            f"recording {recording!r}: {lost} of {inside} readings of {key!r} share a row with another and are not "
+            f"used, because their times do not fit the clock; pass sample='nearest', or clock={key!r}",
+            stacklevel=5,
+        )
+
+
 def _on_clock(recording: Recording, streams: Mapping[str, Any], clock: str | float) -> tuple[TensorDict, float]:
     """Rows of a recording, with the number of each one's picture, and the time of the first, s."""
     times = {
@@ -271,6 +285,7 @@ def _on_clock(recording: Recording, streams: Mapping[str, Any], clock: str | flo
         else:
             choose = last_reading if stream.sample == "last" else nearest_reading
             index, seen = choose(times[key], rows, stream.tolerance)
+            _warn_of_lost_readings(recording.name, key, times[key], rows, seen)
             if not isinstance(read, Readings):
                 out[_PICTURE] = torch.from_numpy(np.where(seen, index, -1))
                 out["observed"] = torch.from_numpy(seen[:, None])
