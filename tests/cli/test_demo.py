@@ -14,7 +14,7 @@ from torch_denkf.odometry import drive_scores, track_failing_drive, usual_failur
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
 def test_demo_of_a_rendered_drive(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    words = ["demo", "--out", str(tmp_path), "--frames", "36", "--every", "12", "--processes", "1"]
+    words = ["demo", "--out", str(tmp_path), "--frames", "36", "--every", "12"]
     assert main(words) == 0
     said = capsys.readouterr().out
     drive = read_kitti_drive(tmp_path / "drives", "demo", size=(100, 300), cache=None)

@@ -34,7 +34,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera of --root over the road, m")
     add("--frames", type=int, default=240, help="of the drive, at most")
     add("--seed", type=int, default=2032, help="of the rendered drive; the training's was 0")
-    add("--processes", type=int, default=1, help="that render at a time")
     add("--every", type=int, default=4, help="n-th frame that the animation shows")
     add("--threads", type=int, default=1, help="of torch and OpenCV")
 
@@ -68,7 +67,6 @@ def _run(args: argparse.Namespace) -> None:
                 frames=args.frames,
                 size=size,
                 seed=args.seed,
-                processes=args.processes,
                 overwrite=True,
                 progress=bar.update,
             )

@@ -77,8 +77,7 @@ def drive_picture(
     panels = [figure.add_subplot(below[row, 1]) for row in range(2)]
     drive.draw_panels(panels, named=True)
     _legend(figure, below_map, 3)
-    if title:
-        figure.suptitle(title, fontsize=12)
+    figure.suptitle(title, fontsize=12)
     return figure
 
 
@@ -165,7 +164,7 @@ class _Drive:
         axes.annotate("start", (0, 0), (0, -14), textcoords="offset points", fontsize=9, ha="center")
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="to the right, m", ylabel="forward, m")
-        axes.margins(0.1)
+        axes.margins(0.14)
         axes.grid(alpha=0.25)
         return parts
 
@@ -173,9 +172,8 @@ class _Drive:
         from matplotlib.patches import Ellipse
 
         centre, width, height, angle = self.ellipse_at(step)
-        patch = Ellipse(
-            centre, width, height, angle=angle, facecolor=BELIEF, alpha=0.22, zorder=3, label="filter: 90 %"
-        )
+        patch = Ellipse(centre, width, height, angle=angle, facecolor=BELIEF, alpha=0.22, zorder=3)
+        patch.set_label("filter: 90 %")
         axes.add_patch(patch)
         return patch
 
@@ -224,8 +222,7 @@ class _Animation:
 
         figure.set_dpi(100)
         self.canvas, self.images, self.spans = FigureCanvasAgg(figure), images, spans
-        if title:
-            figure.suptitle(title, fontsize=11)
+        figure.suptitle(title, fontsize=11)
         columns = figure.add_gridspec(1, 2, width_ratios=[1, 1.1])
         right = columns[1].subgridspec(3, 1, height_ratios=[1.05, 1, 1])
         self.drive = _Drive(tracked, spans)
@@ -293,13 +290,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
     """One legend for all, below."""
     handles, labels = axes.get_legend_handles_labels()
     order = [labels.index(name) for name in (*_PATHS[::2], labels[0], "filter: 90 %", _PATHS[1])]
-    shown = figure.legend(
-        [handles[n] for n in order],
-        [labels[n] for n in order],
-        loc="outside lower center",
-        ncols=columns,
-        fontsize=9,
-        frameon=False,
-    )
+    style: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "fontsize": 9, "frameon": False}
+    shown = figure.legend([handles[n] for n in order], [labels[n] for n in order], **style)
     for line in shown.get_lines():
         line.set_alpha(1.0)

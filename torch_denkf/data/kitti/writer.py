@@ -25,7 +25,8 @@ from torch_denkf.vision.poses import KITTI_DT, poses_to_state
 
 FORMAT = 3  # raise it when drives of the same options come out differently
 MARKER = "drive.json"
-STRETCH = 40  # frames that a process draws at a time
+STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
+REPORTED = 40  # frames after which the only process says how far it is
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
 ABANDONED = 600.0  # s without a new image, after which a half drive is a killed run's
 
@@ -142,10 +143,11 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
             job.beside.mkdir()
     except OSError as error:
         raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
+    stretch = min(STRETCH, REPORTED) if processes == 1 else STRETCH
     tasks = [
-        (job, start, min(start + STRETCH, len(job.poses)))
+        (job, start, min(start + stretch, len(job.poses)))
         for job in jobs
-        for start in range(0, len(job.poses), STRETCH)
+        for start in range(0, len(job.poses), stretch)
     ]
     missing = {job.name: len(job.poses) for job in jobs}
 
