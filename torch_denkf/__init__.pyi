@@ -1,3 +1,20 @@
+from . import (
+    data,
+    deployment,
+    envs,
+    filters,
+    functional,
+    metrics,
+    modules,
+    objectives,
+    odometry,
+    plots,
+    pretrained,
+    simulation,
+    training,
+    transforms,
+    vision,
+)
 from .data.kitti.replay import KITTIOdometryExperienceReplay
 from .data.lerobot.replay import LeRobotReplay
 from .data.recordings.frames import Images, Video
@@ -41,6 +58,21 @@ from .transforms import (
 __version__: str
 
 __all__ = [
+    "data",
+    "deployment",
+    "envs",
+    "filters",
+    "functional",
+    "metrics",
+    "modules",
+    "objectives",
+    "odometry",
+    "plots",
+    "pretrained",
+    "simulation",
+    "training",
+    "transforms",
+    "vision",
     "BackpropKF",
     "BlackFrames",
     "Blur",
