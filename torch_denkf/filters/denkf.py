@@ -113,7 +113,7 @@ class DEnKF(Filter):
             observation_dim: O.
             image_shape: of ``"pixels"``, (channels, height, width).
             ensemble_size: E; the paper has 32.
-            rate: drop probability of the stochastic layers; the paper does not say, its older code has 0.1.
+            rate: drop probability of the stochastic layers; the paper does not say; 0.1 is in code that its authors published before.
             r: observation noise before training, a standard deviation.
             initial: the initial belief; N(0, I) of the standardised state by default.
             **kwargs: passed on to the constructor.

@@ -59,13 +59,14 @@ def analyse(
 ) -> Analysis:
     """Condition a forecast ensemble on an observation.
 
+    Members are rows. A are their deviations from the mean, HA those of their predictions, and W = HA R^-1/2 / √(E − 1).
     With the gain K = AᵀHA S⁻¹ / (E − 1) (eq. 11) and d = mean observation − mean prediction:
 
     * ``"sensor"``: xⁱ + K (ỹⁱ − Hxⁱ), with the sensor's own samples ỹⁱ (the paper's eq. 12);
     * ``"perturbed"``: xⁱ + K (y + εⁱ − Hxⁱ) with εⁱ ~ N(0, R), the classical stochastic filter;
-    * ``"etkf"``: mean x̄ + K d, anomalies (I + YYᵀ)^-1/2 A, the symmetric square root: it has exactly the
+    * ``"etkf"``: mean x̄ + K d, deviations (I + WWᵀ)^-1/2 A, the symmetric square root: it has exactly the
       covariance of the Kalman update;
-    * ``"sakov"``: mean x̄ + K d, anomalies A − K HA / 2, its approximation for small gains.
+    * ``"sakov"``: mean x̄ + K d, deviations A − HA Kᵀ / 2, its approximation for small gains.
 
     The last three use the mean of the observation if they are given samples.
 

@@ -122,7 +122,7 @@ class ImageSensor(_Sensor):
         ensemble_size: E.
         trunk: a module from ``[N, C, H, W]`` to ``[N, F]``; Table I's convolutions by default.
         num_cells: widths of the head's hidden layers; Table I has (64, 64, 32, 32).
-        layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
+        layer: ``"dropout"``, ``"flipout"`` or ``"none"``, see :class:`StochasticMLP`.
         rate: drop probability of the head's hidden units.
         loc: mean of the observation ``[O]`` in its units; the head's output is standardised.
         scale: standard deviation of the observation ``[O]``.
@@ -226,7 +226,7 @@ class VectorSensor(_Sensor):
         observation_dim: O.
         ensemble_size: E.
         num_cells: widths of the hidden layers; Table I's head by default.
-        layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
+        layer: ``"dropout"``, ``"flipout"`` or ``"none"``, see :class:`StochasticMLP`.
         rate: drop probability of hidden units.
         loc: mean of the observation ``[O]`` in its units; the network's output is standardised.
         scale: standard deviation of the observation ``[O]``.

@@ -102,7 +102,7 @@ class StochasticMLP(nn.Module):
         in_features: size of the input.
         out_features: size of the output.
         num_cells: width of each hidden layer; Table I's transition has (32, 32, 64, 64).
-        layer: ``"dropout"`` (MC dropout after each hidden activation), ``"flipout"`` or ``"none"``
+        layer: ``"dropout"`` (after each hidden activation, also in evaluation mode), ``"flipout"`` or ``"none"``
             (deterministic, the paper's ``fc``).
         rate: probability of dropping a hidden unit (``"dropout"``), rounded to a multiple of 1/256.
         posterior_std: initial standard deviation of the weights (``"flipout"``).
@@ -166,7 +166,7 @@ class StochasticMLP(nn.Module):
 
     @property
     def noise_size(self) -> int:
-        """Number of random bits that one row of the input needs."""
+        """Random bytes (dropout) or signs (flipout) that one row of the input needs."""
         return sum(self.noise_splits)
 
     @property
