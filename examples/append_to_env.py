@@ -16,50 +16,16 @@ from pathlib import Path
 os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control is imported: nothing is rendered here
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Composite
-from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, TransformedEnv
-from torchrl.envs.transforms import Transform
+from tensordict import TensorDict
 from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
 from torch_denkf.plots import plot_bands
+from torch_denkf.pretrained.encoders import ENCODER_STD, reacher_env
 
-NOISE, DT = 0.05, 0.02  # encoder noise in rad; control step in s
-
-
-class NoisyEncoders(Transform):
-    """Adds white noise to the joint positions, as ``"encoder"`` [*B, 2] rad."""
-
-    def __init__(self, std: float):
-        super().__init__(in_keys=["position"], out_keys=["encoder"])
-        self.std = std
-
-    def _apply_transform(self, position: torch.Tensor) -> torch.Tensor:
-        return position + self.std * torch.randn_like(position)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec["encoder"] = observation_spec["position"].clone()
-        return observation_spec
-
-
-def make_env(seed: int) -> TransformedEnv:
-    """Reacher with noisy encoders; ``"state"`` is the truth, for training and scoring alone."""
-    env = TransformedEnv(
-        DMControlEnv("reacher", "easy"),
-        Compose(
-            DoubleToFloat(),
-            NoisyEncoders(NOISE),
-            CatTensors(in_keys=["position", "velocity"], out_key="state", del_keys=False),
-        ),
-    )
-    env.set_seed(seed)
-    return env
+NOISE, DT = ENCODER_STD, 0.02  # encoder noise, 0.05 rad; control step in s
 
 
 def make_filter(states: torch.Tensor) -> DEnKF:
@@ -137,12 +103,12 @@ def main() -> None:
     torch.manual_seed(args.seed)
     args.out.mkdir(parents=True, exist_ok=True)
 
-    env = make_env(args.seed)
+    env = reacher_env(args.seed)
     rollouts = torch.stack([env.rollout(200) for _ in tqdm(range(args.episodes), desc="collecting", disable=None)])
     denkf = make_filter(rollouts["state"].flatten(0, 1))
     train(denkf, rollouts, args.updates, length=25)
 
-    env = make_env(args.seed + 1000)
+    env = reacher_env(args.seed + 1000)
     env.append_transform(DEnKFTransform(denkf))
     rollout = env.rollout(400)
     table = compare(rollout)

@@ -113,7 +113,8 @@ class DEnKF(Filter):
             observation_dim: O.
             image_shape: of ``"pixels"``, (channels, height, width).
             ensemble_size: E; the paper has 32.
-            rate: drop probability of the stochastic layers; the paper does not say; 0.1 is in code that its authors published before.
+            rate: drop probability of the stochastic layers; the paper does not say. Earlier code of its authors
+                has 0.1.
             r: observation noise before training, a standard deviation.
             initial: the initial belief; N(0, I) of the standardised state by default.
             **kwargs: passed on to the constructor.
