@@ -186,10 +186,9 @@ def test_episodes_that_do_not_fit_their_rows():
 
 
 def test_the_old_name_of_lerobots_replay_warns():
-    for package in (torch_denkf, torch_denkf.data):
-        vars(package).pop("LeRobotExperienceReplay", None)  # once in a process is enough
-        with pytest.warns(DeprecationWarning, match="now called LeRobotReplay"):
-            assert package.LeRobotExperienceReplay is LeRobotReplay
+    vars(torch_denkf.data).pop("LeRobotExperienceReplay", None)  # once in a process is enough
+    with pytest.warns(DeprecationWarning, match="now called LeRobotReplay"):
+        assert torch_denkf.data.LeRobotExperienceReplay is LeRobotReplay
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert torch_denkf.LeRobotReplay is LeRobotReplay

@@ -128,7 +128,7 @@ class ImageSensor(_Sensor):
         scale: standard deviation of the observation ``[O]``.
         pixel_loc: mean of each channel ``[C]``, after the division by 255 of uint8 images.
         pixel_scale: standard deviation of each channel ``[C]``; the trunk reads standardised pixels.
-        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point.
+        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point in [0, 1].
         out_key: learned observations ``[*B, E, O]``.
         encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
             if anywhere.

@@ -24,7 +24,8 @@ class SensorLoss(PartLoss, ReadingsLoss):
     r"""Scores what a filter's sensor reads, without the filter, on any batch of frames ``[*B]``. Of two or
     more dimensions the last is time, for modules that tell times apart.
 
-    The modules that read frames alone are run: the sensor, and what follows from it, such as the noise model.
+    Those modules are run that read frames alone and lead to what is scored: the sensor, and with ``noise`` its noise
+    model. Other sensors of the filter, and their readings, need not be there.
 
     ========================  =====================================================================================
     ``loss_sensor``           score of the sensor's samples against the true observation, the term of that name in
@@ -87,13 +88,24 @@ class SensorLoss(PartLoss, ReadingsLoss):
         super().__init__(filter, {"sensor": sensor, "noise": noise}, score=score, **options)
 
     def _trained(self):
-        return self.filter.frame_modules
+        return [module for _, module in self._placed()]
+
+    def _placed(self):
+        """The modules that read frames alone and lead to what is scored: the sensor, and R where its weight is set."""
+        wanted = {unravel_key(self.tensor_keys.sensor)}
+        wanted |= {unravel_key(self.tensor_keys.noise)} if "noise" in self.weights else set()
+        placed = []
+        for place, module in reversed(self.filter.structure.frames):
+            if not wanted.isdisjoint(map(unravel_key, module.out_keys)):
+                placed.append((place, module))
+                wanted.update(key for keys in reads(module) for key in keys)
+        return placed[::-1]
 
     def _needed(self) -> list[NestedKey]:
         """What the modules read, and the true observation, or the state that it follows from."""
         needed: list[NestedKey] = []
         made: set[NestedKey] = set()
-        for module in self.filter.frame_modules:
+        for _, module in self._placed():
             needed += [key for key in reads(module)[0] if key not in made and key not in needed]
             made.update(map(unravel_key, module.out_keys))
         model = self._observation_model()
@@ -105,7 +117,7 @@ class SensorLoss(PartLoss, ReadingsLoss):
         call = Call(size, time=len(size) > 1)
         # As in Filter.sequence: a recurrent network among these modules reads whole sequences.
         with set_recurrent_mode(True) if call.time else nullcontext():
-            written = run_modules(self.filter.structure.frames, self.filter.entries_of(tensordict), call)
+            written = run_modules(self._placed(), self.filter.entries_of(tensordict), call)
         for key, value in written.items():
             out.set(key, value)
         return out

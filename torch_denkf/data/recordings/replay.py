@@ -25,6 +25,7 @@ from torch_denkf.data.statistics import picture_statistics
 
 __all__ = ["Recording", "RecordingReplay"]
 
+_LITTLE = 0.2  # a share of readings: fewer of them in the common time are a mistake in the unit, more often than not
 _LOST = 0.02  # a share of readings that may be lost without a word
 _PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
 _TAKEN = (
@@ -257,8 +258,15 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
 
 
 def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np.ndarray, seen: np.ndarray) -> None:
-    """Warn where readings share rows although the clock has a row for each of them."""
+    """Warn where few readings lie in the common time, or some share rows although the clock has one for each."""
     inside = int(((times >= rows[0]) & (times <= rows[-1])).sum())
+    if inside < _LITTLE * len(times):
+        warnings.warn(
+            f"recording {recording!r}: {inside} of {len(times)} readings of {key!r}, {times[0]:g} to {times[-1]:g} s, "
+            f"lie in the time that all streams share, {rows[0]:g} to {rows[-1]:g} s; if its times are not in s, pass "
+            "unit='ms', 'us' or 'ns'",
+            stacklevel=5,
+        )
     lost = inside - int(seen.sum())
     if inside <= len(rows) and lost > _LOST * inside:
         warnings.warn(
