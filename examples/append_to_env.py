@@ -38,7 +38,7 @@ def make_filter(states: torch.Tensor) -> DEnKF:
         sensor=None,  # the encoders are read as they are
         observation=Select([0, 1]),
         noise=ConstantNoise([NOISE, NOISE], in_key="encoder"),
-        analysis=EnsembleAnalysis("etkf", sensor_key="encoder"),
+        analysis=EnsembleAnalysis("etkf", sensor_key="encoder"),  # draws no noise for a reading that is used as it is
         initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], sensor_key="encoder"),
     )
 

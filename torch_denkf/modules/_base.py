@@ -225,6 +225,12 @@ class SubModel(TensorDictModule):
             where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
             where.update(self.noise_sizes(*values))
             given = self.draw_noise(call.batch_size, time=call.time, **where)
+            if given is None:  # it would run as if no noise were wanted
+                raise ValueError(
+                    f"{type(self).__name__} at place {call.place!r} names noise, and its draw_noise drew none. Where "
+                    "that needs the number of members, or another size, return it from noise_sizes(self, *values): "
+                    'for example {"members": ensemble.shape[-2]}.'
+                )
         return given
 
     def _explain_precision(self, error: RuntimeError, entries: Entries) -> None:
