@@ -22,16 +22,8 @@ from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, FilterTrainer, Missing
 from torch_denkf.data import KITTIOdometryExperienceReplay, with_motion, write_drives
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_endpoint_error
-from torch_denkf.modules import (
-    AroundState,
-    DiagonalNoise,
-    EnsembleAnalysis,
-    FlowSensor,
-    Select,
-    StochasticMLP,
-    UnicycleMotion,
-    UnicycleTransition,
-)
+from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, FlowSensor, Select, StochasticMLP
+from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
 from torch_denkf.plots import plot_bands, plot_path
 
 VELOCITIES = [3, 4]  # v in m/s and theta_dot in rad/s, of the state [x, y, theta, v, theta_dot]

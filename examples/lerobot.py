@@ -25,29 +25,15 @@ import numpy as np
 import torch
 from torchrl.envs import ExcludeTransform, TransformedEnv
 
-from torch_denkf import (
-    DEnKF,
-    DEnKFLoss,
-    DEnKFTransform,
-    FilterTrainer,
-    LeRobotReplay,
-    MissingFrames,
-    ReplayEnv,
-    SensorLoss,
-    Stage,
-)
+from torch_denkf import DEnKF, DEnKFTransform, MissingFrames
+from torch_denkf.data import LeRobotReplay
+from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import interval_coverage
-from torch_denkf.modules import (
-    DiagonalNoise,
-    FromSensor,
-    ImageSensor,
-    KeypointTrunk,
-    LearnedTransition,
-    Select,
-    StochasticMLP,
-)
+from torch_denkf.modules import DiagonalNoise, FromSensor, ImageSensor, LearnedTransition, Select, StochasticMLP
+from torch_denkf.modules.keypoints import KeypointTrunk
+from torch_denkf.objectives import DEnKFLoss, SensorLoss
 from torch_denkf.plots import plot_bands
-from torch_denkf.training import hold_last
+from torch_denkf.training import FilterTrainer, Stage, hold_last
 
 
 def write_folder(root: Path, episodes: int, rows: int) -> None:

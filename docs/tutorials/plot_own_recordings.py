@@ -27,23 +27,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from torch_denkf import (
-    DEnKF,
-    DEnKFLoss,
-    DEnKFTransform,
-    FilterTrainer,
-    Recording,
-    RecordingReplay,
-    ReplayEnv,
-    SensorLoss,
-    Stage,
-    Table,
-    Video,
-)
+from torch_denkf import DEnKF, DEnKFTransform
+from torch_denkf.data import Recording, RecordingReplay, Table, Video
+from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import ensemble_interval_coverage, state_errors
 from torch_denkf.modules import DiagonalNoise, GaussianPrior, ImageSensor, LearnedTransition, Select, StochasticMLP
 from torch_denkf.modules.sensor import convolutional_trunk
+from torch_denkf.objectives import DEnKFLoss, SensorLoss
 from torch_denkf.plots import plot_bands, write_video
+from torch_denkf.training import FilterTrainer, Stage
 
 torch.manual_seed(0)
 FPS, RATE, SECONDS, SIZE = 20, 50, 8, (24, 32)  # pictures a second; rows a second; s; height and width of a picture

@@ -82,6 +82,8 @@ print("steps with a picture: {:.0%}; with a reading of the encoder: {:.0%}".form
 move = torch.nn.Linear(2, 2, bias=False)
 move.weight.data = torch.tensor([[1.0, 0.99 * DT], [0.0, 0.99]])  # the position moves with the new speed
 process_noise = ConstantNoise([0.0, PUSH], in_key=("belief", "ensemble"), out_key=("forecast", "noise"))
+wheel = {"predicted_key": "wheel_predicted", "sensor_key": "wheel", "observed_key": "wheel_seen"}
+wheel["noise_variance_key"] = "wheel_noise"
 fused = Filter(
     {
         "camera": VectorSensor(
@@ -107,14 +109,7 @@ fused = Filter(
             belief_key="middle",
         ),
         "h_wheel": Select([1], in_key=("middle", "ensemble"), out_key="wheel_predicted"),
-        "by_wheel": EnsembleAnalysis(
-            "etkf",
-            forecast_key=("middle", "ensemble"),
-            predicted_key="wheel_predicted",
-            sensor_key="wheel",
-            noise_variance_key="wheel_noise",
-            observed_key="wheel_seen",
-        ),
+        "by_wheel": EnsembleAnalysis("etkf", forecast_key=("middle", "ensemble"), **wheel),
     },
     initial=GaussianPrior([0.0, 0.0], [1.0, 0.3], ensemble_size=MEMBERS),
 )

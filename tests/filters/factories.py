@@ -7,18 +7,11 @@ from torch import nn
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.filters.inductor import need_compiler
 from torch_denkf.functional import ensemble_mean, ensemble_var
-from torch_denkf.modules import (
-    ConstantNoise,
-    DiagonalNoise,
-    EnsembleAnalysis,
-    GaussianPrior,
-    LearnedObservation,
-    LearnedTransition,
-    LinearObservation,
-    StochasticMLP,
-    SubModel,
-    VectorSensor,
-)
+from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, StochasticMLP, SubModel
+from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
+from torch_denkf.modules.observation import LearnedObservation, LinearObservation
+from torch_denkf.modules.sensor import VectorSensor
+from torch_denkf.modules.transition import LearnedTransition
 
 S, M, OBS, A, E = 3, 4, 2, 2, 4  # state, measurement, observation, action, members
 

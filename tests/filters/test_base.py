@@ -29,16 +29,9 @@ from tests.filters.factories import (
 )
 from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, Filter
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    FromSensor,
-    GaussianPrior,
-    LinearObservation,
-    Select,
-    UnicycleMotion,
-    UnicycleTransition,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, UnicycleMotion, UnicycleTransition
+from torch_denkf.modules.belief import FromSensor, GaussianPrior
+from torch_denkf.modules.observation import LinearObservation, Select
 from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]

@@ -3,14 +3,8 @@
 import pytest
 import torch
 
-from torch_denkf.functional import (
-    ensemble_cov,
-    ensemble_mean,
-    ensemble_var,
-    inflate,
-    random_rotation,
-    relax_to_prior_spread,
-)
+from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var
+from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 
 # Few operations on numbers of size 1 in double precision.
 EXACT = {"rtol": 1e-12, "atol": 1e-12}

@@ -81,6 +81,21 @@ class CarSettings:
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
+def velocity_analysis(lags: int) -> EnsembleAnalysis:
+    """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
+
+    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations.
+    """
+    own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
+    return EnsembleAnalysis(
+        "sensor",
+        taper=(own, torch.eye(2)),
+        forecast_key=("forecast", "clone"),
+        observed_key=("forecast", "observed"),
+        belief_key="analysis",
+    )
+
+
 class CarFilter(Filter):
     """A DEnKF for a car with one camera, built by :func:`car_filter`.
 
@@ -101,15 +116,7 @@ class CarFilter(Filter):
         s = settings
         mean, std = torch.tensor(s.velocity_mean), torch.tensor(s.velocity_std)
         sensor = FlowSensor(dt=s.dt, ensemble_size=s.ensemble_size, features=s.features, num_cells=s.num_cells)
-        # Errors of speed and of turn rate have nothing to do with each other; few members would see correlations.
-        own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + s.lags, 1)])
-        analysis = EnsembleAnalysis(
-            "sensor",
-            taper=(own, torch.eye(2)),
-            forecast_key=("forecast", "clone"),
-            observed_key=("forecast", "observed"),
-            belief_key="analysis",
-        )
+        analysis = velocity_analysis(s.lags)
         analysis.inflation = s.inflation
         modules = OrderedDict(
             sensor=sensor,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-import torch
 from tensordict.nn import TensorDictSequential
 
 from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
 from benchmarks.kitti.sensors import SAMPLES
 from torch_denkf.modules import AroundState, EnsembleAnalysis, MemberGain, StochasticMLP, UnicycleMotion, WithHistory
+from torch_denkf.odometry.car import velocity_analysis
 
 LAGS = 4  # past steps that an innovation may still correct
 
@@ -19,15 +19,7 @@ class DEnKF(KITTIRecipe):
     """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
 
     def modules(self):
-        # Errors of speed and of turn rate have nothing to do with each other; 32 members would see correlations.
-        own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + LAGS, 1)])
-        analysis = EnsembleAnalysis(
-            "sensor",
-            taper=(own, torch.eye(2)),
-            forecast_key=("forecast", "clone"),
-            observed_key=("forecast", "observed"),
-            belief_key="analysis",
-        )
+        analysis = velocity_analysis(LAGS)
         return OrderedDict(
             noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
