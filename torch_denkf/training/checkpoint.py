@@ -93,9 +93,17 @@ def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[s
     for number, old in enumerate(saved["stages"][: stage + 1]):
         new = wanted["stages"][number] if number < len(wanted["stages"]) else {}
         pairs += [(f"stages[{number}].{key}", old.get(key), new.get(key)) for key in {**old, **new}]
-    different = [f"{name} ({old}, now {new})" for name, old, new in pairs if old != new]
+    different = [f"{name} ({_short(old, new)}, now {_short(new, old)})" for name, old, new in pairs if old != new]
     if different:
         raise ValueError(
             f"{file} is of another training: {', '.join(different)} differ. Give another out, or start anew with "
             "fit(resume=False)."
         )
+
+
+def _short(value: Any, other: Any) -> str:
+    """A setting, for a message; of the names of parameters those that the other one has not."""
+    if not isinstance(value, list) or not isinstance(other, list):
+        return str(value)
+    own = [name for group in value for name in group if not any(name in theirs for theirs in other)]
+    return f"{sum(map(len, value))} names, of which only here: {', '.join(own[:2]) or 'none'}{', ...' if len(own) > 2 else ''}"
