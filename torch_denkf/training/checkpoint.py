@@ -106,4 +106,5 @@ def _short(value: Any, other: Any) -> str:
     if not isinstance(value, list) or not isinstance(other, list):
         return str(value)
     own = [name for group in value for name in group if not any(name in theirs for theirs in other)]
-    return f"{sum(map(len, value))} names, of which only here: {', '.join(own[:2]) or 'none'}{', ...' if len(own) > 2 else ''}"
+    some = ", ".join(own[:2]) + (", ..." if len(own) > 2 else "")
+    return f"{sum(map(len, value))} names, of which only here: {some or 'none'}"
