@@ -1,10 +1,15 @@
-# `make demo` (watch it work), `make test` (everything CI runs), `make bench` (speed, beside its peers),
-# `make docs` (the site, in docs/_build/html), `make test-nightly` (the tests beside the nightlies of torchrl and
-# tensordict).
+# `make demo` (watch it work), `make test` (everything CI runs), `make docs` (the site, in docs/_build/html),
+# `make bench` (speed, beside its peers), `make test-nightly` (the tests beside the nightlies of torchrl and tensordict).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# uv makes the environment where it is installed, Python's own venv elsewhere.
+ifneq ($(shell command -v uv),)
+MAKE_VENV := uv venv --quiet --seed --allow-existing --python $(PYTHON)
+else
+MAKE_VENV := $(PYTHON) -c "import ensurepip" || { echo "python3 -m venv is missing: apt install python3-venv, or install uv"; exit 1; }; $(PYTHON) -m venv
+endif
 
 NIGHTLY_VENV := .venv-nightly
 NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
@@ -14,12 +19,12 @@ NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 demo: $(STAMP)
 	$(BIN)/denkf demo --out runs/demo
 
-test: lint layers unit smoke
+test: lint layers unit smoke docs
 
 # Exact versions come from constraints.txt. On a machine without a GPU,
 # `make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"` saves the CUDA download.
 $(STAMP): setup.py constraints.txt
-	$(PYTHON) -m venv $(VENV)
+	$(MAKE_VENV) $(VENV)
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[examples,test]"
 	touch $@
 
@@ -51,7 +56,8 @@ test-nightly: $(NIGHTLY_STAMP)
 
 # The releases make way: they and the nightlies own the same files.
 $(NIGHTLY_STAMP): setup.py constraints.txt
-	$(PYTHON) -m venv --clear $(NIGHTLY_VENV)
+	rm -rf $(NIGHTLY_VENV)
+	$(MAKE_VENV) $(NIGHTLY_VENV)
 	$(NIGHTLY_VENV)/bin/python -m pip install --quiet $(PIP_ARGS) --constraint constraints.txt --editable ".[examples,test]"
 	$(NIGHTLY_VENV)/bin/python -m pip uninstall --quiet --yes torchrl tensordict
 	touch $@
