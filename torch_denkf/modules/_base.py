@@ -173,8 +173,9 @@ class SubModel(TensorDictModule):
         if value is None:
             present = ", ".join(sorted(map(str, entries))) or "nothing"
             raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Rename the key in the "
-                f"constructor of {type(self).__name__}, or put the module that writes it in front."
+                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Give the filter that entry "
+                "(does the environment or the data have it?), put the module that writes it in front, or rename the key "
+                f"in the constructor of {type(self).__name__}."
             )
         return value
 
