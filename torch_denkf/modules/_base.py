@@ -173,9 +173,9 @@ class SubModel(TensorDictModule):
         if value is None:
             present = ", ".join(sorted(map(str, entries))) or "nothing"
             raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Give the filter that entry "
-                "(does the environment or the data have it?), put the module that writes it in front, or rename the key "
-                f"in the constructor of {type(self).__name__}."
+                f"{type(self).__name__} reads {key!r}, which is missing. There is {present}. Give the filter it "
+                "(does the environment or the data have it?), put the module that writes it in front, or rename the "
+                f"key in the constructor of {type(self).__name__}."
             )
         return value
 
