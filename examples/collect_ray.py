@@ -24,7 +24,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from append_to_env import NOISE, make_env
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
@@ -34,6 +33,7 @@ from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
+from torch_denkf.pretrained.encoders import ENCODER_STD, reacher_env
 
 WINDOW = 25  # steps that are back-propagated through
 EPISODE = 200  # steps; a filter that has learned little goes astray in long ones
@@ -48,7 +48,7 @@ def make_filter(states: torch.Tensor) -> DEnKF:
         ),
         None,
         Select([0, 1]),
-        ConstantNoise([NOISE, NOISE], in_key="encoder"),
+        ConstantNoise([ENCODER_STD, ENCODER_STD], in_key="encoder"),
         EnsembleAnalysis("etkf", sensor_key="encoder"),
         initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], sensor_key="encoder"),
     )
@@ -56,7 +56,7 @@ def make_filter(states: torch.Tensor) -> DEnKF:
 
 def policy_env(denkf: DEnKF) -> EnvBase:
     """Reacher as the policy needs it: a mark at resets, and what the filter remembers. Runs in the worker."""
-    env = make_env(int(torch.randint(2**31, ())))
+    env = reacher_env(int(torch.randint(2**31, ())))
     for transform in (StepCounter(EPISODE), InitTracker(), denkf.make_tensordict_primer()):
         env.append_transform(transform)
     return env
@@ -118,7 +118,7 @@ def main() -> None:
         raise SystemExit(f"--frames must be a multiple of {WINDOW * args.collectors}: whole windows of each collector.")
     torch.manual_seed(0)
 
-    env = make_env(0)
+    env = reacher_env(0)
     denkf = make_filter(env.rollout(200)["state"])  # its scales
     loss = DEnKFLoss(denkf, sensor=0.0, transition=0.0, state_scale=denkf["transition"].scale)
     optimiser = torch.optim.Adam(denkf.parameters(), lr=2e-3)

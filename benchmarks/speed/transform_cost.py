@@ -27,7 +27,7 @@ from torchrl.envs.transforms import Transform
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import write_page
-from examples.append_to_env import NOISE, NoisyEncoders, make_filter
+from examples.append_to_env import NOISE, make_filter
 from torch_denkf.data import render_drives
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.envs import KITTIReplayEnv
@@ -41,6 +41,7 @@ from torch_denkf.modules import (
     UnicycleTransition,
     VectorSensor,
 )
+from torch_denkf.pretrained import NoisyEncoders
 from torch_denkf.transforms import DEnKFTransform
 
 TARGET_MS = 0.4
