@@ -72,9 +72,9 @@ def _compiler() -> str:
 
 
 def _cache() -> str:
-    from torch_denkf.data.cache import _cache_directory
+    from torch_denkf.data.cache import usual_folder
 
-    folder = _cache_directory()
+    folder = usual_folder()
     if not folder.is_dir():
         return f"{folder} (not there yet)"
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,8 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+
+from torch_denkf._files import clear_errors, reserve
 
 __all__ = [
     "JoinedPictures",
@@ -22,6 +25,9 @@ __all__ = [
     "text_of_size",
     "unnamed_file",
 ]
+
+
+CURE = "pass cache=FOLDER, or cache=None for memory"
 
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
@@ -63,12 +69,15 @@ def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.nda
     """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
 
     Raises:
-        OSError: if the folder cannot be written to.
+        OSError: if the folder cannot be written to, or has not enough space.
     """
     if folder is None:
         return np.zeros((rows, 3, *size), np.uint8)
-    with unnamed_file(folder) as file:
-        return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+    shape = (rows, 3, *size)
+    name = f"{math.prod(shape) / 1e6:.1f} MB of pictures to {folder}"
+    with unnamed_file(folder) as file, clear_errors(folder / "pictures", CURE, name=name):
+        reserve(file, math.prod(shape))
+        return np.memmap(file, np.uint8, "r+", shape=shape)
 
 
 def unnamed_file(folder: Path) -> IO[bytes]:
@@ -77,11 +86,9 @@ def unnamed_file(folder: Path) -> IO[bytes]:
     Raises:
         OSError: if the folder cannot be written to.
     """
-    try:
+    with clear_errors(folder / "file", CURE, name=f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryFile(dir=folder)
-    except OSError as error:
-        raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
 
 
 class JoinedPictures:
