@@ -146,8 +146,8 @@ def open_entry(folder: Path) -> TensorDict:
         FileNotFoundError: without the entry.
     """
     content = _read_manifest(folder)
-    out = TensorDict({}, content["batch_sizes"][""])
     try:
+        out = TensorDict({}, content["batch_sizes"][""], device="cpu")
         for name, about in content["tensors"].items():
             file = folder / f"{name}.bin"
             _check(file, about, whole=False)
@@ -188,10 +188,10 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         text = sealed["content"]
         content = json.loads(text)
         sound = zlib.crc32(text.encode()) == sealed["crc32"] and content["format"] == FORMAT
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         if folder.is_dir():
-            raise DamagedEntry(f"it has no {MANIFEST}: another version wrote it, or it was not finished") from None
-        raise
+            raise DamagedEntry(f"it has no {MANIFEST}: another version wrote it, or a part was deleted") from None
+        raise FileNotFoundError(f"no entry {folder}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedEntry(f"{file} cannot be read ({error})") from error
     if not sound:
