@@ -107,18 +107,18 @@ def replacing(file: str | Path) -> Iterator[Path]:
         file.parent.mkdir(parents=True, exist_ok=True)
         _sweep(file.parent)
     beside, held = _claim(file)
-    try:
-        with clear_errors(file, beside=beside):
+    with clear_errors(file, beside=beside):
+        try:
             yield beside
             sync(beside)  # else a power failure could put an empty file in the place of a good one
             os.replace(beside, file)
             sync(file.parent)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    finally:
-        if held is not None:
-            os.close(held)
+        except BaseException:
+            beside.unlink(missing_ok=True)
+            raise
+        finally:
+            if held is not None:
+                os.close(held)
 
 
 def write_bytes(file: str | Path, data: bytes | bytearray | memoryview) -> None:

@@ -51,28 +51,33 @@ def locked(folder: Path, name: str, doing: str) -> Iterator[None]:
     Args:
         folder: made where it is not there.
         name: of the file that is the lock; it goes with it.
-        doing: what holders of the lock do in the folder, for the message: ``"trains"``.
+        doing: what holders of the lock do in the folder, for the message: ``"is writing to it"``.
 
     Raises:
-        OSError: if another process holds the lock; names the folder and the process.
+        OSError: if another process holds the lock, or the folder cannot be written to; names the folder and the
+            process.
 
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
-        >>> with locked(folder, ".lock", "writes"), locked(folder, ".lock", "writes"):
+        >>> with locked(folder, ".lock", "is writing to it"), locked(folder, ".lock", "is writing to it"):
         ...     pass
         Traceback (most recent call last):
-        OSError: another process (...) writes in ...: wait for it to end, or choose another folder
+        OSError: cannot use ...: another process is writing to it (process ...); wait for it to end, or choose ...
     """
-    folder.mkdir(parents=True, exist_ok=True)
     file = folder / name
-    held = take_lock(file) or take_lock(file)  # the first holder may have removed it at that moment
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = take_lock(file) or take_lock(file)  # the first holder may have removed it at that moment
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot use {folder}: {error.strerror}; choose another folder") from error
     if held is None:
         holder = ""
         with contextlib.suppress(OSError):
             holder = file.read_text().strip()
         raise OSError(
-            f"another process ({holder or 'unknown'}) {doing} in {folder}: wait for it to end, or choose another folder"
+            f"cannot use {folder}: another process {doing} ({holder or 'unknown'}); wait for it to end, or choose "
+            "another folder"
         )
     try:
         os.ftruncate(held, 0)

@@ -78,7 +78,7 @@ def _cache() -> str:
     if not folder.is_dir():
         return f"{folder} (not there yet)"
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    return f"{folder}, {size / 1e6:.1f} MB; may be deleted at any time"
+    return f"{folder}, {size / 1e6:.1f} MB; may be deleted at any time: denkf cache"
 
 
 def _extra(name: str) -> str:

@@ -111,7 +111,7 @@ def write_entry(folder: Path, content: TensorDict) -> None:
     for name, tensor in _tensors(content):
         file = folder / f"{'.'.join(name)}.bin"
         with file.open("wb", buffering=0) as stream:
-            data = memoryview(_bytes(tensor).numpy())
+            data = _bytes(tensor).numpy().data
             reserve(stream, len(data))
             for begin in range(0, len(data), _BLOCK):
                 part = data[begin : begin + _BLOCK]

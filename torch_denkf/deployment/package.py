@@ -62,6 +62,10 @@ class PackagedStep:
 def load_step(path: str | Path) -> PackagedStep:
     """Loads what :func:`torch_denkf.deployment.export_step` wrote.
 
+    A package is a program: loading it runs the native code in it, with all rights of this process, and a package that
+    is not compiled may hold pickles, which run code, too. Load packages alone that you would also execute; nothing in
+    the file is checked against malice. Weights that are data only: :func:`torch_denkf.pretrained.save_pretrained`.
+
     Args:
         path: the ``.pt2`` file.
 

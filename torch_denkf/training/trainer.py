@@ -157,7 +157,7 @@ class FilterTrainer(HookPoints):
                 process, or the file and the free space.
             FloatingPointError: if too many updates in a row are not finite; names stage and update.
         """
-        alone = locked(self.out, ".training", "trains") if self.processes.is_main else nullcontext()
+        alone = locked(self.out, ".training", "is training in it") if self.processes.is_main else nullcontext()
         with alone:
             return self._fit(resume)
 

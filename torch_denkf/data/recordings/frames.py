@@ -245,7 +245,8 @@ class _Store:
 
     def __init__(self, size: tuple[int, int], folder: Path | None):
         self._size, self._memory = size, bytearray()
-        self._file, self._folder = None if folder is None else unnamed_file(folder), folder
+        self._file = None if folder is None else unnamed_file(folder)
+        self._folder = folder or Path()
 
     def add(self, pixels: np.ndarray) -> None:
         """Keep a picture ``[3, H, W]``."""
