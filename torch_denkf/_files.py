@@ -32,7 +32,8 @@ def free_space(folder: Path) -> str:
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     status = os.statvfs(folder)
-    return f"{status.f_bavail * status.f_frsize / 1e6:.1f} MB free"
+    free = status.f_bavail * status.f_frsize
+    return f"{free / 1e6:.1f} MB free" if free >= 1e6 else f"{free / 1e3:.0f} kB free"
 
 
 @contextmanager
