@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
-from torch_denkf.filters.inductor import clear_damaged_libraries, need_compiler
+from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler
 from torch_denkf.modules._base import flat_noise
 
 
@@ -112,7 +112,8 @@ def export_step(
     if compiled:
         clear_damaged_libraries()
         options = {"aot_inductor.metadata": {SIGNATURE: json.dumps(signature)}}
-        torch._inductor.aoti_compile_and_package(program, package_path=package, inductor_configs=options)
+        with clear_full_cache():
+            torch._inductor.aoti_compile_and_package(program, package_path=package, inductor_configs=options)
     else:
         torch.export.save(program, package, extra_files={SIGNATURE: json.dumps(signature)})
     write_bytes(path, package.getbuffer())

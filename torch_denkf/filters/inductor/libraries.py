@@ -7,15 +7,19 @@ fails with "file too short" until someone deletes the cache.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import struct
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from torch_denkf._files import free_space
 from torch_denkf._lock import take_lock
 
-__all__ = ["clear_damaged_libraries", "is_whole"]
+__all__ = ["clear_damaged_libraries", "clear_full_cache", "is_whole"]
 
 _LOG = logging.getLogger("torch_denkf")
 _HEADER, _64_BITS = 64, 2  # bytes of ELF's header; its class
@@ -32,10 +36,7 @@ def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
     """
     if not sys.platform.startswith("linux"):
         return []
-    if cache is None:
-        from torch._inductor.runtime.cache_dir_utils import cache_dir
-
-        cache = Path(cache_dir())
+    cache = cache or _cache_in_use()
     removed = []
     for library in cache.glob("*/*.so"):
         with contextlib.suppress(OSError):
@@ -43,6 +44,32 @@ def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
                 _LOG.warning("inductor's cache held half a library, %s: it is compiled again", library)
                 removed.append(library)
     return removed
+
+
+@contextmanager
+def clear_full_cache() -> Iterator[None]:
+    """A compilation that fails because the disk of inductor's cache is full says so.
+
+    Raises:
+        OSError: naming the cache and the free space.
+    """
+    try:
+        yield
+    except Exception as error:
+        if os.strerror(errno.ENOSPC) not in str(error):
+            raise
+        cache = _cache_in_use()
+        raise OSError(
+            errno.ENOSPC,
+            f"cannot compile in {cache}, inductor's cache: {os.strerror(errno.ENOSPC)}, {free_space(cache)}; free some "
+            "space, or set TORCHINDUCTOR_CACHE_DIR to another folder",
+        ) from error
+
+
+def _cache_in_use() -> Path:
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    return Path(cache_dir())
 
 
 def is_whole(library: Path) -> bool:
