@@ -46,15 +46,20 @@ def test_a_failure_leaves_what_was_there(tmp_path):
     file = tmp_path / "new" / "table.csv"
     write_text(file, "earlier")
     for error in (ValueError, KeyboardInterrupt, OSError):
-        with pytest.raises(error), replacing(file) as beside:
-            assert (beside.parent, beside.suffix) == (file.parent, ".csv")
-            beside.write_text("half")
-            raise error
+        with pytest.raises(error):
+            fail_half_way(file, error)
     assert file.read_text() == "earlier"
     assert os.listdir(file.parent) == ["table.csv"]
     write_bytes(file, b"later")
     assert file.read_bytes() == b"later"
     assert file.stat().st_mode & 0o777 == 0o666 & ~_mask()
+
+
+def fail_half_way(file, error):
+    with replacing(file) as beside:
+        assert (beside.parent, beside.suffix) == (file.parent, ".csv")
+        beside.write_text("half")
+        raise error
 
 
 def _mask():
@@ -92,9 +97,9 @@ def test_links_stay_and_devices_are_written_to(tmp_path):
 
 
 def test_errors_of_other_files_are_not_the_writers(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"^\[Errno 2\] No such file or directory: '/nowhere'$"):
-        with replacing(tmp_path / "a.txt"):
-            open("/nowhere")
+    match = r"^\[Errno 2\] No such file or directory: '/nowhere'$"
+    with pytest.raises(FileNotFoundError, match=match), replacing(tmp_path / "a.txt"):
+        Path("/nowhere").read_text()
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"cannot write .*file/a.txt: .*; choose another folder"):
         write_text(tmp_path / "file" / "a.txt", "")

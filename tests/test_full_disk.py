@@ -101,11 +101,15 @@ def test_rendered_drives(drives, small_disk):
     assert len(read_kitti_drive(disk, "small", cache=None)) == 3
 
 
+def collect(disk, demos):
+    for number in range(demos):
+        append_to_manifest(disk, write_demo(disk, make_demo(number, 8)))
+
+
 def test_collected_demos(small_disk):
     disk = small_disk("24k")
     with pytest.raises(OSError, match=FULL.format(r"demo(s|-00000\d)")):
-        for number in range(20):
-            append_to_manifest(disk, write_demo(disk, make_demo(number, 8)))
+        collect(disk, 20)
     entries = read_manifest(disk)
     assert len(entries) >= 1
     assert [what_is_wrong(disk, entry) for entry in entries.values()] == [None] * len(entries)
