@@ -54,11 +54,10 @@ class DEnKFTransform(Transform):
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
         check_finite: whether a non-finite observation, forecast or belief raises. Costs one synchronisation a step.
-        packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (a program: load
-            only what you trust): at B=1 ten
-            times as fast as the filter itself, with the parameters that it had when it was exported, for environments
-            of the batch size of the export, and not inside a worker, because it cannot be pickled. Resets and specs
-            come from ``filter``.
+        packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
+            load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
+            parameters of its export, is for environments of the batch size of the export, and not for use inside a
+            worker, because it cannot be pickled. Resets and specs come from ``filter``.
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.

@@ -144,3 +144,15 @@ def test_bombs_are_refused_by_their_headers(tmp_path):
         pytest.raises(ValueError, match=r"more than a demo can have \(1000\)"),
     ):
         open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["../demo-000000.npz", "{parent}/demo-000000.npz", "", "a/../demo-000000.npz"])
+def test_demos_outside_of_the_folder_are_refused(tmp_path, place):
+    root = tmp_path / "demos"
+    root.mkdir()
+    write_folder(root, [make_demo(0, 8)])
+    (tmp_path / "demo-000000.npz").write_bytes((root / "demo-000000.npz").read_bytes())
+    (entry,) = read_manifest(root).values()
+    write_manifest(root, [replace(entry, file=place.format(parent=tmp_path))])
+    with pytest.raises(ValueError, match=r"demos.jsonl names a file outside of its folder, '.*'; such a collection"):
+        open_dataset(root)
