@@ -146,7 +146,7 @@ def test_bombs_are_refused_by_their_headers(tmp_path):
         open_dataset(tmp_path)
 
 
-@pytest.mark.parametrize("place", ["../demo-000000.npz", "{parent}/demo-000000.npz", "", "a/../demo-000000.npz"])
+@pytest.mark.parametrize("place", ["../demo-000000.npz", "{parent}/demo-000000.npz", "", "..", "a/../demo-000000.npz"])
 def test_demos_outside_of_the_folder_are_refused(tmp_path, place):
     root = tmp_path / "demos"
     root.mkdir()

@@ -105,7 +105,7 @@ def what_is_wrong(root: Path, entry: Entry) -> str | None:
 
 
 def _place(root: Path, entry: Entry) -> Path:
-    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file:
+    if not isinstance(entry.file, str) or entry.file in ("", "..") or Path(entry.file).name != entry.file:
         raise ValueError(
             f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
             "anything of yours: download it from where you trust it, or take the line out"
