@@ -17,13 +17,14 @@ from pathlib import Path
 from tensordict import TensorDict
 
 from torch_denkf._files import clear_errors, sync
-from torch_denkf._lock import take_lock
+from torch_denkf._lock import remove_locked, take_lock
 from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, reserve_entry, seal_entry, write_entry
 
 __all__ = ["cache_folder", "cached", "cached_in_place", "entries_of", "forget", "stamp", "sweep", "usual_folder"]
 
 _LOG = logging.getLogger("torch_denkf")
 _WRITING, _LOCK = ".writing-", "lock"
+_TRIES = 3  # to open what was just written: another process may clear the cache at that moment
 _UNLOCKED = 3600.0  # s without a change, after which a half entry without a lock is a dead process's
 _EARLIER = re.compile(r".+-[0-9a-f]{16,20}")  # entries of versions that had no manifest
 
@@ -66,7 +67,7 @@ def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
     content = read()
     with _writing(entry) as folder:
         write_entry(folder, content)
-    return open_entry(entry)
+    return content if (stored := _load(entry)) is None else stored  # it may be gone again
 
 
 def cached_in_place(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> TensorDict:
@@ -80,9 +81,15 @@ def cached_in_place(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDi
     Raises:
         OSError: if the cache cannot be written; names the entry and the free space.
     """
-    stored = _load(entry)
-    if stored is not None:
-        return stored
+    for _ in range(_TRIES):
+        stored = _load(entry)
+        if stored is not None:
+            return stored
+        _fill(entry, fill)
+    return open_entry(entry)
+
+
+def _fill(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> None:
     with _writing(entry) as folder:
         made: list[TensorDict] = []
 
@@ -92,7 +99,6 @@ def cached_in_place(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDi
 
         fill(allocate)
         seal_entry(folder, made[0])
-    return open_entry(entry)
 
 
 def entries_of(folder: Path) -> list[Path]:
@@ -115,23 +121,37 @@ def sweep(folder: Path) -> int:
         How many entries that were.
     """
     swept = 0
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         for name in os.listdir(folder):
-            left = folder / name
-            if not name.startswith(_WRITING) or not left.is_dir():
-                continue
-            with contextlib.suppress(OSError):
-                if not (left / _LOCK).exists():
-                    if time.time() - max(path.stat().st_mtime for path in (left, *left.rglob("*"))) > _UNLOCKED:
-                        shutil.rmtree(left, ignore_errors=True)
-                        swept += 1
-                    continue
-                held = take_lock(left / _LOCK, create=False)
-                if held is not None:  # its process is gone
-                    shutil.rmtree(left, ignore_errors=True)
-                    os.close(held)
-                    swept += 1
+            if name.startswith(_WRITING):
+                with contextlib.suppress(OSError):
+                    swept += _sweep(folder / name)
     return swept
+
+
+def _sweep(left: Path) -> bool:
+    """Removes a half entry whose process is gone."""
+    with contextlib.suppress(OSError):
+        left.rmdir()  # an empty one: its process was killed at the first or at the last moment
+        return True
+    held, locks = None, (left / _LOCK).exists()
+    try:
+        held = take_lock(left / _LOCK, create=False)
+    except OSError:
+        locks = False
+    if held is None and (
+        locks or time.time() - max(path.stat().st_mtime for path in (left, *left.rglob("*"))) < _UNLOCKED
+    ):
+        return False
+    _remove(left, held)
+    return True
+
+
+def _remove(left: Path, held: int | None) -> None:
+    """Removes a half entry, its lock last: whatever a kill leaves of it is known as dead."""
+    remove_locked(left, _LOCK)
+    if held is not None:
+        os.close(held)
 
 
 def _is_earlier(folder: Path) -> bool:
@@ -183,16 +203,28 @@ def _writing(entry: Path) -> Iterator[Path]:
 def _beside(entry: Path) -> Iterator[Path]:
     """A place beside an entry; what is there at the end goes, or is swept once this process is gone."""
     entry.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=entry.parent))
-    held = None
+    folder, held = _claim(entry.parent)
     try:
-        with contextlib.suppress(OSError):  # a file system without locks: nobody sweeps what has just changed
-            held = take_lock(folder / _LOCK)
         yield folder / "entry"
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder, held)
+
+
+def _claim(parent: Path) -> tuple[Path, int | None]:
+    """A new folder to write to, and its lock; None on a file system without locks, where its age says if it is dead."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
+        try:
+            held = take_lock(folder / _LOCK)
+        except FileNotFoundError:  # swept while it was empty
+            continue
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            return folder, None
         if held is not None:
-            os.close(held)
+            return folder, held
 
 
 def _errors_of(entry: Path):

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from torch_denkf._files import clear_errors, sync
-from torch_denkf._lock import take_lock
+from torch_denkf._lock import remove_locked, take_lock
 from torch_denkf.data.kitti.files import write_poses
 from torch_denkf.simulation.street.camera import Camera
 from torch_denkf.simulation.street.renderer import Renderer
@@ -130,10 +130,10 @@ class Job:
         for name in ("calib.txt", "times.txt", MARKER):
             sync(beside / name)
         write_poses(self.root / "poses" / f"{self.name}.txt", self.poses)
-        (beside / LOCK).unlink(missing_ok=True)
         if self.target.exists():
             shutil.rmtree(self.target)
         beside.rename(self.target)
+        (self.target / LOCK).unlink(missing_ok=True)
         sync(self.target.parent)
 
 
@@ -198,7 +198,7 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
     finally:
         _last.clear()
         for job in jobs:
-            shutil.rmtree(job.beside, ignore_errors=True)
+            remove_locked(job.beside, LOCK)
         for lock in held:
             if lock is not None:
                 os.close(lock)
@@ -217,12 +217,15 @@ def _draw(job: Job, start: int, stop: int) -> None:
 def _sweep(root: Path, name: str) -> None:
     """Remove what killed runs left of a drive."""
     for folder in root.glob(f".{name}-????????"):
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # an empty one: its process was killed at the first or at the last moment
+            continue
         lock = folder / LOCK
         if lock.exists():
             with contextlib.suppress(OSError):
                 held = take_lock(lock, create=False)
                 if held is not None:  # its process is gone
-                    shutil.rmtree(folder, ignore_errors=True)
+                    remove_locked(folder, LOCK)
                     os.close(held)
             continue
         newest = max(path.stat().st_mtime for path in (folder, *folder.glob("image_?")))
