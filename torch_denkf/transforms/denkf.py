@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters._said import say_ignored_mask
 from torch_denkf.filters.base import where_rows
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
@@ -153,6 +154,7 @@ class DEnKFTransform(Transform):
             value = next_tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
+        say_ignored_mask(self.filter, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
             written = self.filter.take_step(entries, next_tensordict.batch_size)
         if self.check_finite:

@@ -1,0 +1,63 @@
+"""What a filter says once: steps that stay eager, masks that a module does not read, variances that are held."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+
+from torch_denkf.modules._base import reads
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["say_eager", "say_ignored_mask", "say_once"]
+
+#: What environments and data sets call their mask.
+_MASK = "observed"
+
+
+def say_once(filter: Filter, about: str, text: str) -> None:
+    """Warns the first time that ``about`` comes up with this filter; not while torch traces it."""
+    if about not in filter._said and not torch.compiler.is_compiling():
+        filter._said.add(about)
+        warnings.warn(f"{text} Said once.", stacklevel=3)
+
+
+def say_eager(filter: Filter, why: str, cure: str) -> None:
+    """Says that a call of a filter that was compiled runs eagerly."""
+    if filter.compiled is not None:
+        say_once(filter, why, f"{type(filter).__name__} was compiled, but this call runs eagerly: {why} {cure}")
+
+
+def say_ignored_mask(filter: Filter, tensordict: TensorDictBase) -> None:
+    """Says that a mask hides a reading, which a module uses all the same because it reads no mask.
+
+    A mask is ``"observed"``, or a boolean entry that a sensor or the transition may read. One that a module of the
+    update reads is taken to belong to that module's reading.
+    """
+    structure = filter.structure
+    if not structure.unmasked or torch.compiler.is_compiling():
+        return
+    read_in_update = {key for _, module in structure.update for keys in reads(module) for key in keys}
+    before = (*structure.frames, structure.transition)
+    for key in dict.fromkeys([_MASK, *(key for _, module in before for key in reads(module)[1])]):
+        mask = None if key in read_in_update else tensordict.get(key, None)
+        if not _is_mask(mask) or bool(mask.all()):
+            continue
+        for place, module in structure.unmasked:
+            if not any(_is_mask(tensordict.get(unravel_key(name), None)) for name in module.in_keys):
+                name = type(module).__name__
+                say_once(
+                    filter,
+                    f"{key!r} at {place!r}",
+                    f"The mask {key!r} hides readings, and {name} at place {place!r} reads no mask: it uses a hidden "
+                    f"reading like any other. Name the mask in {name}, optional_keys=[{key!r}], and heed it in "
+                    "compute(). Where its reading is never missing, there is nothing to do.",
+                )
+
+
+def _is_mask(value: object) -> bool:
+    return isinstance(value, torch.Tensor) and value.dtype == torch.bool
