@@ -105,7 +105,15 @@ class Steps(NamedTuple):
                 entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
         return self._update(entries, written, call, reset, start, missing)
 
-    def first(self, entries: Entries, call: Call, start: Entries, *, in_sequence: bool = True) -> Entries:
+    def first(
+        self,
+        entries: Entries,
+        call: Call,
+        start: Entries,
+        *,
+        in_sequence: bool = True,
+        missing: set[NestedKey] | None = None,
+    ) -> Entries:
         """The first step of a sequence: its belief is ``start``; the update is made if that is to see its frame."""
         structure = self.structure
         entries = {**entries, **{key: start[key] for key in structure.carry}}
@@ -114,7 +122,7 @@ class Steps(NamedTuple):
             out = self.run([structure.transition], entries, call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
-        return self._update(entries, forecast, call, every, start, None)
+        return self._update(entries, forecast, call, every, start, missing)
 
     def _update(
         self,

@@ -334,17 +334,30 @@ class Filter(TensorDictSequential):
         written.update(steps.advance({**entries, **written}, call))
         return written
 
-    def initialise(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
+    def initialise(
+        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
+    ) -> TensorDictBase:
+        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
+
+        Args:
+            tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
+            without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
+                its prior.
+
+        Raises:
+            KeyError: if an entry is missing, or ``without`` names what no module reads.
+        """
         tensordict = self._of_one_robot(tensordict)
         entries, call, structure = self.entries_of(tensordict), Call(tensordict.batch_size), self.structure
+        missing = set(refuse_unknown_readings(structure, without))
         frame_keys, written = set(structure.frame_keys), {}
         if self.update_at_reset or not frame_keys.isdisjoint(chain(*reads(self.initial))):
-            written = self.steps().frames(entries, call)
+            written = self.steps().frames(entries, call, missing)
             entries.update(written)
-        start = self.initial_belief(entries, call)
+        entries = {key: value for key, value in entries.items() if key not in missing}
+        start = self.initial_belief(entries, call._replace(missing=frozenset(missing)))
         if self.update_at_reset:
-            written.update(self.steps().first(entries, call, start, in_sequence=False))
+            written.update(self.steps().first(entries, call, start, in_sequence=False, missing=missing))
         else:
             written.update(start)
             written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})

@@ -123,7 +123,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used.
+    Where nothing is observed at reset, the prior alone is used; so it is with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -162,6 +162,14 @@ class FromSensor(_InitialEnsemble):
         register_constant(self, "mean", mean)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
+
+    def on_entries(self, entries, call):
+        """The belief; without its reading the prior."""
+        if call.missing.isdisjoint(self.in_keys):
+            return super().on_entries(entries, call)
+        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
+        values = self._members(mean, std, self._noise(entries, [], call), call.batch_size)
+        return dict(zip(self.out_keys, values, strict=True))
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""
