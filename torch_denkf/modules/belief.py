@@ -123,7 +123,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used; so it is with ``filter.initialise(..., without=[...])``.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.

@@ -191,8 +191,8 @@ class ParticleAnalysis(SubModel):
     errors. Where nothing is observed the weights stay, exactly.
 
     Args:
-        likelihood: a Gaussian likelihood, whose reading, prediction and noise are looked at once more for the innovation
-            and its normalised square; ``None`` where there is no such likelihood, and no such diagnostics.
+        likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
+            ``None`` for neither.
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
