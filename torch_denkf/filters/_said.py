@@ -1,4 +1,4 @@
-"""What a filter says once: steps that stay eager, masks that a module does not read, variances that are held."""
+"""What a filter says once: steps that stay eager, masks that a module does not read, readings that count twice."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase, unravel_key
+from torch.utils.weak import WeakIdKeyDictionary
 
 from torch_denkf.modules._base import reads
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["say_eager", "say_ignored_mask", "say_once"]
+__all__ = ["mark_up_to_date", "say_eager", "say_ignored_mask", "say_once", "say_up_to_date"]
 
 #: What environments and data sets call their mask.
 _MASK = "observed"
+#: Beliefs that an environment's transform has brought up to the frame beside them.
+_UP_TO_DATE = WeakIdKeyDictionary()
 
 
 def say_once(filter: Filter, about: str, text: str) -> None:
@@ -57,6 +60,27 @@ def say_ignored_mask(filter: Filter, tensordict: TensorDictBase) -> None:
                     f"reading like any other. Name the mask in {name}, optional_keys=[{key!r}], and heed it in "
                     "compute(). Where its reading is never missing, there is nothing to do.",
                 )
+
+
+def mark_up_to_date(belief: torch.Tensor) -> None:
+    """Remembers, as long as it lives, that a belief has seen the frame that an environment emits with it."""
+    if not torch.compiler.is_compiling():
+        _UP_TO_DATE[belief] = None
+
+
+def say_up_to_date(filter: Filter, belief: torch.Tensor) -> None:
+    """Says that a policy's filter starts its step from a belief that has seen the frame already.
+
+    It is noticed where the environment runs in the same process and nothing copies the belief on its way.
+    """
+    if not torch.compiler.is_compiling() and belief in _UP_TO_DATE:
+        say_once(
+            filter,
+            "up to date",
+            f"{type(filter).__name__} in a policy starts its step from a belief that DEnKFTransform has brought up to "
+            "this frame already: each reading counts twice. Keep the filter in one place: in the environment, where "
+            "the policy reads ('belief', 'mean'), or in the policy behind filter.make_tensordict_primer().",
+        )
 
 
 def _is_mask(value: object) -> bool:

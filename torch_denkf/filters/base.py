@@ -34,7 +34,7 @@ from torch_denkf.filters._checks import (
 from torch_denkf.filters._compiled import CompiledSteps
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._primer import LastAction, belief_primer
-from torch_denkf.filters._said import say_eager, say_ignored_mask, say_once
+from torch_denkf.filters._said import say_eager, say_ignored_mask, say_once, say_up_to_date
 from torch_denkf.filters._sequence import filter_rows
 from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.filters._steps import Steps, blank, previous_key, where_rows
@@ -246,6 +246,7 @@ class Filter(TensorDictSequential):
                 entries[key] = entries[previous_key(key)]
         check_inputs(self, entries, tensordict)
         say_ignored_mask(self, tensordict)
+        say_up_to_date(self, entries[structure.carry[0]])
         reset, known = starts_of(tensordict, self.init_key, step=True), entries.get(_KNOWN)
         if known is not None:
             known = known.reshape(*tensordict.batch_size, 1)
