@@ -255,9 +255,8 @@ def previous_key(key: NestedKey) -> NestedKey:
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
     """What a module writes where its reading is missing; nothing if it does not know."""
     readings = set(getattr(module, "reading_keys", ()))
-    if not isinstance(module, SubModel) or not readings:
+    if not isinstance(module, SubModel) or not readings or not hasattr(module, "without_reading"):
         return {}
     values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
     values += [entries.get(key) for key in module.optional_keys]
-    out = module.without_reading(*values)
-    return dict(zip(module.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))
+    return module.by_key(module.without_reading(*values), "without_reading")

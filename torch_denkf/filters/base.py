@@ -274,7 +274,8 @@ class Filter(TensorDictSequential):
 
         Args:
             tensordict: carry, frame, and what else the modules read; the new belief is written there. A dictionary of
-                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision.
+                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision; a number is an entry
+                ``[1]``.
             without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
                 out, and the belief is the forecast unless another sensor has something to say.
 
@@ -476,6 +477,7 @@ class Filter(TensorDictSequential):
             return tensordict
         like = self.like()
         out = TensorDict(dict(tensordict), batch_size=[])
+        out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
         if like is None:
             return out
         return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))

@@ -234,7 +234,7 @@ class ImageSensor(_Sensor):
         self._looked = largest > 0  # specs are tried out on zeros
         if largest > _TOO_BRIGHT:
             warnings.warn(
-                f"ImageSensor reads {self.in_keys[0]!r} in floating point up to {largest:.0f}, and expects [0, 1]. Give "
+                f"ImageSensor reads {self.in_keys[0]!r} in floating point up to {largest:.0f}; it expects [0, 1]. Give "
                 "it uint8 images, which it divides by 255, or divide them; with pixel_loc and pixel_scale in the units "
                 "of the pixels any range will do. Said once.",
                 stacklevel=2,
