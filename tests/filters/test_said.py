@@ -13,8 +13,9 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf.envs import LinearGaussianEnv
+from torch_denkf.filters import DEnKF
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.modules import SubModel
+from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform
 
 MEAN = ("belief", "mean")
@@ -225,3 +226,62 @@ def test_no_false_alarm_for_a_filter_in_one_place(case):
                     filter(data)
             else:  # what the transform left, and the next frame
                 filter.step(data[:, -1]["next"].exclude("reward").set("observation", torch.zeros(2, 2)))
+
+
+# ------------------------------------------------------------------------------------------- masks of one reading
+
+
+@pytest.mark.parametrize("observed", [None, True])
+@pytest.mark.parametrize("make", [linear_denkf, linear_kalman, lambda: bootstrap(20)])
+def test_a_held_reading_that_counts_anew_is_said_once(make, observed):
+    filter, frames = make(), readings(2, 4).set("observation_observed", hidden(2, 4))
+    if observed:  # the mask of another sensor
+        frames["observed"] = torch.ones(2, 4, 1, dtype=torch.bool)
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        filter.sequence(frames.copy())
+        filter.sequence(frames.copy())
+    assert len(said(record)) == 1
+    assert "observed_key='observation_observed'" in said(record)[0]
+
+
+@pytest.mark.parametrize("case", ["its key", "hidden, too", "all new"])
+def test_no_false_alarm_where_held_readings_are_hidden(case):
+    filter, frames = linear_kalman(), readings(2, 4).set("observation_observed", hidden(2, 4))
+    if case == "its key":
+        filter = linear_kalman(observed_key="observation_observed")
+    elif case == "hidden, too":
+        frames["observed"] = hidden(2, 4)
+    else:
+        frames["observation_observed"] = torch.ones(2, 4, 1, dtype=torch.bool)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        filter.sequence(frames)
+
+
+def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):
+    """Oracle: the mask under its usual name."""
+    F, Q, H, R = linear_system()
+    frames = readings(3, 6).set("gps_observed", torch.rand(3, 6, 2) < 0.5)
+    renamed = frames.clone().rename_key_("gps_observed", "observed")
+    noise = ConstantNoise(R.sqrt(), in_key="observation")
+    initial = linear_denkf().initial
+    for make in (
+        lambda **keys: linear_kalman(**keys),
+        lambda **keys: DEnKF(
+            NoisyLinear(F, torch.linalg.cholesky(Q)),
+            None,
+            LinearObservation(H),
+            noise,
+            initial=initial,
+            observation_key="observation",
+            **keys,
+        ),
+    ):
+        outs = []
+        for filter, given in ((make(), renamed), (make(observed_key="gps_observed"), frames)):
+            torch.manual_seed(1)
+            outs.append(filter.sequence(given.copy())[MEAN])
+        assert outs[0].equal(outs[1])
+    with pytest.raises(ValueError, match="observed_key are for the default analysis"):
+        DEnKF(noise, None, noise, noise, linear_denkf()["analysis"], initial=initial, observed_key="gps_observed")

@@ -222,7 +222,7 @@ def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[P
         for part in _in_sequences(module):
             must, may = reads(part)
             updates = not made.issuperset(must) and not set(carry).isdisjoint(_out(part))
-            if not may and (updates or getattr(part, "reading_keys", ())):
+            if not may and (updates or len(getattr(part, "reading_keys", ())) > 0):
                 yield place, part
 
 

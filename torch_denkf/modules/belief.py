@@ -3,6 +3,7 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey
@@ -168,8 +169,8 @@ class FromSensor(_InitialEnsemble):
         if call.missing.isdisjoint(self.in_keys):
             return super().on_entries(entries, call)
         mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
-        values = self._members(mean, std, self._noise(entries, [], call), call.batch_size)
-        return dict(zip(self.out_keys, values, strict=True))
+        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
+        return self.by_key(self._members(mean, std, noise, call.batch_size))
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

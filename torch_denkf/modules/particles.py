@@ -239,9 +239,8 @@ class ParticleAnalysis(SubModel):
             optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
         self.tempering, self.info_key = tempering, info_key
-        self.angles, self.reading_keys = (
-            ([], []) if likelihood is None else (likelihood.angles, likelihood.reading_keys)
-        )
+        self.angles: list[int] = [] if likelihood is None else likelihood.angles
+        self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
 
     def without_reading(self, particles, prior, log_likelihood, predicted, *_):
         """What is written where there is no reading: the likelihood says what the belief is, the innovation is zero."""
