@@ -138,8 +138,8 @@ def _uneven(source) -> Sequence[float] | None:
     off = sum(abs(gap - usual) > _UNEVEN * usual for gap in gaps)
     if off:
         warnings.warn(
-            f"{source.path}: {off} of {len(gaps)} frames come earlier or later than {usual:.3g} s after the one before, "
-            f"up to {max(gaps):.3g} s; the times in the file are used. To take frames as evenly spaced, pass --fps.",
+            f"{source.path}: {off} of {len(gaps)} frames come earlier or later than {usual:.3g} s after the one before "
+            f"(at most {max(gaps):.3g} s); the times in the file are used. To take frames as evenly spaced, pass --fps.",
             stacklevel=2,
         )
     return stamps if off or source.fps is None else None
