@@ -139,7 +139,7 @@ def _uneven(source) -> Sequence[float] | None:
     if off:
         warnings.warn(
             f"{source.path}: {off} of {len(gaps)} frames come earlier or later than {usual:.3g} s after the one before "
-            f"(at most {max(gaps):.3g} s); the times in the file are used. To take frames as evenly spaced, pass --fps.",
+            f"(at most {max(gaps):.3g} s); the times in the file are used. Pass --fps to take them as even.",
             stacklevel=2,
         )
     return stamps if off or source.fps is None else None

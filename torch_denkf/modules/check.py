@@ -41,7 +41,7 @@ def check_analysis(
     ``LinearObservation(torch.eye(O, S))``. What is checked, as far as the analysis writes it:
 
     * mean, variances, covariance of the ensemble, innovation, NIS and log-likelihood are those of the Kalman update;
-    * where nothing is observed, the belief is the forecast, and NaN behind the mask spoils neither values nor gradients;
+    * where nothing is observed, the belief is the forecast, and NaN behind the mask spoils no value and no gradient;
       where some components are observed, the belief is that of the Kalman update with these alone;
     * batches ``[]``, ``[3]`` and ``[2, 3]`` give beliefs of these shapes, and inputs are left as they are;
     * the derivative of the mean by the reading is the gain;
