@@ -66,8 +66,8 @@ unseen = record(50, 100)
 # %%
 # The filters
 # -----------
-# They share their parts. ``moments`` is the initial belief of the filters with a mean and a covariance, ``members`` that
-# of the filters with an ensemble or particles.
+# They share their parts. ``moments`` is the initial belief of the filters with a mean and a covariance, ``members`` and
+# ``particles`` are those of the filters with an ensemble or particles.
 #
 # The Kalman filter and the Backprop KF need a linear system: they get the pendulum at rest, where the sine of the angle
 # is nearly the angle.
@@ -112,12 +112,12 @@ filters = {
 # do to see where they stand.
 
 train = record(256, 40)
-for name, loss, updates, rate in (
-    ("DPF", MixtureLoss(filters["DPF"]), 30, 3e-3),
-    ("LSTMFilter", GaussianLoss(filters["LSTMFilter"]), 120, 1e-2),
+for loss, updates, rate in (
+    (MixtureLoss(filters["DPF"]), 30, 3e-3),
+    (GaussianLoss(filters["LSTMFilter"]), 120, 1e-2),
 ):
     optimiser = torch.optim.Adam(loss.parameters(), rate)
-    for update in range(updates):
+    for _ in range(updates):
         batch = train[torch.randint(256, (32,)), :20].clone()
         value = sum(v for key, v in loss(batch).items() if key.startswith("loss"))
         optimiser.zero_grad()
@@ -128,7 +128,7 @@ for name, loss, updates, rate in (
 # The comparison
 # --------------
 # * The *error* is the root mean square of the belief's mean against the truth.
-# * The *CRPS* also looks at the spread: a belief that is too sure or too doubtful scores worse. It has the state's unit.
+# * The *CRPS* also looks at the spread: a belief that is too sure or too doubtful scores worse. Its unit is the state's.
 # * *NIS* is the normalised innovation squared. Its mean is 1 if the filter knows how far off readings will be. A filter
 #   that is too sure of itself has a larger one.
 # * The *time* is that of one step of one pendulum, eagerly. ``filter.compile()`` makes it shorter, see
@@ -137,10 +137,10 @@ for name, loss, updates, rate in (
 
 def crps(out: TensorDict) -> torch.Tensor:
     """Of the belief, whatever it is made of, ``[*B, 2]``."""
-    belief, truth = out["belief"], out["state"]
-    if "log_weight" in belief.keys():
+    belief, truth, names = out["belief"], out["state"], set(out["belief"].keys())
+    if "log_weight" in names:
         return crps_weighted(belief["ensemble"], belief["log_weight"], truth)
-    if "ensemble" in belief.keys():
+    if "ensemble" in names:
         return crps_ensemble(belief["ensemble"], truth)
     return crps_gaussian(belief["mean"], belief["var"], truth)
 
@@ -177,13 +177,13 @@ plt.show()
 # %%
 # What to take
 # ------------
-# ==========================================================  ======================================================
-# you have                                                    take
-# ==========================================================  ======================================================
-# a linear system                                             ``KalmanFilter``, exact
-# a smooth motion, a belief with one bump                     ``EKF`` or ``UKF``
-# a network for motion or sensor, images, many components     ``DEnKF``; ``"etkf"`` for readings that are used as they are
-# a field of thousands of components                          ``DEnKF`` with ``LocalEnsembleAnalysis``
-# beliefs with several bumps, few dimensions                  ``ParticleFilter``; its learned kin ``DPF`` and ``PFM``
-# no idea of the motion, many recordings                      ``LSTMFilter``, as a rival
-# ==========================================================  ======================================================
+# =======================================================  =========================================================
+# you have                                                 take
+# =======================================================  =========================================================
+# a linear system                                          ``KalmanFilter``, exact
+# a smooth motion, a belief with one bump                  ``EKF`` or ``UKF``
+# a network for motion or sensor, images, many components  ``DEnKF``; ``"etkf"`` for readings used as they are
+# a field of thousands of components                       ``DEnKF`` with ``LocalEnsembleAnalysis``
+# beliefs with several bumps, few dimensions               ``ParticleFilter``; its learned kin ``DPF`` and ``PFM``
+# no idea of the motion, many recordings                   ``LSTMFilter``, as a rival
+# =======================================================  =========================================================
