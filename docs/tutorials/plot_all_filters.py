@@ -128,7 +128,8 @@ for loss, updates, rate in (
 # The comparison
 # --------------
 # * The *error* is the root mean square of the belief's mean against the truth.
-# * The *CRPS* also looks at the spread: a belief that is too sure or too doubtful scores worse. Its unit is the state's.
+# * The *CRPS* also looks at the spread: a belief that is too sure or too doubtful scores worse. Its unit is that of the
+#   state.
 # * *NIS* is the normalised innovation squared. Its mean is 1 if the filter knows how far off readings will be. A filter
 #   that is too sure of itself has a larger one.
 # * The *time* is that of one step of one pendulum, eagerly. ``filter.compile()`` makes it shorter, see

@@ -128,21 +128,23 @@ class _Case(NamedTuple):
 
     def draw(self, batch: Sequence[int], members: int | None = None) -> TensorDict:
         """What an analysis reads, ``[*batch]``, without a mask."""
-        size, like = self.members if members is None else members, {"dtype": self.dtype}
-        mixing = torch.eye(self.state_dim, **like) + 0.3 * torch.randn(*batch, self.state_dim, self.state_dim, **like)
-        center = torch.randn(*batch, 1, self.state_dim, **like)
-        ensemble = center + torch.randn(*batch, size, self.state_dim, **like) @ mixing.mT
+        size = self.members if members is None else members
+        mixing = torch.eye(self.state_dim, dtype=self.dtype) + 0.3 * torch.randn(
+            *batch, self.state_dim, self.state_dim, dtype=self.dtype
+        )
+        center = torch.randn(*batch, 1, self.state_dim, dtype=self.dtype)
+        ensemble = center + torch.randn(*batch, size, self.state_dim, dtype=self.dtype) @ mixing.mT
         predicted = ensemble @ self.matrix.mT
         # A reading half a standard deviation off, of 1.5 times the forecast's variance: the gain is about 0.4.
         spread = predicted.var(-2)
         reading, variance = predicted.mean(-2) + 0.5 * spread.sqrt(), 1.5 * spread
         if self.samples:
-            draws = torch.randn(predicted.shape, **like)
+            draws = torch.randn(predicted.shape, dtype=self.dtype)
             draws = (draws - draws.mean(-2, keepdim=True)) / draws.std(-2, keepdim=True)
             reading = reading.unsqueeze(-2) + variance.sqrt().unsqueeze(-2) * draws
         forecast = {"ensemble": ensemble, "observation": predicted}
         forecast |= {"mean": ensemble_mean(ensemble), "cov": ensemble_cov(ensemble)}
-        forecast["log_weight"] = torch.full(ensemble.shape[:-1], 1 / size, **like).log()
+        forecast["log_weight"] = torch.full(ensemble.shape[:-1], 1 / size, dtype=self.dtype).log()
         td = TensorDict({"forecast": TensorDict(forecast, batch)}, batch)
         return td.set(self.keys.reading, reading).set(self.keys.variance, variance)
 
@@ -178,8 +180,8 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
     yield from _gain(analysis, case, tolerance)
     yield from _noise(analysis, case)
     if keys.observed is not None:
-        names = {key for names in reads(analysis) for key in names}
-        yield f"the mask {keys.observed!r}, read", float(unravel_key(keys.observed) not in names), 0
+        read = {key for some in reads(analysis) for key in some}
+        yield f"the mask {keys.observed!r}, read", float(unravel_key(keys.observed) not in read), 0
         width, nothing = case.observation_dim, torch.zeros(2, 1, dtype=torch.bool)
         first = torch.arange(width) > 0 if width > 1 else torch.ones(1, dtype=torch.bool)
         for name, observed in (
@@ -261,15 +263,15 @@ def _gain(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iter
 
 def _noise(analysis: TensorDictModuleBase, case: _Case) -> Iterator[tuple[str, float, float]]:
     """Whether noise can be drawn beforehand, and follows torch's generator."""
-    sizes = {"members": 16, "state_dim": case.state_dim, "observation_dim": case.observation_dim}
+    state, width = case.state_dim, case.observation_dim
     for place, part in random_parts(analysis, "self"):
-        lacks = part.draw_noise((2,), dtype=case.dtype, **sizes) is None
+        lacks = part.draw_noise((2,), members=16, state_dim=state, observation_dim=width, dtype=case.dtype) is None
         yield f"draw_noise of {type(part).__name__} at {place!r}: what it did not draw", float(lacks), 0
     td, means = case.draw((2,), members=16), []
     for _ in range(2):
-        state = torch.get_rng_state()
+        generator = torch.get_rng_state()
         means.append(analysis(td.clone())[case.keys.belief, "mean"])
-        torch.set_rng_state(state)
+        torch.set_rng_state(generator)
     yield "belief for the same seed", _largest(means[1] - means[0]), 0
 
 

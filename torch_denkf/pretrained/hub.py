@@ -29,7 +29,7 @@ except ImportError:
 __all__ = ["HubFilter"]
 
 
-class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):
+class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):  # type: ignore[call-arg]
     """A filter with ``push_to_hub``, ``save_pretrained`` and ``from_pretrained`` of ``huggingface_hub``'s mixin.
 
     The files are those of :func:`~torch_denkf.pretrained.save_pretrained`: data only, with a checksum.
