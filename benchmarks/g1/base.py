@@ -14,15 +14,15 @@ from benchmarks.g1.sensors import SENSORS, FramePool, Statistics, train_sensor
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training import read_checkpoint, write_checkpoint
 
-CHECKED = 2500  # frames that a sensor is validated on
+CHECKED = 1200  # frames that a sensor is validated on
 
 
 @dataclass(frozen=True)
 class SensorBudget:
     """Updates of a sensor, and frames in each."""
 
-    glimpse: int = 4500
-    paper: int = 2000
+    glimpse: int = 2600
+    paper: int = 1000
     frames: int = 32
 
 

@@ -35,38 +35,35 @@ def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[
     """Training frames: other light and colours for all; noise, shifts, boxes, salt and pepper for some.
 
     Args:
-        pixels: ``[N, 3, H, W]`` in [0, 1]; changed in place.
+        pixels: uint8 ``[N, 3, H, W]``; changed in place.
         place: of the hand, ``[N, 2]``.
         generator: of all random numbers.
 
     Returns:
-        The frames, and how far the hand moved in them, ``[N, 2]``.
+        The frames, about in [0, 1], and how far the hand moved in them, ``[N, 2]``.
     """
-    count, width = len(pixels), pixels.shape[-1]
+    count, height, width = len(pixels), *pixels.shape[-2:]
 
     def draw(*shape: int) -> Tensor:
         return torch.rand(count, *shape, generator=generator)
 
-    gain = (0.75 + 0.45 * draw(1, 1, 1)) * (0.92 + 0.16 * draw(3, 1, 1))
-    gain = torch.where(draw(1, 1, 1) < 0.1, gain * (0.4 + 0.5 * draw(1, 1, 1)), gain)
-    pixels.mul_(gain).add_(0.1 * draw(1, 1, 1) - 0.05)
     which, far, moved = draw(), draw(2) * 2 - 1, torch.zeros(count, 2)
-    height = pixels.shape[-2]
     for k in (which < 0.5).nonzero().flatten().tolist():
         reach = width * (1.2 * SHIFT if which[k] < 0.15 else 0.25 * SHIFT)
         right, down = (round(float(step) * reach) for step in far[k])
         pixels[k] = shifted(pixels[k], right, down)
         moved[k] = torch.tensor([2 * right / width, 2 * down / height])
-    some = (draw() < 0.4).nonzero().flatten()
-    noise = torch.randn(pixels[some].shape, generator=generator)
-    pixels[some] += 0.03 * noise
-    hidden = (draw() < 0.35).nonzero().flatten()
-    around = place[hidden] + moved[hidden] + 0.5 * (draw(2)[hidden] * 2 - 1)
-    away = draw()[hidden].unsqueeze(-1) < 0.6  # most boxes lie elsewhere
-    around = torch.where(away, 2 * draw(2)[hidden] - 1, around)
-    for k, spot, side in zip(hidden.tolist(), around, draw()[hidden], strict=True):
-        pixels[k : k + 1] = boxed(pixels[k : k + 1], spot.unsqueeze(0), 0.1 + 0.25 * float(side))
+    gain = (0.75 + 0.45 * draw(1, 1, 1)) * (0.92 + 0.16 * draw(3, 1, 1))
+    gain = torch.where(draw(1, 1, 1) < 0.1, gain * (0.4 + 0.5 * draw(1, 1, 1)), gain)
+    frames = pixels.float().mul_(gain / 255).add_(0.1 * draw(1, 1, 1) - 0.05)
+    for k in (draw() < 0.3).nonzero().flatten().tolist():
+        frames[k] += 0.03 * torch.randn(frames[k].shape, generator=generator)
+    near, side, elsewhere = draw(2) * 2 - 1, 0.1 + 0.25 * draw(), draw(2) * 2 - 1
+    for k in (draw() < 0.35).nonzero().flatten().tolist():
+        # Most boxes lie anywhere, the others at the hand.
+        spot = elsewhere[k] if float(which[k]) * 10 % 1 < 0.6 else place[k] + moved[k] + 0.5 * near[k]
+        frames[k : k + 1] = boxed(frames[k : k + 1], spot.unsqueeze(0), float(side[k]))
     salted = (draw() < 0.15).nonzero().flatten()
-    frames = TensorDict({"pixels": pixels[salted]}, batch_size=[len(salted)])
-    pixels[salted] = SaltAndPepper(generator=generator)(frames)["pixels"]
-    return pixels.clamp_(0, 1), moved
+    some = TensorDict({"pixels": frames[salted]}, batch_size=[len(salted)])
+    frames[salted] = SaltAndPepper(generator=generator)(some)["pixels"]
+    return frames, moved
