@@ -10,6 +10,7 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.g1.base import SensorBudget
+from benchmarks.g1.pictures import draw_all
 from benchmarks.g1.study import Study, rows_in, run_all
 from benchmarks.g1.tables import COLUMNS, markdown
 from benchmarks.g1.training import FilterBudget
@@ -39,6 +40,8 @@ def main() -> None:
         rows = rows_in(study.out)
         header = f"`{command('g1')}`: {(time.time() - begun) / 60:.0f} min"
         report(study.out, COLUMNS, rows, markdown(rows, header))
+    if study.command == "pictures" or study.smoke:
+        print(*draw_all(study), sep="\n")
 
 
 if __name__ == "__main__":

@@ -85,8 +85,6 @@ class TrainedSensor:
         torch.manual_seed(self.seed)
         sensor = build(facts)
         updates = getattr(self.budget, self.kind)
-        train_sensor(
-            sensor, train, held_out, out=self.out, seed=self.seed, updates=updates, batch=self.budget.frames
-        )
+        train_sensor(sensor, train, held_out, out=self.out, seed=self.seed, updates=updates, batch=self.budget.frames)
         write_checkpoint(facts_file, vars(facts))
         return sensor.eval(), facts

@@ -1,4 +1,4 @@
-"""The motion that all filters learn: rates that last, a pull to the commands where those are read. Nothing of it is known.
+"""The motion that all filters learn: rates that last, and a pull to the commands where those are read.
 
 The filters' state is D numbers, and the change of each in the last row. It is trained on states of the training
 episodes before any filter is, and further with each filter.

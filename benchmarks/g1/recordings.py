@@ -1,4 +1,4 @@
-"""The recordings of the study, and which episodes train, tune, validate and are tested; by episode, never within one."""
+"""The recordings of the study, and which episodes train, tune, validate and are tested, never within one."""
 
 from __future__ import annotations
 

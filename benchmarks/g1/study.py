@@ -92,9 +92,7 @@ class Base:
         for condition in PICTURES:
             file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
             exact = role == "test"
-            codes = read_codes(
-                sensor, study.data, trained.hand, numbers, condition=condition, exact=exact, file=file
-            )
+            codes = read_codes(sensor, study.data, trained.hand, numbers, condition=condition, exact=exact, file=file)
             out[condition] = with_readings(sensor, codes, self.target, MEMBERS, self.start.mean(0))
         for condition in set(CONDITIONS) - set(PICTURES):
             out[condition] = fail(out["clean"], condition, self.black)
@@ -166,7 +164,7 @@ def joined(readings: dict[str, TensorDict]) -> TensorDict:
 
 
 def run_all(study: Study) -> None:
-    """Trains and tests everything: all filters of the arm with the first sensor, fewer of the hand and of the others."""
+    """Trains and tests everything: all filters of the arm with the first sensor, fewer of all else."""
     for seed in study.seeds:
         for kind in study.sensors:
             sensor = TrainedSensor(study, kind, seed, study.sensor_budget)

@@ -25,9 +25,9 @@ class FilterBudget:
     """Updates of each stage; the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
-    filter: int = 160  # updates of a filter on readings
-    length: int = 32  # rows of the filter's windows
-    batch: int = 24  # windows an update
+    filter: int = 120  # updates of a filter on readings
+    length: int = 24  # rows of the filter's windows
+    batch: int = 16  # windows an update
 
 
 @torch.no_grad()

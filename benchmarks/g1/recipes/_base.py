@@ -41,9 +41,7 @@ class G1Recipe(Recipe):
     bias = True  # whether the state holds the sensor's slow errors
     members = MEMBERS
 
-    def __init__(
-        self, target: Target, facts: Statistics, motion: Motion, error: Tensor, start: Tensor, encoding: int
-    ):
+    def __init__(self, target: Target, facts: Statistics, motion: Motion, error: Tensor, start: Tensor, encoding: int):
         self.target, self.facts, self.motion = target, facts, deepcopy(motion)
         self.error, self.start, self.encoding = error, start, encoding
         self.dims, self.unit = range(target.size), torch.full((target.size,), target.unit)
