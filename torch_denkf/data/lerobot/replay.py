@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -75,18 +76,20 @@ class LeRobotReplay(EpisodeReplay):
         state_key: feature of the state.
         action_key: feature of the action; None for none, as are data sets without an ``"action"``.
         size: (H, W) to scale the images to, whatever their aspect.
+        dims: numbers of the state to keep, in this order, by place or by name: an arm of a whole robot. None for all.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
         episodes: of this split, with the recording's own ``number``.
         fps: rows a second.
-        names: of the state's numbers, such as the joints; None where the recording names none.
+        names: of the state's numbers that are kept, such as the joints; None where the recording names none.
 
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the folder, a parquet file or a video.
         ValueError: for versions of the format that are not read, cameras and features that are not there, files that
-            are damaged or contradict the metadata, splits without episodes, episodes that are shorter than a slice.
+            are damaged or contradict the metadata, ``dims`` that the state has not, splits without episodes, episodes
+            that are shorter than a slice.
 
     Examples:
         >>> data = LeRobotReplay("aloha_static_coffee", camera="cam_high", slice_len=16, batch_size=64)
@@ -122,6 +125,7 @@ class LeRobotReplay(EpisodeReplay):
         state_key: str = "observation.state",
         action_key: str | None = "action",
         size: tuple[int, int] = (96, 128),
+        dims: Sequence[int | str] | None = None,
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
@@ -137,12 +141,16 @@ class LeRobotReplay(EpisodeReplay):
                 cache=options.get("cache", True),
                 progress=options.get("progress", True),
             )
-        self.fps, self.names = recording.fps, recording.names
+        state = recording.rows["state"]
+        kept = _places(dims, recording.names, state.shape[-1])
+        self.fps, self.names = recording.fps, recording.names and tuple(recording.names[place] for place in kept)
         self._images = JoinedPictures([recording.rows["image"]])
         numbers, lengths = torch.unique_consecutive(recording.rows["episode"], return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
         super().__init__(
-            recording.rows.exclude("image", "episode", "frame").set("step", recording.rows["frame"]),
+            recording.rows.exclude("image", "episode", "frame").update(
+                {"step": recording.rows["frame"], "state": state if dims is None else state[:, kept]}
+            ),
             [
                 LeRobotEpisode(f"episode_{number:06d}", start, length, number)
                 for number, start, length in zip(numbers.tolist(), starts, lengths.tolist(), strict=True)
@@ -155,6 +163,16 @@ class LeRobotReplay(EpisodeReplay):
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor]:
         return picture_statistics(self._images, index[self._all_rows["observed"].squeeze(-1)[index]])
+
+
+def _places(dims: Sequence[int | str] | None, names: tuple[str, ...] | None, width: int) -> list[int]:
+    """Places of the numbers that are asked for by place or name; all by default."""
+    places = {name: place for place, name in enumerate(names or ())}
+    chosen = range(width) if dims is None else [places.get(dim, -1) if isinstance(dim, str) else dim for dim in dims]
+    if not chosen or not all(0 <= place < width for place in chosen):
+        known = list(names) if names else "no names"
+        raise ValueError(f"dims={dims} are not all among the {width} numbers of the state; it has {known}")
+    return list(chosen)
 
 
 def __getattr__(name: str):
