@@ -81,15 +81,15 @@ class Layout:
         return int(feature["shape"][0])
 
     def names(self, key: str) -> tuple[str, ...] | None:
-        """Names of a feature's numbers, where each has one: LeRobot's are lists, lists in lists, or below common names."""
-        names = _flat(self.features[key].get("names") or [])
-        return tuple(names) if len(names) == self.width(key) else None
-
-
-def _flat(names: Any) -> list[str]:
-    if isinstance(names, dict):
-        names = list(names.values())
-    return [name for part in names for name in _flat(part)] if isinstance(names, list) else [str(names)]
+        """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
+        names = self.features[key].get("names")
+        if isinstance(names, dict):
+            names = list(names.values())
+        if isinstance(names, list):
+            names = [name for part in names for name in (part if isinstance(part, list) else [part])]
+        if not names or len(names) != self.width(key):
+            return None
+        return tuple(str(name) for name in names)
 
 
 def read_layout(root: Path, camera: str | None) -> Layout:
