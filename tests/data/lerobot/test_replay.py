@@ -258,10 +258,10 @@ def test_without_the_extra(tmp_path, root, monkeypatch):
 
 @pytest.mark.parametrize("dims", [[2, 0], ["wrist", "shoulder"], ["wrist", 0]])
 def test_some_numbers_of_the_state(root, dims):
-    data, whole = open_all(root, dims=dims), open_all(root)
+    data, whole = open_all(root, dims=dims, action_dims=[1]), open_all(root)
     assert data.names == ("wrist", "shoulder")
     assert data[:]["state"].equal(whole[:]["state"][:, [2, 0]])
-    assert data[:]["action"].equal(whole[:]["action"])
+    assert data[:]["action"].equal(whole[:]["action"][:, [1]])
     assert data.statistics["state", "std"].equal(whole.statistics["state", "std"][[2, 0]])
     assert whole.names == tuple(NAMES)
     shared.check_contract(data)
@@ -269,8 +269,10 @@ def test_some_numbers_of_the_state(root, dims):
 
 @pytest.mark.parametrize("dims", [[3], [-1], ["hand"], []])
 def test_numbers_that_the_state_has_not(root, dims):
-    with pytest.raises(ValueError, match=r"not all among the 3 numbers of the state; it has \['shoulder'"):
+    with pytest.raises(ValueError, match=r"^dims=.* others than the 3 numbers there are, shoulder, elbow, wrist$"):
         open_all(root, dims=dims)
+    with pytest.raises(ValueError, match=r"^action_dims=\[2\] .* the 2 numbers there are$"):
+        open_all(root, action_dims=[2])
 
 
 def test_names_and_actions_are_optional(tmp_path):

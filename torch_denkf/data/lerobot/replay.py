@@ -89,6 +89,7 @@ class LeRobotReplay(EpisodeReplay):
         action_key: feature of the action; None for none, as are data sets without an ``"action"``.
         size: (H, W) to scale the images to, whatever their aspect.
         dims: numbers of the state to keep, in this order, by place or by name: an arm of a whole robot. None for all.
+        action_dims: numbers of the action to keep, by place. Commands to other joints are noise to a learned motion.
         repeats: ``"keep"`` or ``"mask"`` repeated pictures.
         lag: rows by which the states are later than the pictures.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
@@ -104,7 +105,7 @@ class LeRobotReplay(EpisodeReplay):
         ImportError: without pyarrow.
         FileNotFoundError: without the folder, a parquet file or a video.
         ValueError: for versions of the format that are not read, cameras and features that are not there, files that
-            are damaged or contradict the metadata, ``dims`` that the state has not, splits without episodes, episodes
+            are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes, episodes
             that are shorter than a slice or the lag, and other words for ``repeats``.
 
     Examples:
@@ -142,6 +143,7 @@ class LeRobotReplay(EpisodeReplay):
         action_key: str | None = "action",
         size: tuple[int, int] = (96, 128),
         dims: Sequence[int | str] | None = None,
+        action_dims: Sequence[int] | None = None,
         repeats: Literal["keep", "mask"] = "keep",
         lag: int = 0,
         **options: Unpack[ReplayOptions],
@@ -161,12 +163,15 @@ class LeRobotReplay(EpisodeReplay):
                 cache=options.get("cache", True),
                 progress=options.get("progress", True),
             )
-        kept = _places(dims, recording.names, recording.rows["state"].shape[-1])
-        self.fps, self.lag = recording.fps, lag
-        self.names = recording.names and tuple(recording.names[place] for place in kept)
+        self.fps, self.names, self.lag = recording.fps, recording.names, lag
         self._images = JoinedPictures([recording.rows["image"]])
         rows, self._shown = _paired(recording.rows.exclude("image"), lag)
-        rows["state"] = rows["state"][:, kept]
+        if dims is not None:
+            kept = _places("dims", dims, recording.names, rows["state"].shape[-1])
+            rows["state"] = rows["state"][:, kept]
+            self.names = recording.names and tuple(recording.names[place] for place in kept)
+        if action_dims is not None and "action" in rows:
+            rows["action"] = rows["action"][:, _places("action_dims", action_dims, None, rows["action"].shape[-1])]
         numbers, lengths = torch.unique_consecutive(rows.pop("episode"), return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
         repeated = torch.zeros(len(rows), dtype=torch.bool)
@@ -215,14 +220,14 @@ def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dic
     return float_pictures(images, shown[row])
 
 
-def _places(dims: Sequence[int | str] | None, names: tuple[str, ...] | None, width: int) -> list[int]:
-    """Places of the numbers that are asked for by place or name; all by default."""
+def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
+    """Places of the numbers that are asked for by place or name."""
     places = {name: place for place, name in enumerate(names or ())}
-    chosen = range(width) if dims is None else [places.get(dim, -1) if isinstance(dim, str) else dim for dim in dims]
+    chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
     if not chosen or not all(0 <= place < width for place in chosen):
-        known = list(names) if names else "no names"
-        raise ValueError(f"dims={dims} are not all among the {width} numbers of the state; it has {known}")
-    return list(chosen)
+        known = f", {', '.join(names)}" if names else ""
+        raise ValueError(f"{argument}={list(dims)} names none or others than the {width} numbers there are{known}")
+    return chosen
 
 
 def __getattr__(name: str):
