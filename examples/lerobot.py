@@ -4,9 +4,9 @@
     python examples/lerobot.py --root FOLDER --camera top --state observation.state --joints 7:14
 
 Any folder of LeRobot 2.0, 2.1 or 3.0 will do. The sensor reads the joints from single pictures. Where commands were
-recorded, they drive the filter's motion, which is learned. What is left on the screen: errors on unseen episodes beside
-those of simpler ways, and in --out a picture and a video. ``examples/kitti.py``, ``ur5.py`` and ``own_recordings.py`` are
-the same page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
+recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes beside those of
+simpler ways, and leaves a picture and a video in --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
+page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
 
 FIGURES
 """
@@ -28,8 +28,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from torch_denkf import DEnKF, DEnKFTransform, Filter
-from torch_denkf.data import EpisodeReplay, LeRobotReplay, lag_errors
-from torch_denkf.data.lerobot.replay import LeRobotEpisode
+from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay, lag_errors
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (
@@ -119,15 +118,13 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
     commands = {"action_key": "action", "action_loc": facts["action", "mean"]} if driven else {}
     if driven:
         commands["action_scale"] = facts["action", "std"].clamp_min(1e-3)
+    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) in the place of
+    # () learn other motions, too.
+    motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
+    motion.requires_grad_(driven)
     wind = ConstantNoise(0.1 * scale, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
-        # Linear: joints go after their commands. Widths such as (64, 64) in the place of () learn other motions, too.
-        transition=LearnedTransition(
-            StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.1),
-            loc=loc,
-            scale=scale,
-            **commands,
-        ),
+        transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
         sensor=ImageSensor(
             joints,
             image_shape=image,
@@ -183,9 +180,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
 
     noises = [module for module in denkf.modules() if isinstance(module, ScaledNoise)]
     candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
-    factor = choose_for_coverage(
-        candidates, lambda value: [setattr(noise, "factor", value) for noise in noises], coverage
-    )
+    factor = choose_for_coverage(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], coverage)
     print(f"noise times {factor}, chosen on {len(held_out.episodes)} episodes that the sensor has not seen")
 
 
@@ -194,7 +189,9 @@ def main() -> None:
     parser.add_argument("--root", type=Path, help="LeRobot folder; a small one is made by default")
     parser.add_argument("--camera", help="of the folder, where it has several")
     parser.add_argument("--state", default="observation.state", help="feature that the belief is about")
-    parser.add_argument("--joints", nargs="+", default=[":"], help="of the state: 7:14, 3, gripper, right_*; default all")
+    parser.add_argument(
+        "--joints", nargs="+", default=[":"], help="of the state: 7:14, 3, gripper, right_*; default all"
+    )
     parser.add_argument("--no-commands", action="store_true", help="leave recorded commands out")
     parser.add_argument("--lag", type=int, help="rows by which states are later than pictures; estimated by default")
     parser.add_argument("--size", nargs=2, type=int, default=(96, 128), help="height and width to scale pictures to")
@@ -258,7 +255,7 @@ def no_picture(rows: TensorDict) -> TensorDict:
     return rows.set("observed", torch.zeros_like(rows["observed"]))
 
 
-def believe(denkf: DEnKF, data: LeRobotReplay, episode: LeRobotEpisode) -> TensorDict:
+def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
     """An episode as the robot would have seen it, with the belief in each row."""
     env = TransformedEnv(ReplayEnv(data, episodes=episode.name))
     env.append_transform(DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
@@ -283,7 +280,7 @@ def draw(seen: TensorDict, reading: torch.Tensor, data: LeRobotReplay, names: Se
     """A picture and a video of the four joints that move most: 90 % bands, truth, readings; shaded without pictures."""
     dims = sorted(data.statistics["state", "std"].argsort(descending=True)[:4].tolist())
     bands = {"dims": dims, "names": [names[dim] for dim in dims]}
-    shared = {"observed": ~dead(seen), "time": 1 / data.fps}
+    shared = {"observed": ~dead(seen), "time": seen["time"].flatten()}
     dots = {dim: reading[:, dim].where(seen["observed"][:, 0], torch.nan) for dim in dims}
     axes = plot_bands(seen, readings=dots, **bands, **shared)
     axes[0].figure.savefig(stem.with_suffix(".png"), dpi=110)
