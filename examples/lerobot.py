@@ -14,6 +14,7 @@ FIGURES
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.util
 import json
 from collections.abc import Sequence
@@ -231,9 +232,10 @@ def main() -> None:
     data, held_out = folder(num_slices=64, slice_len=2), folder(split="validation")
     print(f"{len(data.episodes)} episodes, {len(data)} rows, {data.repeats_masked} of them with repeated pictures;")
     print(f"{len(joints)} of {width} numbers of the state, which are {args.lag} rows later than the pictures")
+    args.updates = args.updates or (min(max(8 * len(data) // 64, 300), 3000), 400, 200)
+    digest = hashlib.sha256(repr(sorted(vars(args).items())).encode()).hexdigest()[:8]  # other options, other training
     denkf = make_filter(data)
-    passes = 8 * len(data) // 64
-    train(denkf, data, held_out, args.out, args.updates or (min(max(passes, 300), 3000), 400, 200))
+    train(denkf, data, held_out, args.out / f"training-{digest}", args.updates)
 
     # The replay environment, with the filter in it: any torchrl code can step it. Commands are replayed, too.
     unseen, blind = folder(split="test", transform=fail), folder(split="test", transform=no_picture)
