@@ -13,6 +13,8 @@ import math
 import torch
 from torch import Tensor
 
+from torch_denkf.functional._checks import check_shape
+from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.weighted import check_particles
 
 
@@ -97,6 +99,53 @@ def soft_resample(
     # Picked first, then their logarithm: a particle that was picked has a positive probability.
     ratio = log_weights.gather(-1, index) - proposal.gather(-1, index).log()
     return _take(particles, index), ratio.log_softmax(-1)
+
+
+def jitter_copies(
+    resampled: Tensor, particles: Tensor, log_weights: Tensor, normal: Tensor, *, factor: float = 1.0
+) -> Tensor:
+    r"""Moves the copies that resampling made apart; one of each particle stays where it is.
+
+    Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
+    the weighted particles *before* resampling times the square of :math:`\text{factor} \cdot E^{-1 / (S + 4)}`, Scott's
+    rule for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It widens the
+    distribution, less so with more particles. Where one particle has all the weight, the covariance of all of them is
+    taken, as if their weights were equal.
+
+    Args:
+        resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
+            neighbours there.
+        particles: the particles before, ``[*B, E, S]``.
+        log_weights: their log-weights before, normalised, ``[*B, E]``.
+        normal: standard-normal numbers ``[*B, E, S]``.
+        factor: on the width; 0 for no jitter.
+
+    Returns:
+        The particles, ``[*B, E, S]``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or ``factor`` is negative.
+
+    Examples:
+        >>> import torch
+        >>> particles, picked = torch.tensor([[0.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [2.0]])
+        >>> even, normal = torch.full((3,), 1 / 3).log(), torch.ones(3, 1)
+        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()
+        tensor([1.0000, 1.3277, 2.0000])
+    """
+    check_particles(particles, log_weights)
+    check_shape("resampled", resampled, particles.shape, "[*B, E, S]")
+    check_shape("normal", normal, particles.shape, "[*B, E, S]")
+    if factor < 0:
+        raise ValueError(f"factor scales the jitter's width, 0 or more; got {factor}.")
+    size, dim = particles.shape[-2:]
+    alone = log_weights.max(-1, keepdim=True).values > -1e-6
+    weights = torch.where(alone, 1 / size, log_weights.exp()).unsqueeze(-1)
+    anomalies = particles - (weights * particles).sum(-2, keepdim=True)
+    root = semidefinite_root(anomalies.mT @ (weights * anomalies))
+    same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
+    copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
+    return resampled + torch.where(copies, factor * size ** (-1 / (dim + 4)) * (normal @ root.mT), 0)
 
 
 def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
