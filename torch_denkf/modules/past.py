@@ -26,7 +26,24 @@ __all__ = ["EnsemblePast", "LaggedAnalysis", "LaggedBelief", "WithEnsemblePast"]
 _AGE = ("smoothed", "age")
 
 
-class WithEnsemblePast(SubModel):
+class InPlaceOf(SubModel):
+    """A sub-model around another, whose place it takes: the noise of the inner one keeps its name."""
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Those of the module inside."""
+        return getattr(self.module, "noise_names", ())
+
+    def draw_noise(self, batch_size, **sizes):
+        """Draws the noise of the module inside."""
+        return self.module.draw_noise(batch_size, **sizes)
+
+    def parts(self):
+        """Those of the module inside."""
+        return self.module.parts() if isinstance(self.module, SubModel) else {}
+
+
+class WithEnsemblePast(InPlaceOf):
     """An initial belief with a past: L copies of its members.
 
     Args:
@@ -65,13 +82,9 @@ class WithEnsemblePast(SubModel):
         self.ensemble_key, self.log_weight_key = (belief_key, "ensemble"), (belief_key, "log_weight")
         copy_sizes(initial, self)
 
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
-
     def on_entries(self, entries, call):
         """The belief and its past."""
-        written = run_module(self.module, entries, call.part("initial"))
+        written = run_module(self.module, entries, call)
         ensemble, log_weight = written[self.ensemble_key], written.get(self.log_weight_key)
         past = ensemble.unsqueeze(-2).repeat_interleave(self.lag, -2)
         age = torch.full((*call.batch_size, 1), self.age, device=ensemble.device)
@@ -101,7 +114,7 @@ class EnsemblePast(SubModel):
         return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
 
 
-class LaggedAnalysis(SubModel):
+class LaggedAnalysis(InPlaceOf):
     """An analysis that corrects the past with the same reading, by the past's covariance with the prediction.
 
     It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
@@ -145,15 +158,6 @@ class LaggedAnalysis(SubModel):
         self.info_key, self.reading_keys = analysis.info_key, analysis.reading_keys
         if hasattr(analysis, "noise_variance_key"):
             self.noise_variance_key = analysis.noise_variance_key
-
-    @property
-    def noise_names(self) -> tuple[str, ...]:
-        """Those of the analysis."""
-        return self.module.noise_names
-
-    def draw_noise(self, batch_size, **sizes):
-        """Draws the noise of the analysis."""
-        return self.module.draw_noise(batch_size, **sizes)
 
     def noise_sizes(self, *values):
         """Those of the analysis."""

@@ -17,14 +17,14 @@ from torch_denkf.functional import smoothing_gain
 from torch_denkf.modules._base import SubModel, reads, run_module
 from torch_denkf.modules._gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.modules.past import check_positive_lag, copy_sizes
+from torch_denkf.modules.past import InPlaceOf, check_positive_lag, copy_sizes
 
 __all__ = ["CrossTransition", "LaggedMoments", "MomentsPast", "WithMomentsPast"]
 
 _PAST = ("past_mean", "past_cov", "past_gain")
 
 
-class CrossTransition(SubModel):
+class CrossTransition(InPlaceOf):
     """A forecast of mean and covariance, with the covariance of the states before and after the step.
 
     Args:
@@ -56,17 +56,13 @@ class CrossTransition(SubModel):
         needed, optional = reads(transition)
         super().__init__(transition, needed, [*transition.out_keys, cross_key], optional_keys=optional)
 
-    def parts(self):
-        """Those of the transition: its noise stays where it was."""
-        return self.module.parts()
-
     def on_entries(self, entries, call):
         """The forecast and the cross-covariance."""
         written, cross = self.module.with_cross(entries, call, wanted=True)
         return {**written, unravel_key(self.out_keys[-1]): cross}
 
 
-class WithMomentsPast(SubModel):
+class WithMomentsPast(InPlaceOf):
     """An initial mean and covariance with a past: L copies of them.
 
     Args:
@@ -104,13 +100,9 @@ class WithMomentsPast(SubModel):
         self.lag, self.age, self.belief_key = lag, age, belief_key
         copy_sizes(initial, self)
 
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
-
     def on_entries(self, entries, call):
         """The belief and its past: the state itself, of which nothing is left open."""
-        written = run_module(self.module, entries, call.part("initial"))
+        written = run_module(self.module, entries, call)
         mean, cov = written[self.belief_key, "mean"], written[self.belief_key, "cov"]
         gain = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
         past = [torch.stack([value] * self.lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]

@@ -90,7 +90,21 @@ class FixedLag(Filter):
                 ordered["past"] = past
         ordered["smoothed"] = last
         super().__init__(ordered, initial=initial, **options_of(filter))
-        self.lag = lag
+        self.lag, self._without_lag = lag, list(filter.carry_keys)
+
+    def sequence(self, tensordict, *, detach_every=None, keep=None):
+        """Filters a sequence, see :meth:`Filter.sequence`.
+
+        Raises:
+            KeyError: if the data hold beliefs that were stored without their past.
+        """
+        lacking = [key for key in self.carry_keys if tensordict.get(key, None) is None]
+        if lacking and all(tensordict.get(key, None) is not None for key in self._without_lag):
+            raise KeyError(
+                f"The data hold {self._without_lag}, from which a filter would go on, but not {lacking}: they were "
+                "stored without a lag. Leave them out: tensordict.exclude(*filter.belief_keys)."
+            )
+        return super().sequence(tensordict, detach_every=detach_every, keep=keep)
 
 
 def kind_of(filter: Filter) -> tuple[str, str]:
