@@ -9,8 +9,6 @@ The past of the first steps of an episode is the episode's first state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
@@ -22,8 +20,6 @@ from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 
 __all__ = ["EnsemblePast", "LaggedAnalysis", "LaggedBelief", "WithEnsemblePast"]
-
-_AGE = ("smoothed", "age")
 
 
 class InPlaceOf(SubModel):
@@ -224,8 +220,8 @@ def check_positive_lag(lag: int) -> None:
         raise ValueError(f"lag counts the steps to look back, at least 1; got {lag}.")
 
 
-def copy_sizes(initial: nn.Module, owner: nn.Module, names: Sequence[str] = ("ensemble_size", "state_dim")) -> None:
+def copy_sizes(initial: nn.Module, owner: nn.Module) -> None:
     """What an initial belief says about its sizes."""
-    for name in (*names, "observation_dim", "input_dim"):
+    for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim"):
         if hasattr(initial, name):
             setattr(owner, name, getattr(initial, name))

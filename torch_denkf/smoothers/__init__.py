@@ -3,7 +3,8 @@
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.ensemble import EnKS, EnRTS
 from torch_denkf.smoothers.fixed_lag import FixedLag
+from torch_denkf.smoothers.iterated import IEnKS
 from torch_denkf.smoothers.particles import ParticleSmoother
 from torch_denkf.smoothers.rts import RTSSmoother
 
-__all__ = ["Smoother", "FixedLag", "EnKS", "EnRTS", "RTSSmoother", "ParticleSmoother"]
+__all__ = ["Smoother", "FixedLag", "EnKS", "EnRTS", "IEnKS", "RTSSmoother", "ParticleSmoother"]
