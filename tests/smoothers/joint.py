@@ -1,5 +1,7 @@
 """The oracle of all smoothers: all states and readings of a linear system as one Gaussian, conditioned by a solve."""
 
+from itertools import pairwise
+
 import torch
 from tensordict import TensorDict
 
@@ -19,7 +21,7 @@ def joint_beliefs(frames, lag=None):
     means, covs = [], []
     for row in frames:
         starts = [*row["is_init"].flatten().nonzero().flatten().tolist(), len(row)]
-        parts = [_episode(row[start:end], lag) for start, end in zip(starts, starts[1:], strict=False)]
+        parts = [_episode(row[start:end], lag) for start, end in pairwise(starts)]
         means.append(torch.cat([mean for mean, _ in parts]))
         covs.append(torch.cat([cov for _, cov in parts]))
     return torch.stack(means), torch.stack(covs)

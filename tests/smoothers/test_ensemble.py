@@ -9,7 +9,7 @@ from tests.filters.factories import linear_denkf, linear_kalman, linear_system, 
 from tests.filters.gaussian_for_tests import directional_check
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
-from torch_denkf.functional import ensemble_cov, enrts_smooth, enrts_step
+from torch_denkf.functional import enrts_smooth, enrts_step, ensemble_cov
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -203,7 +203,7 @@ def test_learned_parts_learn_from_what_they_look_back_at(float64, make):
     frames = running.draw_noise(frames)
     directional_check(
         lambda: smoother.sequence(frames.copy())["smoothed", "ensemble"].square().sum(),
-        [p for p in filter.parameters()],
+        list(filter.parameters()),
         step=1e-6,
         rtol=1e-4,
     )

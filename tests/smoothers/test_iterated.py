@@ -49,7 +49,7 @@ def test_without_process_noise_it_is_the_kalman_smoother(float64, iterations):
 
 
 def test_with_process_noise_many_members_are_the_kalman_smoother(float64):
-    frames, size = drive(2, 6), 3000
+    frames, size = drive(2, 6), 500
     expected = FixedLag(linear_kalman(), 1).sequence(frames.copy())
     with torch.no_grad():
         out = linear(size, noise=known_process_noise(), iterations=1).sequence(frames.copy())

@@ -36,9 +36,7 @@ class WithSmoothed(InPlaceOf):
         tensor([0])
     """
 
-    def __init__(
-        self, initial: TensorDictModuleBase, *, belief_key: str = "belief", smoothed_key: str = "smoothed"
-    ):
+    def __init__(self, initial: TensorDictModuleBase, *, belief_key: str = "belief", smoothed_key: str = "smoothed"):
         needed, optional = reads(initial)
         own = [(smoothed_key, name) for name in _SMOOTHED]
         super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
@@ -51,9 +49,7 @@ class WithSmoothed(InPlaceOf):
         for name in _SMOOTHED[:3]:
             written[self.smoothed_key, name] = written[self.belief_key, name]
         ensemble = written[self.belief_key, "ensemble"]
-        written[self.smoothed_key, "age"] = torch.zeros(
-            *call.batch_size, 1, dtype=torch.int64, device=ensemble.device
-        )
+        written[self.smoothed_key, "age"] = torch.zeros(*call.batch_size, 1, dtype=torch.int64, device=ensemble.device)
         return written
 
 
@@ -186,7 +182,7 @@ class IteratedAnalysis(SubModel):
         if not call.sample:
             return noise
         for place, part in random_parts(self.module["transition"], call.part("transition").place):
-            value = entries.get(("noise", place))
+            value: object = entries.get(("noise", place))
             if value is None:
                 value = part.draw_noise(
                     call.batch_size,

@@ -159,9 +159,7 @@ class ResampledTransition(SubModel):
             return ()
         return ("uniform", "normal") if self.jitter else ("",)
 
-    def draw_noise(
-        self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_
-    ):
+    def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
         """Draws uniform numbers ``[*batch_size, 1]``, and for a jitter normal ones ``[*batch_size, E, S]``."""
         if not self.noise_names:
             return None

@@ -20,9 +20,10 @@ __all__ = ["FixedLag", "kind_of", "rebuilt"]
 class FixedLag(Filter):
     """A filter that also says, at each step, what it now believes of the state L steps ago.
 
-    The belief of t is the filter's own. Beside it stand ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, S]``
-    of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``: by how many steps that
-    state lies back, which is L, or fewer where the episode is younger. How it is done follows from the belief:
+    The belief of t is the filter's own. Beside it stand ``("smoothed", "mean")`` and ``("smoothed", "var")``,
+    ``[*B, S]``, of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``: by how many
+    steps that state lies back, which is L, or fewer where the episode is younger. How it is done follows from the
+    belief:
 
     =====================  ========================================================================  ==================
     belief                 smoother                                                                  further entries
@@ -126,8 +127,8 @@ def kind_of(filter: Filter) -> tuple[str, str]:
         if "ensemble" in names and "log_weight" not in names:
             return "ensemble", prefix
     raise TypeError(
-        f"{type(filter).__name__} carries {filter.carry_keys}; smoothing needs an ensemble, a mean and a covariance, or "
-        "particles with log-weights behind a ResampledTransition."
+        f"{type(filter).__name__} carries {filter.carry_keys}; smoothing needs an ensemble, a mean and a covariance, "
+        "or particles with log-weights behind a ResampledTransition."
     )
 
 
@@ -161,12 +162,10 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
     def lagged(module: TensorDictModuleBase) -> TensorDictModuleBase:
         nonlocal found
         if type(module) is TensorDictSequential:
-            return TensorDictSequential(
-                OrderedDict((name, lagged(part)) for name, part in named_modules_of(module))
-            )
+            return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
         if isinstance(module, EnsembleUpdate) or hasattr(module, "info_key"):
             found = True
-            return LaggedAnalysis(module)  # type: ignore[arg-type]  # which refuses what it cannot wrap
+            return LaggedAnalysis(module)  # which refuses what it cannot wrap
         return module
 
     out = OrderedDict((name, lagged(module)) for name, module in modules.items())

@@ -79,7 +79,7 @@ class ParticleSmoother(Smoother):
         return particles, smoothed, *moments_of(particles, smoothed)
 
     def _densities(self, entries: Entries, particles: Tensor, log_weights: Tensor) -> Tensor:
-        """log p of each particle at t, in the columns, given each at t − 1, in the rows, ``[*B, T, E, E]``."""
+        """Log-density of each particle at t, in the columns, given each at t − 1, in the rows, ``[*B, T, E, E]``."""
         motion, structure = self.filter.transition_module.module, self.filter.structure
         key, out_key = unravel_key(motion.in_keys[0]), unravel_key(motion.out_keys[0])
         time, count = particles.ndim - 3, particles.shape[-3]
@@ -109,7 +109,7 @@ class ParticleSmoother(Smoother):
 
 
 def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor) -> Tensor:
-    """log N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
+    """Log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
 
     Args:
         values: ``[*B, E, S]``.
