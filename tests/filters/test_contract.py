@@ -24,7 +24,7 @@ from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms import DEnKFTransform
 
 
-def particles(scheme):
+def particles(scheme, **kwargs):
     F, Q, H, R = linear_system()
     return ParticleFilter(
         NoisyLinear(F, torch.linalg.cholesky(Q)),
@@ -34,6 +34,7 @@ def particles(scheme):
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=16),
         resampling=scheme,
+        **kwargs,
     )
 
 
@@ -51,11 +52,12 @@ FILTERS = {
     "UKF": lambda: linear_filter("UKF"),
     "Backprop KF": lambda: linear_filter("BackpropKF"),
     "particles, systematic": lambda: particles("systematic"),
+    "particles, jitter": lambda: particles("systematic", jitter=0.7, ess_threshold=0.5),
     "particles, soft": lambda: particles("soft"),
     "particles, transport": lambda: particles("transport"),
     "LSTM": lambda: lstm(),
 }
-LAGGED = ("DEnKF etkf", "DEnKF perturbed", "Kalman", "UKF", "particles, systematic")
+LAGGED = ("DEnKF etkf", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
 FILTERS |= {f"{name}, lag": partial(lambda inner: FixedLag(inner(), 3), FILTERS[name]) for name in LAGGED}
 FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}  # of their own
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}

@@ -107,10 +107,11 @@ def jitter_copies(
     r"""Moves the copies that resampling made apart; one of each particle stays where it is.
 
     Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
-    the weighted particles *before* resampling times the square of :math:`\text{factor} \cdot E^{-1 / (S + 4)}`, Scott's
+    the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, Scott's
     rule for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It widens the
-    distribution, less so with more particles. Where one particle has all the weight, the covariance of all of them is
-    taken, as if their weights were equal.
+    distribution, less so with more particles. N is the *effective* number of particles, and the covariance is unbiased
+    for it: where a few particles have all the weight, they say little about the spread, and the kernel is wide. Where
+    one alone has it, the covariance of all particles is taken, as if their weights were equal.
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
@@ -130,8 +131,8 @@ def jitter_copies(
         >>> import torch
         >>> particles, picked = torch.tensor([[0.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [2.0]])
         >>> even, normal = torch.full((3,), 1 / 3).log(), torch.ones(3, 1)
-        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()
-        tensor([1.0000, 1.3277, 2.0000])
+        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()  # 3^(-1/5) / 2 = 0.4014
+        tensor([1.0000, 1.4014, 2.0000])
     """
     check_particles(particles, log_weights)
     check_shape("resampled", resampled, particles.shape, "[*B, E, S]")
@@ -142,10 +143,11 @@ def jitter_copies(
     alone = log_weights.max(-1, keepdim=True).values > -1e-6
     weights = torch.where(alone, 1 / size, log_weights.exp()).unsqueeze(-1)
     anomalies = particles - (weights * particles).sum(-2, keepdim=True)
-    root = semidefinite_root(anomalies.mT @ (weights * anomalies))
+    cov = anomalies.mT @ (weights * anomalies) / (1 - weights.square().sum(-2, keepdim=True))
+    width = factor * effective_sample_size(log_weights).clamp(min=1)[..., None, None] ** (-1 / (dim + 4))
     same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
     copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
-    return resampled + torch.where(copies, factor * size ** (-1 / (dim + 4)) * (normal @ root.mT), 0)
+    return resampled + torch.where(copies, width * (normal @ semidefinite_root(cov).mT), 0)
 
 
 def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
