@@ -287,9 +287,8 @@ def test_compiled_equals_eager():
 def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
     generator = torch.Generator().manual_seed(0)
     size = 200_000
-    particles = (
-        torch.randn(size, 2, generator=generator, dtype=torch.float64) @ torch.tensor([[2.0, 0.5], [0.0, 1.0]]).double()
-    )
+    root = torch.tensor([[2.0, 0.5], [0.0, 1.0]], dtype=torch.float64)
+    particles = torch.randn(size, 2, generator=generator, dtype=torch.float64) @ root
     log_weights = torch.zeros(size, dtype=torch.float64).log_softmax(-1)
     picked = particles[:1].expand(size, 2)
     normal = torch.randn(size, 2, generator=generator, dtype=torch.float64)

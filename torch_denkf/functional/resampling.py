@@ -107,11 +107,11 @@ def jitter_copies(
     r"""Moves the copies that resampling made apart; one of each particle stays where it is.
 
     Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
-    the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, Scott's
-    rule for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It widens the
-    distribution, less so with more particles. N is the *effective* number of particles, and the covariance is unbiased
-    for it: where a few particles have all the weight, they say little about the spread, and the kernel is wide. Where
-    one alone has it, the covariance of all particles is taken, as if their weights were equal.
+    the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
+    rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
+    widens the distribution, less so with more particles. N is the *effective* number of particles, and the covariance
+    is unbiased for it: where a few particles have all the weight, they say little about the spread, and the kernel is
+    wide. Where one alone has it, the covariance of all particles is taken, as if their weights were equal.
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
