@@ -45,6 +45,9 @@ class ParticleFilter(Filter):
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
+        jitter: regularised particle filter: the copies that resampling makes are moved apart by a Gaussian kernel of
+            this many times the usual width, see :func:`~torch_denkf.functional.jitter_copies`. For motions with little
+            noise of their own, or none.
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
@@ -89,6 +92,7 @@ class ParticleFilter(Filter):
         alpha: float = 0.05,
         epsilon: float = 0.05,
         ess_threshold: float | None = None,
+        jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
         observed_key: NestedKey = "observed",
@@ -112,6 +116,7 @@ class ParticleFilter(Filter):
                 alpha=alpha,
                 epsilon=epsilon,
                 ess_threshold=ess_threshold,
+                jitter=jitter,
                 observed_key=observed_key,
             )
         if unravel_key(transition.in_keys[1]) not in map(unravel_key, initial.out_keys):

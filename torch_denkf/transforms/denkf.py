@@ -16,6 +16,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters.base import where_rows
+from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
@@ -49,8 +50,10 @@ class DEnKFTransform(Transform):
         filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
             its ``initial`` belief.
         initial: the initial belief of a plain ``TensorDictSequential``.
+        lag: fixed-lag smoothing: beside the belief of t what is believed of t - lag, ``("smoothed", "mean")``,
+            ``("smoothed", "var")`` and what else :class:`~torch_denkf.smoothers.FixedLag` writes; ``None`` for none.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
-        store_ensemble: if ``False``, rollouts and collected data hold the belief's mean and variance alone; the
+        store_ensemble: if ``False``, rollouts and collected data hold means and variances alone; the
             ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
@@ -62,7 +65,8 @@ class DEnKFTransform(Transform):
             come from ``filter``.
 
     Raises:
-        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
+        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``, or cannot be
+            smoothed although there is a ``lag``.
         KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
@@ -82,6 +86,7 @@ class DEnKFTransform(Transform):
         filter: Filter | TensorDictSequential,
         *,
         initial: TensorDictModuleBase | None = None,
+        lag: int | None = None,
         diagnostics: Sequence[NestedKey] = (),
         store_ensemble: bool = True,
         no_grad: bool = True,
@@ -97,13 +102,15 @@ class DEnKFTransform(Transform):
             filter = Filter(*filter._module_iter(), initial=initial)
         elif initial is not None:
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
+        if lag is not None:
+            filter = FixedLag(filter, lag)
         self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
         unknown = [key for key in self._keep if key not in filter.out_keys]
         if unknown:
             raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(filter.out_keys)}.")
         structure = filter.structure
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
-        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var")]
+        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var", "age")]
         super().__init__(
             in_keys=list(structure.needed),
             out_keys=[key for key in self._keep if key not in dropped],
