@@ -121,7 +121,7 @@ def sweep(folder: Path) -> int:
         How many entries that were.
     """
     swept = 0
-    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+    with contextlib.suppress(OSError):
         for name in os.listdir(folder):
             if name.startswith(_WRITING):
                 with contextlib.suppress(OSError):

@@ -17,6 +17,7 @@ from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
+from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
 from torch_denkf.training.stage import Stage, only_trainable
@@ -299,23 +300,10 @@ class FilterTrainer(HookPoints):
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
                 file.unlink(missing_ok=True)
         else:
-            self._set_aside()
+            set_aside(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
         self._logs.open({})
         state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
         return {**state, "model": self._model_on_cpu()}
-
-    def _set_aside(self) -> None:
-        """Moves what a run left whose last checkpoint is missing: nobody can make it again."""
-        files = [*self.out.glob("best_*.pt"), *self._logs.files()]
-        if not files:
-            return
-        number = 1 + max((int(f.name.removeprefix("earlier-")) for f in self.out.glob("earlier-[0-9]*")), default=0)
-        aside = self.out / f"earlier-{number}"
-        for file in files:
-            place = aside / file.relative_to(self.out)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            file.rename(place)
-        _LOG.warning("%s has no last.pt, but other files of an earlier training: they are now in %s", self.out, aside)
 
     def _model_on_cpu(self) -> dict[str, torch.Tensor]:
         return {name: tensor.detach().cpu().clone() for name, tensor in self.model.state_dict().items()}
