@@ -84,6 +84,8 @@ class CompiledSteps:
                 carry, values = (tuple(value.clone() for value in part) for part in (carry, values))
             outputs.append(values)
             begin += length
+        if len(outputs) == 1:
+            return dict(zip(keep, outputs[0], strict=True))
         columns = zip(*outputs, strict=True)
         return {key: torch.cat(values, time) for key, values in zip(keep, columns, strict=True)}
 
