@@ -9,7 +9,8 @@ from typing import Unpack
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 
 __all__ = ["GaussianFilter", "GaussianOptions"]
 

@@ -11,7 +11,8 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,

@@ -9,7 +9,8 @@ from typing import Any, Unpack
 import torch
 from tensordict import NestedKey
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 
 __all__ = ["KalmanFilter"]

@@ -9,7 +9,8 @@ from typing import Literal, Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
     GaussianLikelihood,
     NoisyTransition,

@@ -303,15 +303,34 @@ def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey
         may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
         must = [key for key in map(unravel_key, module.in_keys) if key not in may]
         return list(dict.fromkeys(must)), list(dict.fromkeys(may))
+    return reads_of(part for _, part in named_modules_of(module))
+
+
+def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What modules must find that run one after the other, and what they use where it is there."""
     needed: dict[NestedKey, None] = {}
     optional: dict[NestedKey, None] = {}
     made: set[NestedKey] = set()
-    for _, part in named_modules_of(module):
-        must, may = reads(part)
+    for module in modules:
+        must, may = reads(module)
         needed.update((key, None) for key in must if key not in made)
         optional.update((key, None) for key in may if key not in made)
-        made.update(map(unravel_key, part.out_keys))
+        made.update(writes(module))
     return list(needed), [key for key in optional if key not in needed]
+
+
+def writes(module: TensorDictModuleBase) -> list[NestedKey]:
+    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
+    return list(dict.fromkeys(unravel_key(key) for part in in_sequences(module) for key in part.out_keys))
+
+
+def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
+    """The module, or those of a plain sequence."""
+    if type(module) is TensorDictSequential:
+        for _, part in named_modules_of(module):
+            yield from in_sequences(part)
+    else:
+        yield module
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:

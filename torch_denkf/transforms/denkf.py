@@ -14,7 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
-from torch_denkf.filters.base import where_rows
+from torch_denkf.filters._steps import where_rows
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
