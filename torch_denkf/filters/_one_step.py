@@ -94,9 +94,9 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
 
 def take_step(filter: Filter, entries: Entries, batch_size: torch.Size) -> Entries:
     """See :meth:`Filter.take_step`."""
-    steps = filter.steps()
+    structure, steps = filter.structure, filter.steps()  # in this order: the first sorts replaced modules anew
     if filter.compiled is not None:
-        drawn = draw_noise(filter, entries, batch_size, filter.structure.modules)
+        drawn = draw_noise(filter, entries, batch_size, structure.modules)
         if drawn is not None:
             written = filter.compiled.step(steps, {**entries, **drawn}, batch_size)
             look_at_ceiling(steps, written)

@@ -60,6 +60,7 @@ def filter_sequence(
             "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
             f"batch_size {list(size)}."
         )
+    filter.structure  # noqa: B018 - sorts the modules anew where one has been replaced
     keep = list(filter.out_keys) if keep is None else [unravel_key(key) for key in keep]
     unknown = [key for key in keep if key not in filter.out_keys]
     if unknown:

@@ -3,7 +3,7 @@
 Inductor puts all loops between two calls of the library into one function. Where small products are written out, that
 is a whole chunk of steps: tens of thousands of lines, with memory of its own for each number on the way. With one
 function for each loop nest, the same function serves every step of the chunk, and the memory of one step serves the
-next. This compiles sooner, and less memory has to be asked for, which takes as long as to compute in such small steps.
+next. Short functions compile sooner. And in steps this small, allocating memory takes as long as computing.
 """
 
 from __future__ import annotations
