@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from math import sqrt
 from typing import TYPE_CHECKING
@@ -11,36 +10,30 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
+from torch_denkf.filters._said import say_once
 from torch_denkf.modules._base import Entries
 
 if TYPE_CHECKING:
-    from torch_denkf.filters._steps import Steps
+    from torch_denkf.filters.base import Filter
 
-__all__ = ["SayOnce", "hold_variances", "look_at_ceiling"]
+__all__ = ["hold_variances", "look_at_ceiling", "say_ceiling"]
 
 #: The mean is held within so many of the largest standard deviations that a variance ceiling allows.
 _FARTHEST = 1000.0
 
 
-class SayOnce:
-    """Warns that a variance is held at the ceiling, once."""
-
-    def __init__(self) -> None:
-        self.said = False
-
-    def __call__(self, key: NestedKey, ceiling: float) -> None:
-        """Warns about the variance ``key``."""
-        if not self.said:
-            self.said = True
-            warnings.warn(
-                f"The variance in {key!r} has reached variance_ceiling={ceiling:g} and is held there: "
-                "nothing observes what grows. Said once.",
-                stacklevel=2,
-            )
+def say_ceiling(filter: Filter, key: NestedKey) -> None:
+    """Warns that the variance ``key`` is held at the ceiling, once."""
+    say_once(
+        filter,
+        "ceiling",
+        f"The variance in {key!r} has reached variance_ceiling={filter.variance_ceiling:g} and is held there: "
+        "nothing observes what grows.",
+    )
 
 
 def hold_variances(
-    written: Entries, belief: Iterable[NestedKey], ceiling: float, say: Callable[[NestedKey, float], None]
+    written: Entries, belief: Iterable[NestedKey], ceiling: float, say: Callable[[NestedKey], None]
 ) -> None:
     """Holds the variances at the ceiling, in place of the entries ``written``; the correlations stay.
 
@@ -48,7 +41,7 @@ def hold_variances(
         written: what a step wrote; changed.
         belief: keys of the belief.
         ceiling: largest variance, in the state's units squared.
-        say: told which variance is held, and at what.
+        say: told which variance is held.
     """
     for key in _variances(belief):
         variance = written.get(key)
@@ -58,7 +51,7 @@ def hold_variances(
         if exceeded is False:
             continue
         if exceeded:
-            say(key, ceiling)
+            say(key)
         prefix, farthest = key[:-1], _FARTHEST * sqrt(ceiling)
         mean_key = (*prefix, "mean")
         mean = written.get(mean_key)
@@ -80,14 +73,14 @@ def hold_variances(
             written[*prefix, "ensemble"] = torch.where(same, ensemble, limited)
 
 
-def look_at_ceiling(steps: Steps, written: Entries) -> None:
+def look_at_ceiling(filter: Filter, written: Entries) -> None:
     """Says whether a variance is held at the ceiling, where a compiled graph could not."""
-    if steps.ceiling is None or steps.say.said or torch.compiler.is_compiling():
+    if filter.variance_ceiling is None or "ceiling" in filter._said or torch.compiler.is_compiling():
         return
-    for key in _variances(steps.structure.belief):
+    for key in _variances(filter.structure.belief):
         value = written.get(key)
-        if value is not None and not value.is_cuda and (value >= 0.999 * steps.ceiling).any():
-            steps.say(key, steps.ceiling)
+        if value is not None and not value.is_cuda and (value >= 0.999 * filter.variance_ceiling).any():
+            say_ceiling(filter, key)
 
 
 def _variances(belief: Iterable[NestedKey]) -> list[NestedKey]:

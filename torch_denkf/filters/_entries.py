@@ -22,6 +22,7 @@ def of_one_robot(filter: Filter, tensordict: TensorDictBase | Mapping[str, Any])
         return tensordict
     like = filter.like()
     out = TensorDict(dict(tensordict), batch_size=[])
+    out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
     if like is None:
         return out
     return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))

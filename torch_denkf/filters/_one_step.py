@@ -18,6 +18,7 @@ from torch_denkf.filters._checks import (
 )
 from torch_denkf.filters._entries import write
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._said import say_eager, say_ignored_mask, say_up_to_date
 from torch_denkf.filters._slices import starts_of
 from torch_denkf.filters._steps import blank
 from torch_denkf.filters._structure import KNOWN, previous_key, submodels
@@ -37,6 +38,11 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
     entries = filter.entries_of(tensordict, one_step=True)
     check_inputs(filter, entries, tensordict, without)
     if without:
+        say_eager(
+            filter,
+            "predict() and step(without=...) leave readings out.",
+            "Hide what is missing with a mask instead, which keeps the step compiled.",
+        )
         call, steps, missing = Call(tensordict.batch_size), filter.steps(), set(without)
         written = steps.frames(entries, call, missing)
         written.update(steps.advance({**entries, **written}, call, missing=missing))
@@ -44,6 +50,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
         if lost:
             raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
     else:
+        say_ignored_mask(filter, tensordict)
         written = filter.take_step(entries, tensordict.batch_size)
     if filter.check_finite and not torch.compiler.is_compiling():
         refuse_non_finite(structure, entries, written)
@@ -71,6 +78,8 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
         if previous_key(key) in entries:
             entries[key] = entries[previous_key(key)]
     check_inputs(filter, entries, tensordict)
+    say_ignored_mask(filter, tensordict)
+    say_up_to_date(filter, entries[structure.carry[0]])
     reset, known = starts_of(tensordict, filter.init_key, step=True), entries.get(KNOWN)
     if known is not None:
         known = known.reshape(*tensordict.batch_size, 1)
@@ -99,7 +108,7 @@ def take_step(filter: Filter, entries: Entries, batch_size: torch.Size) -> Entri
         drawn = draw_noise(filter, entries, batch_size, structure.modules)
         if drawn is not None:
             written = filter.compiled.step(steps, {**entries, **drawn}, batch_size)
-            look_at_ceiling(steps, written)
+            look_at_ceiling(filter, written)
             return written
     call = Call(batch_size)
     written = steps.frames(entries, call)
@@ -114,16 +123,18 @@ def initial_belief(filter: Filter, entries: Entries, call: Call) -> Entries:
     return summaries(run_module(filter.initial, hidden, call.part("initial")), belief)
 
 
-def first_belief(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
+def first_belief(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey]) -> TensorDictBase:
     """See :meth:`Filter.initialise`."""
     entries, call, structure = filter.entries_of(tensordict), Call(tensordict.batch_size), filter.structure
+    missing = set(refuse_unknown_readings(structure, without))
     frame_keys, written = set(structure.frame_keys), {}
     if filter.update_at_reset or not frame_keys.isdisjoint(chain(*reads(filter.initial))):
-        written = filter.steps().frames(entries, call)
+        written = filter.steps().frames(entries, call, missing)
         entries.update(written)
-    start = filter.initial_belief(entries, call)
+    entries = {key: value for key, value in entries.items() if key not in missing}
+    start = filter.initial_belief(entries, call._replace(missing=frozenset(missing)))
     if filter.update_at_reset:
-        written.update(filter.steps().first(entries, call, start, in_sequence=False))
+        written.update(filter.steps().first(entries, call, start, in_sequence=False, missing=missing))
     else:
         written.update(start)
         written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})

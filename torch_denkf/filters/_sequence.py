@@ -14,6 +14,7 @@ from torch_denkf.filters._ceiling import look_at_ceiling
 from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
 from torch_denkf.filters._entries import write
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._said import say_ignored_mask
 from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.filters._steps import Steps, blank
 from torch_denkf.filters._structure import KNOWN, Structure, previous_key
@@ -69,7 +70,7 @@ def filter_sequence(
     rows, new = as_rows(tensordict, new)
     outputs = filter_rows(filter, rows, new, detach_every, keep)
     if filter.compiled is not None:
-        look_at_ceiling(filter.steps(), outputs)
+        look_at_ceiling(filter, outputs)
     if rows is not tensordict:
         outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
     write(tensordict, {key: outputs[key] for key in keep})
@@ -103,6 +104,7 @@ def filter_rows(
     structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
     entries, call = filter.entries_of(rows), Call(size, time=True)
     check_inputs(filter, entries, rows, carry=False)
+    say_ignored_mask(filter, rows)
     with set_recurrent_mode(True):  # for modules that are not this package's
         frames = filter.steps().frames(entries, call)
     entries.update(frames)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
-from torch_denkf.filters._ceiling import SayOnce, hold_variances
+from torch_denkf.filters._ceiling import hold_variances
 from torch_denkf.filters._structure import Placed, Structure, previous_key
 from torch_denkf.modules._base import Call, Entries, SubModel, named_modules_of, run_module
 
@@ -36,7 +36,7 @@ class Steps(NamedTuple):
     structure: Structure
     update_at_reset: bool
     ceiling: float | None
-    say: SayOnce
+    say: Callable[[NestedKey], None]
 
     def run(
         self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
@@ -102,7 +102,15 @@ class Steps(NamedTuple):
                 entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
         return self._update(entries, written, call, reset, start, missing)
 
-    def first(self, entries: Entries, call: Call, start: Entries, *, in_sequence: bool = True) -> Entries:
+    def first(
+        self,
+        entries: Entries,
+        call: Call,
+        start: Entries,
+        *,
+        in_sequence: bool = True,
+        missing: set[NestedKey] | None = None,
+    ) -> Entries:
         """The first step of a sequence: its belief is ``start``; the update is made if that is to see its frame."""
         structure = self.structure
         entries = {**entries, **{key: start[key] for key in structure.carry}}
@@ -111,7 +119,7 @@ class Steps(NamedTuple):
             out = self.run([structure.transition], entries, call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
-        return self._update(entries, forecast, call, every, start, None)
+        return self._update(entries, forecast, call, every, start, missing)
 
     def _update(
         self,
@@ -192,9 +200,8 @@ def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
     """What a module writes where its reading is missing; nothing if it does not know."""
     readings = set(getattr(module, "reading_keys", ()))
-    if not isinstance(module, SubModel) or not readings:
+    if not isinstance(module, SubModel) or not readings or not hasattr(module, "without_reading"):
         return {}
     values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
     values += [entries.get(key) for key in module.optional_keys]
-    out = module.without_reading(*values)
-    return dict(zip(module.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))
+    return module.by_key(module.without_reading(*values), "without_reading")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -23,7 +24,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torch_denkf.filters import _one_step
-from torch_denkf.filters._ceiling import SayOnce
+from torch_denkf.filters._ceiling import say_ceiling
 from torch_denkf.filters._checks import refuse_two_precisions
 from torch_denkf.filters._compiled import CompiledSteps
 from torch_denkf.filters._entries import entries_of, of_one_robot
@@ -109,7 +110,7 @@ class Filter(TensorDictSequential):
         self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
         self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
         self.compiled: CompiledSteps | None = None
-        self._say_ceiling = SayOnce()
+        self._said: set[str] = set()
         refuse_two_precisions(self)
         self._sort()
 
@@ -182,7 +183,9 @@ class Filter(TensorDictSequential):
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it gives eagerly, up
-        to rounding. Steps stay eager where the size of a noise is not known in advance, and on a policy's data.
+        to rounding. Calls stay eager where the size of a noise is not known in advance, and in :meth:`predict` and
+        ``step(without=...)``, which would compile anew for each reading that is lost; a warning says so once. On a
+        policy's data they stay eager, too.
 
         Args:
             chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
@@ -215,7 +218,8 @@ class Filter(TensorDictSequential):
 
         Args:
             tensordict: carry, frame, and what else the modules read; the new belief is written there. A dictionary of
-                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision.
+                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision; a number is an entry
+                ``[1]``.
             without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
                 out, and the belief is the forecast unless another sensor has something to say.
 
@@ -236,9 +240,20 @@ class Filter(TensorDictSequential):
         """What one step writes where ``entries`` are, compiled or not; nothing is checked."""
         return _one_step.take_step(self, entries, batch_size)
 
-    def initialise(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
-        return _one_step.first_belief(self, of_one_robot(self, tensordict))
+    def initialise(
+        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
+    ) -> TensorDictBase:
+        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
+
+        Args:
+            tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
+            without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
+                its prior.
+
+        Raises:
+            KeyError: if an entry is missing, or ``without`` names what no module reads.
+        """
+        return _one_step.first_belief(self, of_one_robot(self, tensordict), without)
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
@@ -288,7 +303,7 @@ class Filter(TensorDictSequential):
     def steps(self, update_at_reset: bool | None = None) -> Steps:
         """What one step does, on entries; ``update_at_reset`` as the filter's by default."""
         update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
-        return Steps(self._structure, update_at_reset, self.variance_ceiling, self._say_ceiling)
+        return Steps(self._structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self))
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
         """What the modules may read, as far as it is there; for ``one_step`` not what starts a sequence."""
