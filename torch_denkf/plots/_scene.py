@@ -91,7 +91,7 @@ class Scene:
         for axes in self.bands:
             label = axes.yaxis.label
             room = axes.get_window_extent().height / max(label.get_window_extent().height, 1)
-            label.set_fontsize(label.get_fontsize() * min(1.0, room))
+            label.set_fontsize(float(label.get_fontsize()) * min(1.0, room))
 
     def _picture(self) -> np.ndarray:
         self.canvas.draw()
