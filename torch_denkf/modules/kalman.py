@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
-from torch_denkf.modules._base import SubModel, run_module
+from torch_denkf.modules._base import Call, Entries, SubModel, run_module
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._tensors import as_floating, register_constant
 
@@ -133,6 +133,10 @@ class LinearTransition(SubModel):
 
     def on_entries(self, entries, call):
         """The forecast."""
+        return self.with_cross(entries, call)[0]
+
+    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
+        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         noise = self.noise
         constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
@@ -143,7 +147,8 @@ class LinearTransition(SubModel):
         if not isinstance(noise, torch.Tensor):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
             forecast_cov = forecast_cov + as_covariance(written[unravel_key(noise.out_keys[0])], mean)
-        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
+        cross = cov @ self.matrix.mT if wanted else None
+        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, cross
 
 
 class KalmanAnalysis(SubModel):
