@@ -126,7 +126,8 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
     # () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = ConstantNoise(0.1 * scale, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step beside their commands, before training
+    wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
         sensor=ImageSensor(
@@ -183,7 +184,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
         return interval_coverage(beliefs["mean"], beliefs["var"], runs["state"], level=0.9).mean()
 
     noises = [module for module in denkf.modules() if isinstance(module, ScaledNoise)]
-    candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
+    candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.4, 2.8, 3.3, 4.0)
     factor = choose_for_coverage(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], coverage)
     print(f"noise times {factor}, chosen on {len(held_out.episodes)} episodes that the sensor has not seen")
 
