@@ -1,6 +1,7 @@
 """Damaged drives in KITTI's layout: refused by file and line, or kept as far as they are sound, and counted."""
 
 import math
+import re
 import time
 import warnings
 
@@ -35,11 +36,11 @@ def change(root, name, row, text):
 
 
 def set_times(root, times):
-    (root / TIMES).write_text("".join(f"{value!r}\n" for value in times))
+    (root / TIMES).write_text("".join(f"{float(value)!r}\n" for value in times))
 
 
 def refuses(root, *words):
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match=re.escape(words[0])) as caught:
         read(root)
     missing = [word for word in words if word not in str(caught.value)]
     assert not missing, str(caught.value)
@@ -189,10 +190,9 @@ def test_rendering_refuses_what_it_cannot_lay_out(tmp_path, distance):
     rows = [f"1 0 0 0 0 1 0 0 0 0 1 {k * distance / 2:.9g}" for k in range(3)]
     (tmp_path / "poses/00.txt").write_text("\n".join(rows))
     begun = time.monotonic()
-    with pytest.raises(
-        ValueError, match=rf"poses/00.txt is {distance:g} m long, .*rows 1 and 2; .*50000 m at most".replace("+", r"\+")
-    ):
+    with pytest.raises(ValueError, match=r"poses/00.txt is \d+ m long, .*rows 1 and 2; .*50000 m at most") as caught:
         render_drives(tmp_path / "out", poses=tmp_path / "poses")
+    assert f"{distance:g} m long" in str(caught.value)
     assert time.monotonic() - begun < 2
     assert not (tmp_path / "out").exists()
     (tmp_path / "poses/00.txt").write_text("\n".join(f"1 0 0 0 0 1 0 0 0 0 1 {k}e7" for k in range(3)))
