@@ -11,7 +11,7 @@ import torch
 
 from tests.data.kitti.test_drive import make
 from torch_denkf.data import bridge_gaps, frames_at, read_kitti_drive, render_drives, with_motion
-from torch_denkf.data.kitti.clock import increasing
+from torch_denkf.data.times import increasing
 from torch_denkf.envs import KITTIReplayEnv
 
 ROWS = 20

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from bisect import bisect_left
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from torch_denkf._checks import read_lines
+from torch_denkf.data.times import MOST_WRONG, filled, sound
 from torch_denkf.vision.poses import KITTI_DT
 
-__all__ = ["GAP", "Times", "increasing", "read_times"]
+__all__ = ["GAP", "Times", "read_times"]
 
 GAP = 1.5  # a step that is longer, in median steps, is a gap: no image pair reaches over it
-STILL = 0.1  # a step that is shorter, in median steps, is none: the stamp was written twice
 SHORTEST, LONGEST = 1e-5, 1e4  # s between frames: beyond, the times are not in seconds
-MOST_WRONG = 0.1  # a share of times that do not increase, up to which the others are trusted
 
 
 class Times(NamedTuple):
@@ -61,8 +59,8 @@ def read_times(file: Path, rows: int) -> Times:
     if len(lines) < rows:
         raise ValueError(f"{file} has {len(lines)} times, but there are {rows} posed frames; add the missing rows")
     times = np.array([_seconds(file, number, line) for number, line in enumerate(lines, start=1)])
-    sound = _sound(times)
-    wrong = np.flatnonzero(~sound)
+    good = sound(times)
+    wrong = np.flatnonzero(~good)
     if len(wrong) > MOST_WRONG * len(times):
         raise ValueError(
             f"{file}:{wrong[0] + 1}: the time {times[wrong[0]]:g} s does not increase, nor do {len(wrong) - 1} others "
@@ -75,8 +73,8 @@ def read_times(file: Path, rows: int) -> Times:
             f"({times[wrong[0]]:g} s); their frames count as missing (frame_valid False)",
             stacklevel=5,
         )
-        times = _filled(times, sound)
-    return _with_steps(file, times, sound, rows)
+        times = filled(times, good, KITTI_DT)
+    return _with_steps(file, times, good, rows)
 
 
 def _seconds(file: Path, number: int, line: str) -> float:
@@ -91,19 +89,9 @@ def _seconds(file: Path, number: int, line: str) -> float:
     return value
 
 
-def _filled(times: np.ndarray, sound: np.ndarray) -> np.ndarray:
-    """The times with those that are not sound on straight lines between the others, and beyond these."""
-    index, good = np.arange(len(times)), np.flatnonzero(sound)
-    filled = np.interp(index, good, times[good])
-    step = np.median(np.diff(times[good]) / np.diff(good)) if len(good) > 1 else KITTI_DT
-    filled[: good[0]] -= step * (good[0] - index[: good[0]])
-    filled[good[-1] + 1 :] += step * (index[good[-1] + 1 :] - good[-1])
-    return filled
-
-
-def _with_steps(file: Path, times: np.ndarray, sound: np.ndarray, rows: int) -> Times:
+def _with_steps(file: Path, times: np.ndarray, good: np.ndarray, rows: int) -> Times:
     if len(times) < 2:
-        return Times(times, np.full(len(times), KITTI_DT), sound, KITTI_DT)
+        return Times(times, np.full(len(times), KITTI_DT), good, KITTI_DT)
     steps = np.diff(times)
     median = float(np.median(steps))
     if not SHORTEST <= median <= LONGEST:
@@ -124,45 +112,4 @@ def _with_steps(file: Path, times: np.ndarray, sound: np.ndarray, rows: int) -> 
             f"each {median:g} s; speeds there are means over the gap, and no image pair reaches over it",
             stacklevel=6,
         )
-    return Times(times[:rows], dt[:rows], sound[:rows], median)
-
-
-def _sound(times: np.ndarray) -> np.ndarray:
-    """Stamps that increase, and not by next to nothing."""
-    sound = increasing(times)
-    good = np.flatnonzero(sound)
-    steps = np.diff(times[good])
-    if len(steps):
-        sound[good[1:][steps < STILL * np.median(steps)]] = False
-    return sound
-
-
-def increasing(times: np.ndarray) -> np.ndarray:
-    """Which values belong to the longest strictly increasing sub-sequence, bool ``[N]``.
-
-    One value that is too small, or too large, is the only one left out; a rule that compares with what came before
-    would leave out all that follow a value that is too large. Where both leave out as many, it is the later ones.
-
-    Examples:
-        >>> increasing(np.array([0.0, 1.0, 9.0, 2.0, 2.0, 3.0])).tolist()
-        [True, True, False, True, False, True]
-    """
-    ends: list[float] = []  # the least end of an increasing sub-sequence, by its length
-    last: list[int] = []  # where that end is
-    before = np.full(len(times), -1)
-    for index, value in enumerate(times.tolist()):
-        length = bisect_left(ends, value)
-        before[index] = last[length - 1] if length else -1
-        if length == len(ends):
-            ends.append(value)
-            last.append(index)
-        elif value < ends[length]:
-            ends[length], last[length] = value, index
-    keep = np.zeros(len(times), bool)
-    index = last[-1] if last else -1
-    while index >= 0:
-        keep[index] = True
-        index = int(before[index])
-    ahead = np.ones(len(times), bool)
-    ahead[1:] = times[1:] > np.maximum.accumulate(times)[:-1]
-    return ahead if ahead.sum() == keep.sum() else keep
+    return Times(times[:rows], dt[:rows], good[:rows], median)
