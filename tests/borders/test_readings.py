@@ -194,6 +194,23 @@ def test_a_step_refuses_with_the_key(name, value):
     assert filter.step(td)["belief", "mean"].isfinite().all()
 
 
+@pytest.mark.parametrize("name", ["Kalman", "etkf", "systematic"])
+def test_readings_that_no_step_uses_may_be_anything(name):
+    """Left out of a step, or of a reset that does not look at them."""
+    _, key, _ = FILTERS[name]
+    filter = make(name)
+    td = filter.initialise(TensorDict({key: torch.full((3, 2), torch.nan)}, [3]))
+    assert filter.predict(td.clone())["belief", "mean"].isfinite().all()
+    assert filter.step(td.clone(), without=[key])["belief", "mean"].isfinite().all()
+    env = TransformedEnv(base_env(missing=1.0, batch_size=[2]), ExcludeTransform("observed"))
+    env.append_transform(DEnKFTransform(make(name)))
+    td = env.reset()
+    assert td[key].isnan().all()
+    assert td["belief", "mean"].isfinite().all()
+    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+        env.step(env.rand_action(td))
+
+
 @pytest.mark.parametrize("name", ["Kalman", "etkf", "sensor", "systematic", "LSTM"])
 def test_compiled_steps_and_sequences(name):
     """Through dynamo: one graph without a branch."""

@@ -52,7 +52,8 @@ def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[Ne
     for mask, sharing in readers.items():
         whole: dict[NestedKey, None] = {}
         components: dict[NestedKey, None] = {}
-        by_component = len(sharing) == 1 and getattr(sharing[0], "reads_components", False)
+        same = len({tuple(map(unravel_key, _readings(part))) for part in sharing}) == 1
+        by_component = same and all(getattr(part, "reads_components", False) for part in sharing)
         for key in (unravel_key(key) for part in sharing for key in _readings(part)):
             for source in sources.get(key, ()):
                 (components if by_component and source == key else whole)[source] = None

@@ -307,7 +307,8 @@ class Filter(TensorDictSequential):
         else:
             written = self.take_step(entries, tensordict.batch_size)
         if self.check_finite and not torch.compiler.is_compiling():
-            refuse_non_finite(self.structure, entries, written, self.reject)
+            used = {key: value for key, value in entries.items() if key not in without} if without else entries
+            refuse_non_finite(self.structure, used, written, self.reject)
         write(tensordict, written)
         return tensordict
 

@@ -189,7 +189,8 @@ class DEnKFTransform(Transform):
                 start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
             start = self.filter.summarise(start)
         if self.check_finite:
-            self._assert_finite(_present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys)))
+            entries = _present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys))
+            self._assert_finite(entries, used=self.filter.update_at_reset)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(key))
         return tensordict_reset
@@ -226,9 +227,10 @@ class DEnKFTransform(Transform):
             else:
                 target.set(key, value)
 
-    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor]) -> None:
+    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
+        """Raises where the belief is not finite, or a reading that was ``used`` is not."""
         finite = all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys)
-        absurd = [] if self._reject else rejected_keys(self.filter.structure.guards, entries)
+        absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:
             return
         given = {key: entries[key] for key in self.in_keys if key in entries}
