@@ -44,6 +44,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
             "Hide what is missing with a mask instead, which keeps the step compiled.",
         )
         call, steps, missing = Call(tensordict.batch_size), filter.steps(), set(without)
+        entries = steps.usable({key: value for key, value in entries.items() if key not in missing}, call)
         written = steps.frames(entries, call, missing)
         written.update(steps.advance({**entries, **written}, call, missing=missing))
         lost = [key for key in structure.carry if key in structure.step_keys and key not in written]
@@ -53,7 +54,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
         say_ignored_mask(filter, tensordict)
         written = filter.take_step(entries, tensordict.batch_size)
     if filter.check_finite and not torch.compiler.is_compiling():
-        refuse_non_finite(structure, entries, written)
+        refuse_non_finite(structure, entries, written, filter.reject)
     write(tensordict, written)
     return tensordict
 
@@ -88,6 +89,7 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     if reset is None:
         written = filter.take_step(entries, tensordict.batch_size)
     else:
+        entries = steps.usable(entries, call)
         written = steps.frames(entries, call)
         entries.update(written)
         start = filter.initial_belief(entries, call)
@@ -101,9 +103,12 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict
 
 
-def take_step(filter: Filter, entries: Entries, batch_size: torch.Size) -> Entries:
+def take_step(filter: Filter, entries: Entries, batch_size: torch.Size, reject: bool | None = None) -> Entries:
     """See :meth:`Filter.take_step`."""
-    structure, steps = filter.structure, filter.steps()  # in this order: the first sorts replaced modules anew
+    structure, steps = (
+        filter.structure,
+        filter.steps(reject=reject),
+    )  # in this order: the first sorts replaced modules anew
     if filter.compiled is not None:
         drawn = draw_noise(filter, entries, batch_size, structure.modules)
         if drawn is not None:
@@ -111,6 +116,7 @@ def take_step(filter: Filter, entries: Entries, batch_size: torch.Size) -> Entri
             look_at_ceiling(filter, written)
             return written
     call = Call(batch_size)
+    entries = steps.usable(entries, call)
     written = steps.frames(entries, call)
     written.update(steps.advance({**entries, **written}, call))
     return written
@@ -123,18 +129,21 @@ def initial_belief(filter: Filter, entries: Entries, call: Call) -> Entries:
     return summaries(run_module(filter.initial, hidden, call.part("initial")), belief)
 
 
-def first_belief(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey]) -> TensorDictBase:
-    """See :meth:`Filter.initialise`."""
+def first_belief(
+    filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey] = (), reject: bool | None = None
+) -> TensorDictBase:
+    """See :meth:`Filter.initialise`; ``reject`` as the filter's."""
     entries, call, structure = filter.entries_of(tensordict), Call(tensordict.batch_size), filter.structure
-    missing = set(refuse_unknown_readings(structure, without))
+    missing, steps = set(refuse_unknown_readings(structure, without)), filter.steps(reject=reject)
+    entries = steps.usable(entries, call)
     frame_keys, written = set(structure.frame_keys), {}
     if filter.update_at_reset or not frame_keys.isdisjoint(chain(*reads(filter.initial))):
-        written = filter.steps().frames(entries, call, missing)
+        written = steps.frames(entries, call, missing)
         entries.update(written)
     entries = {key: value for key, value in entries.items() if key not in missing}
     start = filter.initial_belief(entries, call._replace(missing=frozenset(missing)))
     if filter.update_at_reset:
-        written.update(filter.steps().first(entries, call, start, in_sequence=False, missing=missing))
+        written.update(steps.first(entries, call, start, in_sequence=False, missing=missing))
     else:
         written.update(start)
         written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})

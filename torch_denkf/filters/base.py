@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf._checks import check_number
 from torch_denkf.filters import _one_step
 from torch_denkf.filters._ceiling import say_ceiling
 from torch_denkf.filters._checks import refuse_two_precisions
@@ -72,7 +73,11 @@ class Filter(TensorDictSequential):
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
         variance_ceiling: the belief's variances are held at it, so that an unstable system that nobody observes stays
             finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether :meth:`step` raises where the new belief is not finite.
+        check_finite: whether :meth:`step` raises where a reading or the new belief is not finite, or a reading is
+            larger than 1e18 in whatever unit. A sequence does not raise: NaN goes on to the end of it.
+        reject: whether such readings count as not observed, in steps, sequences, compiled and packaged, and
+            ``("info", "rejected")`` ``[*B, 1]`` counts them: each component of a vector that an update reads itself,
+            and one for all that a sensor reads. What shares a mask is rejected together.
 
     Raises:
         ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
@@ -100,6 +105,7 @@ class Filter(TensorDictSequential):
         forecast_keys: Mapping[NestedKey, NestedKey] | None = None,
         variance_ceiling: float | None = 1e12,
         check_finite: bool = True,
+        reject: bool = False,
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
             modules = (OrderedDict(modules[0]),)
@@ -108,7 +114,9 @@ class Filter(TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
-        self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
+        if variance_ceiling is not None:
+            check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
+        self.variance_ceiling, self.check_finite, self.reject = variance_ceiling, check_finite, reject
         self.compiled: CompiledSteps | None = None
         self._said: set[str] = set()
         refuse_two_precisions(self)
@@ -117,15 +125,17 @@ class Filter(TensorDictSequential):
     @property
     def structure(self) -> Structure:
         """The modules by what they read; found anew where one of them has been replaced."""
-        if self._sorted_for != (*all_modules(self), self.initial, *self.control_keys):
+        if self._sorted_for != (*all_modules(self), self.initial, *self.control_keys, self.reject):
             self._sort()
         return self._structure
 
     def _sort(self) -> None:
         """Sorts the modules, and says what they read and write."""
         structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
-        self._sorted_for, self._structure = (*all_modules(self), self.initial, *self.control_keys), structure
-        self.in_keys, self.out_keys = structure.in_keys(self.init_key), structure.out_keys
+        self._sorted_for = (*all_modules(self), self.initial, *self.control_keys, self.reject)
+        self._structure = structure
+        self.in_keys = structure.in_keys(self.init_key)
+        self.out_keys = [*structure.frame_keys, *self.steps().step_keys]
         self._all_keys = list(dict.fromkeys([*self.in_keys, *chain(*reads(self.initial))]))
         self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
 
@@ -228,7 +238,7 @@ class Filter(TensorDictSequential):
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
-            ValueError: if the new belief is not finite, and ``check_finite``.
+            ValueError: with ``check_finite``, if a reading or the new belief is not finite.
         """
         return _one_step.step(self, of_one_robot(self, tensordict), without)
 
@@ -236,9 +246,9 @@ class Filter(TensorDictSequential):
         """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does."""
         return _one_step.step_without_frame(self, of_one_robot(self, tensordict))
 
-    def take_step(self, entries: Entries, batch_size: torch.Size) -> Entries:
-        """What one step writes where ``entries`` are, compiled or not; nothing is checked."""
-        return _one_step.take_step(self, entries, batch_size)
+    def take_step(self, entries: Entries, batch_size: torch.Size, *, reject: bool | None = None) -> Entries:
+        """What one step writes where ``entries`` are, compiled or not, unchecked; ``reject`` as the filter's."""
+        return _one_step.take_step(self, entries, batch_size, reject)
 
     def initialise(
         self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
@@ -300,10 +310,11 @@ class Filter(TensorDictSequential):
         """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
-    def steps(self, update_at_reset: bool | None = None) -> Steps:
-        """What one step does, on entries; ``update_at_reset`` as the filter's by default."""
+    def steps(self, update_at_reset: bool | None = None, reject: bool | None = None) -> Steps:
+        """What one step does, on entries; ``update_at_reset`` and ``reject`` as the filter's by default."""
         update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
-        return Steps(self._structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self))
+        reject = self.reject if reject is None else reject
+        return Steps(self._structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self), reject)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
         """What the modules may read, as far as it is there; for ``one_step`` not what starts a sequence."""
