@@ -83,6 +83,7 @@ setup(
             "tyro",
             "pyarrow>=15",
             "av>=14",
+            "hypothesis",
             "pytest",
             "pytest-xdist",
             "ruff",

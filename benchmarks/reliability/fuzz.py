@@ -1,0 +1,90 @@
+"""The fuzz suite: damaged inputs at every border, and what comes of each."""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.arguments import some_of
+from benchmarks.reliability.case import Case, Verdict, judge
+
+__all__ = ["BORDERS", "Fuzz", "all_cases", "run"]
+
+#: Modules of benchmarks/reliability/borders.
+BORDERS = (
+    "filters_made",
+    "sub_models",
+    "filters_fed",
+)
+KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
+RESULTS = Path(__file__).parent / "results"
+
+
+def all_cases(borders: Sequence[str] = BORDERS) -> list[Case]:
+    """The damaged inputs, in an order of their own."""
+    return [case for name in borders for case in import_module(f"benchmarks.reliability.borders.{name}").cases()]
+
+
+def run(cases: Sequence[Case], progress: bool = True) -> list[tuple[Case, Verdict]]:
+    """Each case with its verdict."""
+    out, told = [], time.monotonic()
+    for number, case in enumerate(cases, start=1):
+        out.append((case, judge(case)))
+        if progress and (time.monotonic() - told > 10 or number == len(cases)):
+            counts = Counter(verdict.kind for _, verdict in out)
+            print(f"{number} of {len(cases)}: {dict(counts)}", flush=True)
+            told = time.monotonic()
+    return out
+
+
+def summary(judged: Sequence[tuple[Case, Verdict]]) -> dict[str, Any]:
+    """Counts of all, by border, and the cases that are neither clear nor right."""
+
+    def counts(kinds: Sequence[str]) -> dict[str, int]:
+        return {"records": len(kinds), **{kind: kinds.count(kind) for kind in KINDS}}
+
+    borders: dict[str, list[str]] = {}
+    for case, verdict in judged:
+        borders.setdefault(case.border, []).append(verdict.kind)
+    wrong = [
+        {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text}
+        for case, verdict in judged
+        if verdict.kind not in ("clear", "right")
+    ]
+    everything = counts([verdict.kind for _, verdict in judged])
+    return {**everything, "borders": {name: counts(kinds) for name, kinds in borders.items()}, "wrong": wrong}
+
+
+@dataclass(frozen=True)
+class Fuzz:
+    """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
+
+    sample: int = 0  # so many of the cases, drawn evenly; 0 for all
+    seed: int = 0  # of the sample
+    borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]  # where the inputs come in
+    match: str = ""  # only cases that have this in their names
+    out: Path = RESULTS / "fuzz.json"
+    smoke: bool = False  # a tiny run
+
+    def __call__(self) -> None:
+        """Runs the suite."""
+        began = time.time()
+        cases = [case for case in all_cases(self.borders) if self.match in f"{case.border} {case.name}"]
+        sample = self.sample or (20 if self.smoke else 0)
+        if sample:
+            cases = random.Random(self.seed).sample(cases, min(sample, len(cases)))
+        found = summary(run(cases))
+        found["seconds"] = round(time.time() - began)
+        for row in found["wrong"]:
+            print(f"{row['kind']}: {row['border']}: {row['case']}: {row['what']}")
+        print({kind: found[kind] for kind in ("records", *KINDS)})
+        if not self.smoke:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            self.out.write_text(json.dumps(found, indent=1) + "\n")
