@@ -22,6 +22,10 @@ BORDERS = (
     "filters_made",
     "sub_models",
     "filters_fed",
+    "kitti",
+    "lerobot",
+    "ur5",
+    "recordings",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 RESULTS = Path(__file__).parent / "results"
