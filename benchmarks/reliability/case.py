@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import torch_denkf
 
-__all__ = ["SECONDS", "Case", "Verdict", "judge"]
+__all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge"]
 
 Kind = Literal["clear", "right", "unclear", "silent", "hang", "crash"]
 
@@ -42,6 +42,8 @@ class Case:
         right: whether a result is right, as the sound part of the input tells; ``None`` where the input must be
             refused.
         within: s in which it must be over.
+        needs: makes what several cases start from, in a process of its own; called once, before the first of them.
+        slow: whether ``needs`` takes so long that small samples leave the case out.
     """
 
     border: str
@@ -50,6 +52,12 @@ class Case:
     act: Callable[[Path], Any]
     right: Callable[[Any], bool] | None = None
     within: float = SECONDS
+    needs: Callable[[], Any] | None = None
+    slow: bool = False
+
+
+class Refused(Exception):
+    """A command ended with a message."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +75,26 @@ class Verdict:
     text: str = ""
 
 
+def apart(work: Callable[[], Any]) -> None:
+    """Runs something in a forked process: what it imports, compiles or computes with threads stays there."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            work()
+            status = 0
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    _, status = os.waitpid(child, 0)
+    if status:
+        raise RuntimeError(f"{work} failed; see above")
+
+
 def judge(case: Case) -> Verdict:
     """Runs a case in a forked process, so that neither a crash nor a hang nor what it changes reaches another one."""
+    if case.needs is not None:
+        case.needs()
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     read, write = os.pipe()
     sys.stdout.flush()
@@ -144,7 +170,7 @@ def _of_error(case: Case, error: Exception) -> Verdict:
     """Clear, if raised in this library with a word of the case in it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-    ours = last.filename.startswith(LIBRARY)
+    ours = last.filename.startswith(LIBRARY) or isinstance(error, Refused)
     named = any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", message) for word in case.words)
     place = f"{Path(last.filename).name}:{last.lineno}"
     text = f"{type(error).__name__} at {place}: {' '.join(message.split())}"[:500]

@@ -26,6 +26,11 @@ BORDERS = (
     "lerobot",
     "ur5",
     "recordings",
+    "caches",
+    "checkpoints",
+    "packages",
+    "pretrained",
+    "commands",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 RESULTS = Path(__file__).parent / "results"
