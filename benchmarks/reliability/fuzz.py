@@ -31,6 +31,7 @@ BORDERS = (
     "packages",
     "pretrained",
     "commands",
+    "around",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 RESULTS = Path(__file__).parent / "results"

@@ -122,7 +122,7 @@ def _weights(change: Callable[[torch.Tensor], torch.Tensor | None]) -> Callable[
     """Changes one weight."""
 
     def act(content: dict) -> None:
-        name = next(name for name, value in content["model"].items() if value.is_floating_point())
+        name = next(name for name, value in content["model"].items() if value.is_floating_point() and value.ndim > 1)
         changed = change(content["model"][name])
         if changed is None:
             del content["model"][name]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case
+from benchmarks.reliability.case import Case, apart
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, same, same_but, written
 from torch_denkf.data import KITTIOdometryExperienceReplay, list_kitti_drives, read_kitti_drive, with_motion, write_drives
 
@@ -28,7 +28,7 @@ Change = Callable[[Path], Any]
 def sound() -> Path:
     """A rendered drive."""
     root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "kitti"
-    write_drives(root, [DRIVE], frames=FRAMES, size=SIZE)
+    apart(lambda: write_drives(root, [DRIVE], frames=FRAMES, size=SIZE))
     return root
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case
+from benchmarks.reliability.case import Case, apart
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, leaves, same, written
 from tests.data.recordings.own_files import SIZE, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video, recording_from_rows, write_trajectory
@@ -28,6 +28,11 @@ def sound() -> Path:
     """A table as CSV and as Parquet, a video, and a folder of images."""
     root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "own"
     root.mkdir()
+    apart(lambda: _write(root))  # OpenCV's threads are not to be forked
+    return root
+
+
+def _write(root: Path) -> None:
     time = np.arange(ROWS) / 10
     columns = {"time": time, "x": np.sin(time), "y": np.cos(time)}
     write_csv(root / "table.csv", **columns)
@@ -35,7 +40,6 @@ def sound() -> Path:
     write_csv(root / "stamps.csv", time=time)
     write_video(root / "run.mkv", ROWS)
     write_images(root / "images", [f"{k / 10:.1f}.png" for k in range(ROWS)])
-    return root
 
 
 def read(root: Path, *, camera: str = "", table: str = "table.csv", replay: Any = None, **options: Any) -> TensorDict:
