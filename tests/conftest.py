@@ -3,11 +3,24 @@
 ``pytest tests/filters/test_kalman.py --compiled`` puts all filters through ``torch.compile``.
 """
 
+import os
+import tempfile
+from pathlib import Path
+
 import pytest
 import torch
 
 from tests.filters.factories import has_compiler
 from torch_denkf.filters import Filter
+from torch_denkf.filters.inductor.libraries import clear_damaged_libraries
+
+# A cache of the tests' own, kept from one run to the next: what a killed run left unfinished harms nobody else.
+COMPILED = Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or f"{tempfile.gettempdir()}/torch_denkf_tests_{os.getuid()}")
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(COMPILED)
+
+
+def pytest_sessionstart():
+    clear_damaged_libraries(COMPILED)
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.ticker import MaxNLocator
 
 from benchmarks.common.plots import BAND, draw_band, plt, save
+from torch_denkf._files import replacing
 from torch_denkf.envs import UR5TableEnv
 
 STEP = 0.08  # s
@@ -132,7 +133,11 @@ def _strip(belief: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, int, 
 
 def _write_video(path: Path | str, frames: Iterable[np.ndarray]) -> None:
     """Writes RGB frames, one a step."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
+        _encode(beside, frames)
+
+
+def _encode(path: Path, frames: Iterable[np.ndarray]) -> None:
     try:
         import av
     except ImportError:  # it comes with the extra [lerobot] only

@@ -92,6 +92,10 @@ class CompiledSteps:
         modules = (*structure.frames, structure.transition, *structure.update)  # a part may be replaced
         kind = (*kind, modules, steps.update_at_reset, steps.ceiling, device)
         if kind not in self._functions:
+            if self.options.get("backend", "inductor") == "inductor":
+                from torch_denkf.filters.inductor import clear_damaged_libraries
+
+                clear_damaged_libraries()
             function = make()
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")

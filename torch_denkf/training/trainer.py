@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +13,7 @@ from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
@@ -21,6 +24,7 @@ from torch_denkf.training.update import Updates, seed_update
 
 __all__ = ["FilterTrainer"]
 
+_LOG = logging.getLogger("torch_denkf")
 _VALIDATION = 2**32 - 1  # the "stage" whose seed every validation starts from
 
 
@@ -37,7 +41,8 @@ class FilterTrainer(HookPoints):
     **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
-    outside of their ``state_dict``, and a sampler none at all.
+    outside of their ``state_dict``, and a sampler none at all. Where ``last.pt`` is missing, what else an earlier run
+    left is not overwritten: it is moved to ``out/earlier-1``. One process at a time trains in ``out``.
 
     **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
     another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
@@ -140,7 +145,7 @@ class FilterTrainer(HookPoints):
         """Trains to the end; where a checkpoint is, from there.
 
         Args:
-            resume: ``False`` removes what an earlier run left in ``out`` and starts anew.
+            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and starts anew.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
@@ -148,8 +153,15 @@ class FilterTrainer(HookPoints):
 
         Raises:
             ValueError: if the checkpoint is damaged, or of another training; the message names the file.
+            OSError: if another process trains in ``out``, or if it cannot be written to; names the folder and the
+                process, or the file and the free space.
             FloatingPointError: if too many updates in a row are not finite; names stage and update.
         """
+        alone = locked(self.out, ".training", "is training in it") if self.processes.is_main else nullcontext()
+        with alone:
+            return self._fit(resume)
+
+    def _fit(self, resume: bool) -> dict[str, dict[str, Any]]:
         state = self.processes.share(self._open(resume) if self.processes.is_main else {})
         self._load_model(state["model"], str(self.last_checkpoint))
         self._results, self._best = state["results"], state["best"]
@@ -276,11 +288,27 @@ class FilterTrainer(HookPoints):
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])
             self._logs.open(state["logs"])
             return state
-        for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
-            file.unlink(missing_ok=True)
+        if self.last_checkpoint.exists():  # the caller wants to start anew
+            for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
+                file.unlink(missing_ok=True)
+        else:
+            self._set_aside()
         self._logs.open({})
         state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
         return {**state, "model": self._model_on_cpu()}
+
+    def _set_aside(self) -> None:
+        """Moves what a run left whose last checkpoint is missing: nobody can make it again."""
+        files = [*self.out.glob("best_*.pt"), *self._logs.files()]
+        if not files:
+            return
+        number = 1 + max((int(f.name.removeprefix("earlier-")) for f in self.out.glob("earlier-[0-9]*")), default=0)
+        aside = self.out / f"earlier-{number}"
+        for file in files:
+            place = aside / file.relative_to(self.out)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            file.rename(place)
+        _LOG.warning("%s has no last.pt, but other files of an earlier training: they are now in %s", self.out, aside)
 
     def _model_on_cpu(self) -> dict[str, torch.Tensor]:
         return {name: tensor.detach().cpu().clone() for name, tensor in self.model.state_dict().items()}

@@ -199,7 +199,12 @@ def test_slices_and_caches(tmp_path):
         )
     assert len(open_all(tmp_path, batch_size=10, slice_len=5, strict_length=False).sample()) > 0
     (tmp_path / "file").write_text("")
-    fails(OSError, r"cannot write to .*file.* pass cache=FOLDER, or cache=None", tmp_path, cache=tmp_path / "file/x")
+    fails(
+        OSError,
+        r"cannot write the cache at .*file.* pass cache=FOLDER or cache=None",
+        tmp_path,
+        cache=tmp_path / "file/x",
+    )
 
 
 def test_damage_in_av1(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torch_denkf._files import replacing
 from torch_denkf.vision.poses import KITTI_DT
 
 
@@ -54,7 +55,8 @@ def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> n
 
 def write_poses(file: Path, poses: np.ndarray) -> None:
     """Write camera-to-world matrices ``[N, 3, 4]``, in metres, to a pose file."""
-    np.savetxt(file, poses.reshape(len(poses), 12), fmt="%.9e")
+    with replacing(file) as beside:
+        np.savetxt(beside, poses.reshape(len(poses), 12), fmt="%.9e")
 
 
 def read_times(file: Path, rows: int) -> tuple[np.ndarray, float]:

@@ -15,8 +15,10 @@ Source: github.com/huggingface/lerobot, ``lerobot.datasets``.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,8 @@ from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
 
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
+MOST_ROWS = 10**8  # of a data set: 38 days at 30 a second
+_WIDTH = re.compile(r"0?\d{0,2}d?")
 COMPLETE = "download the data set completely"
 
 
@@ -108,6 +112,7 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     if version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
+    stay_inside(root, f"images/{camera}", f"{file}, by the name of a camera,")
     if VERSIONS[version] == 2:
         episodes, meta = _episodes_of_version_2(root, info, camera)
     else:
@@ -115,6 +120,11 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
         raise ValueError(f"{root} has no episodes; {COMPLETE}")
+    rows = sum(episode.length for episode in episodes)
+    if rows > MOST_ROWS:
+        raise ValueError(
+            f"{root} announces {rows} rows, more than the {MOST_ROWS} that are read; its metadata are wrong"
+        )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
 
@@ -158,10 +168,9 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
             "episode_index": number,
             "video_key": camera,
         }
-        data = root / info["data_path"].format(**place)
-        episodes.append(
-            EpisodeFiles(number, length, data, root / info["video_path"].format(**place) if video else None, 0.0)
-        )
+        data = _inside(root, info["data_path"], place)
+        shown = _inside(root, info["video_path"], place) if video else None
+        episodes.append(EpisodeFiles(number, length, data, shown, 0.0))
     return episodes, [file]
 
 
@@ -180,10 +189,50 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
             shown, begin = None, 0.0
             if video:
                 place = {"video_key": camera, "chunk_index": entry[keys[4]], "file_index": entry[keys[5]]}
-                shown, begin = root / info["video_path"].format(**place), float(entry[keys[6]])
-            data = root / info["data_path"].format(chunk_index=chunk, file_index=part)
+                shown, begin = _inside(root, info["video_path"], place), float(entry[keys[6]])
+            data = _inside(root, info["data_path"], {"chunk_index": chunk, "file_index": part})
             episodes.append(EpisodeFiles(number, length, data, shown, begin))
     return episodes, files
+
+
+def _inside(root: Path, template: str, place: dict[str, Any]) -> Path:
+    """A path of the metadata, filled in.
+
+    Raises:
+        ValueError: if it leads out of the folder, or is no template of LeRobot's.
+    """
+    try:
+        parts = list(Formatter().parse(template))
+        fields = {field for _, field, _, _ in parts if field is not None}
+        widths = [spec for _, _, spec, _ in parts if spec]
+        if not fields <= set(place) or any(not _WIDTH.fullmatch(spec) for spec in widths):
+            raise ValueError(f"it may name {sorted(place)}, with widths such as 06d")
+        path = template.format(**place)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{root / 'meta' / 'info.json'} has a path {template!r} that cannot be filled in: {error}"
+        ) from error
+    return stay_inside(root, path, str(root / "meta" / "info.json"))
+
+
+def stay_inside(root: Path, path: str, source: str) -> Path:
+    """A path below a folder, as metadata name it.
+
+    Args:
+        root: the folder.
+        path: relative to it.
+        source: what names the path, for the message.
+
+    Raises:
+        ValueError: if it is absolute and elsewhere, or leads out of the folder.
+    """
+    file = root / path
+    if ".." in Path(path).parts or not file.is_relative_to(root) or "\0" in path:
+        raise ValueError(
+            f"{source} names a file outside of the data set, {path!r}; such a data set may read anything of yours: "
+            "download it from where you trust it, or correct the path"
+        )
+    return file
 
 
 def read_table(file: Path, columns: list[str] | None = None):
@@ -249,6 +298,7 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
     if data is None:
         names = [(value or {}).get("path")]
         names += [f"images/{camera}/episode{m}{episode:06d}/frame{m}{frame:06d}.png" for m in "_-"]
-        files = [root / name for name in names if name]
+        source = f"frame {frame} of episode {episode} in {root}"
+        files = [stay_inside(root, name, source) for name in names if name]
         data = next((file.read_bytes() for file in files if file.is_file()), b"")
     return decode_picture(data)
