@@ -24,6 +24,7 @@ from torch import Tensor
 from torchrl.envs.transforms import Compose, TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf._checks import check_number
 from torch_denkf.filters._checks import (
     check_inputs,
     refuse_missing_actions,
@@ -127,6 +128,8 @@ class Filter(TensorDictSequential):
         self.init_key = unravel_key(init_key)
         self.control_keys = [unravel_key(key) for key in control_keys]
         self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
+        if variance_ceiling is not None:
+            check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
         self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
         self.compiled: CompiledSteps | None = None
         self._said_ceiling = False

@@ -55,11 +55,15 @@ def semidefinite_root(cov: Tensor) -> Tensor:
                 [0., 0.]])
     """
     dim = cov.shape[-1]
-    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
+    variance = cov.diagonal(dim1=-2, dim2=-1).detach()
+    std = variance.clamp(min=0).sqrt()
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
     diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
     correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
+    # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
+    negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1)
+    std = torch.where(negative.unsqueeze(-1), torch.nan, std)
     return std.unsqueeze(-1) * cholesky(correlation)
 
 

@@ -197,14 +197,14 @@ class SubModel(TensorDictModule):
         """What :meth:`on_entries` gives.
 
         Raises:
-            TypeError: if entries and parameters differ in precision.
+            TypeError: if entries and parameters differ in precision, or a mask is not boolean.
         """
         if torch.compiler.is_compiling():
             return self.on_entries(entries, call)
         try:
             return self.on_entries(entries, call)
-        except RuntimeError as error:
-            self._explain_precision(error, entries)
+        except (RuntimeError, TypeError, ValueError) as error:
+            self._explain_dtypes(error, entries)
             raise
 
     def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
@@ -234,7 +234,15 @@ class SubModel(TensorDictModule):
                 )
         return given
 
-    def _explain_precision(self, error: RuntimeError, entries: Entries) -> None:
+    def _explain_dtypes(self, error: Exception, entries: Entries) -> None:
+        if "bool" in str(error):
+            for key in self.optional_keys:  # masks, and counts of steps
+                mask = entries.get(key)
+                if mask is not None and mask.dtype not in (torch.bool, torch.int64):
+                    raise TypeError(
+                        f"{type(self).__name__} reads the mask {key!r}, which must be boolean, True where observed; "
+                        f"got {mask.dtype}. Convert it with .bool()."
+                    ) from error
         own = {p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()}
         values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
         given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}

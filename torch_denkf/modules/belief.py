@@ -8,9 +8,16 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules._tensors import (
+    as_floating,
+    as_standard_deviations,
+    check_dims,
+    mean_of_members,
+    register_location,
+)
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
@@ -27,9 +34,8 @@ class _InitialEnsemble(SubModel):
         optional_keys: Sequence[NestedKey] = (),
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
-        std = as_floating(std)
-        if std.ndim != 1 or not (std >= 0).all():
-            raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
+        std = as_standard_deviations("std", std)
+        check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 
@@ -79,6 +85,7 @@ class GaussianPrior(_InitialEnsemble):
         mean = as_floating(mean)
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
+        check_values("mean", mean)
         self.register_buffer("mean", mean)
 
     def compute(self, *, noise, batch_size):
@@ -159,7 +166,8 @@ class FromSensor(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
-        register_constant(self, "mean", mean)
+        register_location(self, "mean", mean)
+        check_dims("dims", dims, self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
 

@@ -19,6 +19,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import (
     effective_sample_size,
     soft_resample,
@@ -95,7 +96,7 @@ class ResampledTransition(SubModel):
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.
 
     Raises:
-        ValueError: on an unknown ``scheme``.
+        ValueError: on an unknown ``scheme``, and numbers out of range.
         KeyError: if an entry is missing.
 
     Example:
@@ -122,6 +123,11 @@ class ResampledTransition(SubModel):
     ):
         if scheme not in ("systematic", "soft", "transport", None):
             raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
+        check_number("alpha", alpha, least=0, most=1)
+        check_number("epsilon", epsilon, above=0)
+        check_count("iterations", iterations)
+        if ess_threshold is not None:
+            check_number("ess_threshold", ess_threshold, least=0, most=1, cure="It is a share of E")
         (ensemble_key, *others), optional = reads(transition)
         others = [key for key in others if key != unravel_key(log_weight_key)]
         super().__init__(
@@ -227,6 +233,7 @@ class ParticleAnalysis(SubModel):
             [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
             + [(info_key, name) for name in ("ess", "log_likelihood")],
         )
+        check_number("tempering", tempering, above=0)
         self.tempering, self.info_key = tempering, info_key
 
     def compute(self, particles, prior, log_likelihood):

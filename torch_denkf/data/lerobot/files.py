@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from torch_denkf._checks import check_count, check_number, read_lines
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
 
@@ -99,16 +100,19 @@ def read_layout(root: Path, camera: str | None) -> Layout:
 
     Raises:
         FileNotFoundError: without metadata.
-        ValueError: for versions that are not supported, cameras that are not there, and malformed metadata.
+        ValueError: for versions that are not supported, cameras that are not there, malformed metadata, numbers out of
+            range, episodes that are listed twice, and paths that lead out of the folder.
     """
     file = root / "meta" / "info.json"
     if not file.is_file():
         raise FileNotFoundError(f"no {file}; pass the folder of a LeRobot data set, which holds meta and data")
     try:
-        info = json.loads(file.read_text())
+        info = json.loads("\n".join(read_lines(file)))
         version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
+    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
+    _check_features(file, features)
     if version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
@@ -120,6 +124,7 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
         raise ValueError(f"{root} has no episodes; {COMPLETE}")
+    _check_episodes(meta, episodes)
     rows = sum(episode.length for episode in episodes)
     if rows > MOST_ROWS:
         raise ValueError(
@@ -127,6 +132,26 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
+
+
+def _check_features(file: Path, features: dict) -> None:
+    for key, feature in features.items():
+        known = isinstance(feature, dict) and isinstance(feature.get("dtype"), str)
+        if not known or not isinstance(feature.get("shape"), (list, tuple)):
+            raise ValueError(
+                f"{file} is malformed: feature {key!r} has no 'dtype' and 'shape', but {feature!r}; download it anew"
+            )
+
+
+def _check_episodes(meta: list[Path], episodes: list[EpisodeFiles]) -> None:
+    seen: set[int] = set()
+    for episode in episodes:
+        if episode.number in seen:
+            raise ValueError(
+                f"{meta[0]} lists episode {episode.number} twice, again as entry {len(seen) + 1} of {len(episodes)}; "
+                "leave one out, or download it anew"
+            )
+        seen.add(episode.number)
 
 
 def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) -> str:
@@ -156,20 +181,25 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
     if not file.is_file():
         raise FileNotFoundError(f"no {file}, which lists the episodes; {COMPLETE}")
     video = info["features"][camera]["dtype"] == "video"
+    chunk = info.get("chunks_size", 1000)
+    check_count(f"chunks_size in {root / 'meta' / 'info.json'}", chunk, cure="It is the episodes in a folder")
     episodes = []
-    for line in filter(str.strip, file.read_text().splitlines()):
+    for at, line in enumerate(read_lines(file), start=1):
+        if not line.strip():
+            continue
         try:
             entry = json.loads(line)
             number, length = int(entry["episode_index"]), int(entry["length"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{file} has a malformed line {line[:80]!r}; download it anew") from error
-        place = {
-            "episode_chunk": number // int(info.get("chunks_size", 1000)),
-            "episode_index": number,
-            "video_key": camera,
-        }
-        data = _inside(root, info["data_path"], place)
-        shown = _inside(root, info["video_path"], place) if video else None
+            raise ValueError(
+                f"{file} has a malformed line {line[:80]!r}, line {at} ({type(error).__name__}: {error}); download it "
+                "anew"
+            ) from error
+        for name, value in (("episode_index", number), ("length", length)):
+            check_count(f"{name} in {file}:{at}", value, least=0)
+        place = {"episode_chunk": number // chunk, "episode_index": number, "video_key": camera}
+        data = _inside(root, info, "data_path", **place)
+        shown = _inside(root, info, "video_path", **place) if video else None
         episodes.append(EpisodeFiles(number, length, data, shown, 0.0))
     return episodes, [file]
 
@@ -185,34 +215,46 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
     episodes = []
     for file in files:
         for entry in read_table(file, keys).to_pylist():
-            number, length, chunk, part = (int(entry[key]) for key in keys[:4])
-            shown, begin = None, 0.0
+            try:
+                number, length, chunk, part = (int(entry[key]) for key in keys[:4])
+                where = [int(entry[key]) for key in keys[4:6]]
+                begin = float(entry[keys[6]]) if video else 0.0
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{file} has a row with gaps, {entry}; download it anew") from error
+            for name, value in (("episode_index", number), ("length", length)):
+                check_count(f"{name} in {file}", value, least=0)
+            check_number(f"from_timestamp of episode {number} in {file}", begin, least=0)
+            shown = None
             if video:
-                place = {"video_key": camera, "chunk_index": entry[keys[4]], "file_index": entry[keys[5]]}
-                shown, begin = _inside(root, info["video_path"], place), float(entry[keys[6]])
-            data = _inside(root, info["data_path"], {"chunk_index": chunk, "file_index": part})
+                place = {"video_key": camera, "chunk_index": where[0], "file_index": where[1]}
+                shown = _inside(root, info, "video_path", **place)
+            data = _inside(root, info, "data_path", chunk_index=chunk, file_index=part)
             episodes.append(EpisodeFiles(number, length, data, shown, begin))
     return episodes, files
 
 
-def _inside(root: Path, template: str, place: dict[str, Any]) -> Path:
-    """A path of the metadata, filled in.
+def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
+    """A file that a template of ``info.json`` names.
 
     Raises:
-        ValueError: if it leads out of the folder, or is no template of LeRobot's.
+        ValueError: if there is no such template, it is none of LeRobot's, or it leads out of the folder.
     """
+    file, template = root / "meta" / "info.json", info.get(name)
+    if not isinstance(template, str):
+        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
     try:
         parts = list(Formatter().parse(template))
         fields = {field for _, field, _, _ in parts if field is not None}
         widths = [spec for _, _, spec, _ in parts if spec]
-        if not fields <= set(place) or any(not _WIDTH.fullmatch(spec) for spec in widths):
-            raise ValueError(f"it may name {sorted(place)}, with widths such as 06d")
+        strange = sorted(fields - set(place)) + [spec for spec in widths if not _WIDTH.fullmatch(spec)]
+        if strange:
+            raise ValueError(f"it has {strange[0]!r}, but may name {sorted(place)}, with widths such as 06d")
         path = template.format(**place)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"{root / 'meta' / 'info.json'} has a path {template!r} that cannot be filled in: {error}"
+            f"{file} has a path {name!r}, {template!r}, that cannot be filled in: {error}; download it anew"
         ) from error
-    return stay_inside(root, path, str(root / "meta" / "info.json"))
+    return stay_inside(root, path, f"{file}, by {name!r},")
 
 
 def stay_inside(root: Path, path: str, source: str) -> Path:
