@@ -56,7 +56,7 @@ INFOS = {
     "no data_path": ({"data_path": "leave out"}, INFO, "'data_path'", "None"),
     "data_path a number": ({"data_path": 3}, INFO, "'data_path'", "3"),
     "data_path of another": ({"data_path": "data/{part}.parquet"}, INFO, "'data_path'", "'part'"),
-    "data_path of attributes": ({"data_path": "{episode_index.__class__.x}"}, INFO, "'data_path'", "episode_index.__class__.x"),
+    "data_path of attributes": ({"data_path": "{episode_index.__class__.x}"}, INFO, "'data_path'", "__class__.x"),
     "data_path above": ({"data_path": "../{episode_index}.parquet"}, INFO, "'data_path'", "outside of the data set"),
     "data_path absolute": ({"data_path": "/etc/passwd"}, INFO, "'data_path'", "outside of the data set", "/etc/passwd"),
 }
