@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import MemoryMappedTensor, TensorDict, is_leaf_nontensor
 from torch import Tensor
 
 from torch_denkf._files import reserve, sync
@@ -251,7 +251,7 @@ def _bytes(tensor: Tensor) -> Tensor:
 
 
 def _tensors(content: TensorDict) -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    for key in content.keys(include_nested=True, leaves_only=True):
+    for key in content.keys(include_nested=True, leaves_only=True, is_leaf=is_leaf_nontensor):
         name = (key,) if isinstance(key, str) else key
         value = content.get(key)
         dtype = str(getattr(value, "dtype", type(value).__name__)).removeprefix("torch.")
