@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
+from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
 from torch_denkf.filters._steps import previous_key
 from torch_denkf.filters._structure import Structure
 from torch_denkf.modules._base import Entries, random_parts
@@ -66,17 +67,30 @@ def check_inputs(
         )
 
 
-def refuse_non_finite(structure: Structure, entries: Entries, written: Entries) -> None:
-    """Raises a ``ValueError`` where the new belief is not finite; the message names the input that is not."""
-    if all(torch.isfinite(written[key]).all() for key in structure.carry if key in written):
+def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, reject: bool) -> None:
+    """Raises a ``ValueError`` where a reading or the new belief is not finite; the message names the input that is not.
+
+    Args:
+        structure: the filter's.
+        entries: what the step read.
+        written: what it wrote.
+        reject: whether readings that are not finite were rejected, and are no mistake.
+    """
+    finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
+    absurd = [] if reject else rejected_keys(structure.guards, entries)
+    if finite and not absurd:
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
-    why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+    if absurd and not set(absurd) & set(bad):
+        why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
+    else:
+        why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
     raise ValueError(
-        f"The new belief is not finite, because of {why}. The tensordict was left as it is. Hide what is broken or "
-        f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
-        "predict(...); check_finite=False switches this off."
+        f"The new belief is not {'to be trusted' if finite else 'finite'}, because of {why}. The tensordict was left as "
+        f"it is. Hide what is broken or missing with a mask ({list(structure.optional)}), or leave it out with "
+        "step(..., without=[...]) or predict(...). A filter with reject=True counts such readings as missing; "
+        "check_finite=False switches this off."
     )
 
 

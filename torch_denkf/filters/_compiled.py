@@ -44,7 +44,7 @@ class CompiledSteps:
         """What one step writes; ``entries`` hold its noise."""
         keys = tuple(entries)
         device = next(iter(entries.values())).device
-        writes = (*steps.structure.frame_keys, *steps.structure.step_keys)
+        writes = (*steps.structure.frame_keys, *steps.step_keys)
         make = partial(_step, steps, keys, writes, batch_size)
         values = self._function(("step", keys, batch_size), steps, device, make)(*entries.values())
         if self._overwrites(device):
@@ -90,7 +90,7 @@ class CompiledSteps:
     def _function(self, kind: tuple, steps: Steps, device: torch.device, make: Callable[[], Callable]) -> Callable:
         structure = steps.structure
         modules = (*structure.frames, structure.transition, *structure.update)  # a part may be replaced
-        kind = (*kind, modules, steps.update_at_reset, steps.ceiling, device)
+        kind = (*kind, modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
                 from torch_denkf.filters.inductor import clear_damaged_libraries
@@ -120,7 +120,8 @@ class CompiledSteps:
 
 def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        entries, call = dict(zip(keys, values, strict=True)), Call(batch)
+        call = Call(batch)
+        entries = steps.usable(dict(zip(keys, values, strict=True)), call)
         written = steps.frames(entries, call)
         written.update(steps.advance({**entries, **written}, call))
         return tuple(written[key] for key in writes)

@@ -12,6 +12,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters._steps import Steps, blank, previous_key
 from torch_denkf.filters._structure import Structure
 from torch_denkf.filters._summaries import summaries
@@ -64,6 +65,7 @@ def filter_rows(
     structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
     entries, call = filter.entries_of(rows), Call(size, time=True)
     check_inputs(filter, entries, rows, carry=False)
+    entries = filter.steps().usable(entries, call)
     with set_recurrent_mode(True):  # for modules that are not this package's
         frames = filter.steps().frames(entries, call)
     entries.update(frames)
@@ -84,7 +86,7 @@ def filter_rows(
         starts = filter.initial_belief(entries, call)
     steps = filter.steps(filter.update_at_reset and not stored)
 
-    reads = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys)
+    reads = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys, REJECTED)
     inputs = {key: entries[key] for key in reads if key in entries}
     inputs.update({key: value for key, value in entries.items() if key[0] == "noise"})
     inputs.update({key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries})
@@ -92,7 +94,7 @@ def filter_rows(
     drawn = draw_noise(filter, {**entries, **starts}, size, (structure.transition, *structure.update), time=True)
     inputs.update(drawn or {})
     shifted = tuple(key for key in structure.controls if previous_key(key) not in entries)
-    step_keys = tuple(key for key in keep if key in structure.step_keys)
+    step_keys = tuple(key for key in keep if key in steps.step_keys)
     todo = Rows(size, inputs, shifted, begins, starts, resumed, detach_every, step_keys)
     compiled = filter.compiled if drawn is not None and not resumed else None
     with set_recurrent_mode(False):

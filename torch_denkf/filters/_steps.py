@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
+from torch_denkf.filters._rejection import REJECTED, usable
 from torch_denkf.filters._structure import Placed, Structure
 from torch_denkf.modules._base import Call, Entries, SubModel, named_modules_of, run_module
 
@@ -34,12 +35,23 @@ class Steps(NamedTuple):
         update_at_reset: whether an initial belief is updated with its frame.
         ceiling: largest variance of the belief; ``None`` for any.
         say: told the key of a variance that is held at the ceiling.
+        reject: whether readings that cannot be true count as not observed.
     """
 
     structure: Structure
     update_at_reset: bool
     ceiling: float | None
     say: Callable[[NestedKey], None]
+    reject: bool = False
+
+    @property
+    def step_keys(self) -> tuple[NestedKey, ...]:
+        """What transition and update write, and how many readings were rejected."""
+        return (*self.structure.step_keys, REJECTED) if self.reject else self.structure.step_keys
+
+    def usable(self, entries: Entries, call: Call) -> Entries:
+        """What the modules may read: without readings that cannot be true, if they are to be rejected."""
+        return usable(self.structure.guards, entries, call.batch_size) if self.reject else entries
 
     def run(
         self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
@@ -133,6 +145,8 @@ class Steps(NamedTuple):
                 written[key] = where_rows(reset, start[key], written[key])
         if self.ceiling is not None:
             self._limit(written, self.ceiling)
+        if self.reject:
+            written[REJECTED] = entries[REJECTED]
         return written
 
     def roll(
@@ -224,7 +238,7 @@ def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
     """
     structure = steps.structure
     at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
-    for key in structure.beside if steps.update_at_reset else structure.step_keys:
+    for key in structure.beside if steps.update_at_reset else steps.step_keys:
         if key in written and key not in at_start:
             written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
 

@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
+from torch_denkf.filters._rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel, reads
 
 __all__ = ["Placed", "Structure", "submodels"]
@@ -41,6 +42,7 @@ class Structure(NamedTuple):
         beside: what else the transition writes.
         observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
         readings: raw entries that the analyses' readings are made of.
+        guards: what a mask hides, of those readings.
         own_info: new names for diagnostics that several analyses would write under one.
         totals: sums of those over the analyses.
         likelihoods: the log-likelihood of each analysis' reading.
@@ -61,6 +63,7 @@ class Structure(NamedTuple):
     beside: tuple[NestedKey, ...]
     observation_dims: dict[NestedKey, int]
     readings: tuple[NestedKey, ...]
+    guards: tuple[Guard, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
     totals: dict[NestedKey, tuple[NestedKey, ...]]
     likelihoods: tuple[NestedKey, ...]
@@ -126,6 +129,7 @@ class Structure(NamedTuple):
             beside=tuple(key for key in _out(steps[0][1]) if key not in forecast_of.values()),
             observation_dims=_observation_dims([*frames, *steps[1:]]),
             readings=tuple(_readings(frames, steps[1:], needed)),
+            guards=_guards(frames, steps[1:], needed, initial),
             own_info=own_info,
             totals=totals,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
@@ -207,6 +211,22 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
             found.update(dict.fromkeys(reads(module)[0]))
     made_by_steps = {key for _, module in update for key in _out(module)}
     return [key for key in found if key in needed and key not in made_by_steps]
+
+
+def _guards(
+    frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey], initial: TensorDictModuleBase
+) -> tuple[Guard, ...]:
+    """What each mask hides, of the entries from outside that the readings are made of."""
+    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
+    made_by_steps = {key for _, module in update for key in _out(module)}
+    sources: dict[NestedKey, list[NestedKey]] = {}
+    for key in {unravel_key(key) for part in parts for key in getattr(part, "reading_keys", ())}:
+        found = {key: None}
+        for _, module in reversed([*frames, *update]):
+            if not found.keys().isdisjoint(_out(module)):
+                found.update(dict.fromkeys(reads(module)[0]))
+        sources[key] = [source for source in found if source in needed and source not in made_by_steps]
+    return guards_of(parts, sources)
 
 
 def _refuse_overwriting(modules: Sequence[Placed]) -> None:

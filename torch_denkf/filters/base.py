@@ -57,6 +57,7 @@ class FilterOptions(TypedDict, total=False):
     forecast_keys: Mapping[NestedKey, NestedKey] | None
     variance_ceiling: float | None
     check_finite: bool
+    reject: bool
 
 
 class Filter(TensorDictSequential):
@@ -92,7 +93,11 @@ class Filter(TensorDictSequential):
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
         variance_ceiling: the belief's variances are held at it, so that an unstable system that nobody observes stays
             finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether :meth:`step` raises where the new belief is not finite.
+        check_finite: whether :meth:`step` raises where a reading or the new belief is not finite, or a reading is
+            larger than 1e18 in whatever unit. A sequence does not raise: NaN goes on to the end of it.
+        reject: whether such readings count as not observed, in steps, sequences, compiled and packaged, and
+            ``("info", "rejected")`` ``[*B, 1]`` counts them: each component of a vector that an update reads itself,
+            and one for all that a sensor reads. What shares a mask is rejected together.
 
     Raises:
         ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
@@ -120,6 +125,7 @@ class Filter(TensorDictSequential):
         forecast_keys: Mapping[NestedKey, NestedKey] | None = None,
         variance_ceiling: float | None = 1e12,
         check_finite: bool = True,
+        reject: bool = False,
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
             modules = (OrderedDict(modules[0]),)
@@ -130,7 +136,7 @@ class Filter(TensorDictSequential):
         self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
         if variance_ceiling is not None:
             check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
-        self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
+        self.variance_ceiling, self.check_finite, self.reject = variance_ceiling, check_finite, reject
         self.compiled: CompiledSteps | None = None
         self._said_ceiling = False
         self._sorted_for: tuple = ()
@@ -140,21 +146,22 @@ class Filter(TensorDictSequential):
     @property
     def structure(self) -> Structure:
         """The modules by what they read; found anew where one of them has been replaced."""
-        if self._sorted_for != (*_flat(self), self.initial, *self.control_keys):
+        if self._sorted_for != (*_flat(self), self.initial, *self.control_keys, self.reject):
             self._sort()
         return self._structure
 
     def _sort(self) -> None:
         """Sorts the modules, and says what they read and write."""
         structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
-        self._sorted_for, self._structure = (*_flat(self), self.initial, *self.control_keys), structure
+        self._sorted_for = (*_flat(self), self.initial, *self.control_keys, self.reject)
+        self._structure = structure
         keys = [*structure.needed, *structure.controls, *structure.carry, *map(previous_key, structure.carry), _KNOWN]
         keys += [*map(previous_key, structure.controls), *structure.belief, self.init_key, *structure.optional]
         self.in_keys = list(dict.fromkeys(keys))
         of_start = [*map(unravel_key, self.initial.in_keys), *getattr(self.initial, "optional_keys", ())]
         self._all_keys = list(dict.fromkeys([*keys, *of_start]))
         self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
-        self.out_keys = [*structure.frame_keys, *structure.step_keys]
+        self.out_keys = [*structure.frame_keys, *self.steps().step_keys]
 
     @property
     def carry_keys(self) -> list[NestedKey]:
@@ -254,6 +261,7 @@ class Filter(TensorDictSequential):
         if reset is None:
             written = self.take_step(entries, tensordict.batch_size)
         else:
+            entries = steps.usable(entries, call)
             written = steps.frames(entries, call)
             entries.update(written)
             start = self.initial_belief(entries, call)
@@ -282,7 +290,7 @@ class Filter(TensorDictSequential):
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
-            ValueError: if the new belief is not finite, and ``check_finite``.
+            ValueError: with ``check_finite``, if a reading or the new belief is not finite.
         """
         tensordict = self._of_one_robot(tensordict)
         without = refuse_unknown_readings(self.structure, without)
@@ -290,15 +298,16 @@ class Filter(TensorDictSequential):
         check_inputs(self, entries, tensordict, without)
         if without:
             call, steps, missing = Call(tensordict.batch_size), self.steps(), set(without)
-            written = steps.frames(entries, call, missing)
-            written.update(steps.advance({**entries, **written}, call, missing=missing))
+            given = steps.usable({key: value for key, value in entries.items() if key not in missing}, call)
+            written = steps.frames(given, call, missing)
+            written.update(steps.advance({**given, **written}, call, missing=missing))
             lost = [key for key in self.structure.carry if key in self.structure.step_keys and key not in written]
             if lost:
                 raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
         else:
             written = self.take_step(entries, tensordict.batch_size)
         if self.check_finite and not torch.compiler.is_compiling():
-            refuse_non_finite(self.structure, entries, written)
+            refuse_non_finite(self.structure, entries, written, self.reject)
         write(tensordict, written)
         return tensordict
 
@@ -313,10 +322,10 @@ class Filter(TensorDictSequential):
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
 
-    def take_step(self, entries: Entries, batch_size: torch.Size) -> Entries:
-        """What one step writes where ``entries`` are, compiled or not; nothing is checked."""
+    def take_step(self, entries: Entries, batch_size: torch.Size, *, reject: bool | None = None) -> Entries:
+        """What one step writes where ``entries`` are, compiled or not, unchecked; ``reject`` as the filter's."""
         structure = self.structure
-        steps = self.steps()
+        steps = self.steps(reject=reject)
         if self.compiled is not None:
             drawn = draw_noise(self, entries, batch_size, (*structure.frames, structure.transition, *structure.update))
             if drawn is not None:
@@ -324,21 +333,30 @@ class Filter(TensorDictSequential):
                 self._look_at_ceiling(written)
                 return written
         call = Call(batch_size)
+        entries = steps.usable(entries, call)
         written = steps.frames(entries, call)
         written.update(steps.advance({**entries, **written}, call))
         return written
 
     def initialise(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
+        return self.initialise_or_reject(tensordict)
+
+    def initialise_or_reject(
+        self, tensordict: TensorDictBase | Mapping[str, Any], reject: bool | None = None
+    ) -> TensorDictBase:
+        """What :meth:`initialise` does, with ``reject`` as the filter's by default."""
         tensordict = self._of_one_robot(tensordict)
         entries, call, structure = self.entries_of(tensordict), Call(tensordict.batch_size), self.structure
+        steps = self.steps(reject=reject)
+        entries = steps.usable(entries, call)
         frame_keys, written = set(structure.frame_keys), {}
         if self.update_at_reset or not frame_keys.isdisjoint(chain(*reads(self.initial))):
-            written = self.steps().frames(entries, call)
+            written = steps.frames(entries, call)
             entries.update(written)
         start = self.initial_belief(entries, call)
         if self.update_at_reset:
-            written.update(self.steps().first(entries, call, start, in_sequence=False))
+            written.update(steps.first(entries, call, start, in_sequence=False))
         else:
             written.update(start)
             written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
@@ -426,10 +444,11 @@ class Filter(TensorDictSequential):
         """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
-    def steps(self, update_at_reset: bool | None = None) -> Steps:
-        """What one step does, on entries; ``update_at_reset`` as the filter's by default."""
+    def steps(self, update_at_reset: bool | None = None, reject: bool | None = None) -> Steps:
+        """What one step does, on entries; ``update_at_reset`` and ``reject`` as the filter's by default."""
         update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
-        return Steps(self._structure, update_at_reset, self.variance_ceiling, self._say_ceiling)
+        reject = self.reject if reject is None else reject
+        return Steps(self._structure, update_at_reset, self.variance_ceiling, self._say_ceiling, reject)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
         """What the modules may read, as far as it is there; for ``one_step`` not what starts a sequence."""

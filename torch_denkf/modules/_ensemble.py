@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypedDict
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_number
@@ -62,6 +62,8 @@ class EnsembleUpdate(SubModel):
         ValueError: if ``inflation`` is not positive, or ``relaxation`` is outside [0, 1].
     """
 
+    reads_components = True
+
     def __init__(
         self,
         *,
@@ -91,3 +93,4 @@ class EnsembleUpdate(SubModel):
         check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
+        self.observed_key = unravel_key(observed_key)

@@ -149,6 +149,8 @@ class GaussianAnalysis(SubModel):
         KeyError: if an entry is missing.
     """
 
+    reads_components = True
+
     def __init__(
         self,
         observation: TensorDictModuleBase,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
@@ -153,6 +153,8 @@ class FromSensor(_InitialEnsemble):
         tensor([5., 0.])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         dims: Sequence[int],
@@ -170,6 +172,7 @@ class FromSensor(_InitialEnsemble):
         check_dims("dims", dims, self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
+        self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

@@ -193,6 +193,8 @@ class KalmanAnalysis(SubModel):
         tensor([0.5000])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         matrix: torch.Tensor,
@@ -229,7 +231,7 @@ class KalmanAnalysis(SubModel):
         elif self.noise is not None:
             check_shape("noise", self.noise, (len(self.matrix),), "[O]")
             check_values("noise", self.noise, least=0, cure="These are variances")
-        self.reading_keys = self.in_keys[2:]
+        self.reading_keys, self.observed_key = self.in_keys[2:], unravel_key(observed_key)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""

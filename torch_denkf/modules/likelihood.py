@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
@@ -51,6 +51,8 @@ class GaussianLikelihood(SubModel):
         tensor([-1.4189, -0.9189])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         *,
@@ -66,7 +68,7 @@ class GaussianLikelihood(SubModel):
         )
 
         self.angles = list(angles)
-        self.reading_keys = self.in_keys[1:]
+        self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
 
     def without_reading(self, predicted, *_):
         """The log-likelihoods where there is no reading: zero."""
@@ -179,6 +181,7 @@ class LearnedLikelihood(SubModel):
         self.bound, self.observation_dim = bound, observation_dim
         self.angles = list(angles)
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
+        self.observed_key = unravel_key(observed_key)
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
             value = as_floating(default if value is None else value)
             check_values(name, value, above=0 if name == "scale" else None)

@@ -191,7 +191,8 @@ class ParticleAnalysis(SubModel):
     r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
 
     Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
-    errors. Where nothing is observed the weights stay, exactly.
+    errors. Where nothing is observed the weights stay, exactly, and so they do where no particle can explain the
+    reading: the log-likelihood is then minus infinity.
 
     Args:
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
@@ -240,8 +241,9 @@ class ParticleAnalysis(SubModel):
         """The belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
-        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
-        seen = (log_likelihood != 0).any(-1, keepdim=True)
+        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed. Where no
+        # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
+        seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
         return (
             particles,
@@ -249,5 +251,5 @@ class ParticleAnalysis(SubModel):
             weighted_mean(particles, log_weights),
             weighted_var(particles, log_weights),
             effective_sample_size(log_weights).unsqueeze(-1),
-            torch.where(seen, total, torch.zeros_like(total)),
+            torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
@@ -191,7 +191,8 @@ class LSTMUpdate(SubModel):
         self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
-        self.reading_keys = inputs
+        self.reading_keys, self.observed_key = inputs, unravel_key(observed_key)
+        self.reads_components = encoding_key is None
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),
