@@ -1,1 +1,1 @@
-"""Attacks on every border of the library, and runs that last: is the result right, or does a message say what is not?"""
+"""Attacks on every border of the library, and runs that last: right, or a message that says what is not."""

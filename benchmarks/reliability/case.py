@@ -15,6 +15,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -120,10 +121,8 @@ def _listen(case: Case, child: int, read: int) -> Verdict:
         heard += part
         over = not part
     late = time.monotonic() >= end
-    try:  # its own children, too
+    with suppress(ProcessLookupError):  # its own children, too; it may be gone, or not as far as setsid
         os.killpg(child, signal.SIGKILL)
-    except ProcessLookupError:  # it has not come as far as setsid, or is gone
-        pass
     _, status = os.waitpid(child, 0)
     if heard:
         return Verdict(**json.loads(heard))

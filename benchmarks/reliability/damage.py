@@ -176,7 +176,9 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
     )
 
 
-def same_but(result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str], derived: Iterable[str] = ()) -> bool:
+def same_but(
+    result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str], derived: Iterable[str] = ()
+) -> bool:
     """Whether ``rows`` are marked as missing in one of ``masks``, and all other rows are as expected.
 
     Args:
@@ -191,7 +193,9 @@ def same_but(result: Any, expected: Any, rows: Iterable[int], masks: Iterable[st
     if not other.keys() <= one.keys() or not finite(one):
         return False
     shapes = [key for key in other if one[key].shape != other[key].shape]
-    marked = any(bool((~one[name].reshape(len(one[name]), -1)[row]).any()) for name in masks if name in one for row in rows)
+    marked = any(
+        bool((~one[name].reshape(len(one[name]), -1)[row]).any()) for name in masks if name in one for row in rows
+    )
     if shapes or not marked:
         return False
     keep = torch.ones(len(next(iter(other.values()))), dtype=torch.bool)

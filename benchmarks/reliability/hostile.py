@@ -44,7 +44,10 @@ def npz_of_zeros(size: int) -> bytes:
     """A small archive with an array of so many bytes."""
     buffer, head = io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("pixels.npy", "w", force_zip64=True) as out:
+    with (
+        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("pixels.npy", "w", force_zip64=True) as out,
+    ):
         out.write(head.getvalue())
         for _ in range(size >> 20):
             out.write(bytes(1 << 20))

@@ -134,6 +134,8 @@ def write_table(file: Path) -> None:
     for part, found in content["parts"].items():
         columns = [column for column in COLUMNS[part] if any(column in row for row in found)]
         lines += [TITLES[part], "", *head("", *columns, "right")]
-        lines += [line(row["name"], *(_cell(row.get(column, "")) for column in columns), _cell(row["right"])) for row in found]
+        lines += [
+            line(row["name"], *(_cell(row.get(column, "")) for column in columns), _cell(row["right"])) for row in found
+        ]
         lines.append("")
     file.with_suffix(".md").write_text("\n".join(lines))

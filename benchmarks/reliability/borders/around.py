@@ -42,20 +42,63 @@ def _pictures(transform: Any) -> Any:
 
 def _transforms() -> list[Subject]:
     t = transforms
-    bounds = {"upside down": (2.0, 1.0), "nan": (NAN, 1.0), "inf": (0.0, float("inf")), "one number": (1.0,), "text": "ab"}
+    bounds = {
+        "upside down": (2.0, 1.0),
+        "nan": (NAN, 1.0),
+        "inf": (0.0, float("inf")),
+        "one number": (1.0,),
+        "text": "ab",
+    }
     shares = {"beyond one": (1.5, 0.5), "negative": (-0.5, 0.5), "nan": (NAN, 0.5), "one number": (0.5,), "text": "ab"}
     return [
         Subject("MissingFrames", t.MissingFrames, dict, {"p": SHARE}, _pictures),
         Subject("BlackFrames", t.BlackFrames, dict, {"p": SHARE}, _pictures),
-        Subject("Blur", t.Blur, dict, {"p": SHARE, "kernel": {"even": 4, "negative": -3, "zero": 0, "a fraction": 2.5, "three numbers": (3, 3, 3), "text": "wide"}}, _pictures),
-        Subject("Brightness", t.Brightness, dict, {"p": SHARE, "gain": {**bounds, "negative": (-1.0, 1.0)}, "offset": bounds}, _pictures),
+        Subject(
+            "Blur",
+            t.Blur,
+            dict,
+            {
+                "p": SHARE,
+                "kernel": {
+                    "even": 4,
+                    "negative": -3,
+                    "zero": 0,
+                    "a fraction": 2.5,
+                    "three numbers": (3, 3, 3),
+                    "text": "wide",
+                },
+            },
+            _pictures,
+        ),
+        Subject(
+            "Brightness",
+            t.Brightness,
+            dict,
+            {"p": SHARE, "gain": {**bounds, "negative": (-1.0, 1.0)}, "offset": bounds},
+            _pictures,
+        ),
         Subject("OccludingBox", t.OccludingBox, dict, {"p": SHARE, "size": shares, "position": shares}, _pictures),
-        Subject("SaltAndPepper", t.SaltAndPepper, dict, {"p": SHARE, "fraction": {"negative": -0.1, "beyond a half": 0.7, "nan": NAN, "text": "x"}}, _pictures),
+        Subject(
+            "SaltAndPepper",
+            t.SaltAndPepper,
+            dict,
+            {"p": SHARE, "fraction": {"negative": -0.1, "beyond a half": 0.7, "nan": NAN, "text": "x"}},
+            _pictures,
+        ),
         Subject(
             "OpticalFlow",
             t.OpticalFlow,
             lambda: {"calibration": (40.0, 40.0, 35.0, 11.0)},
-            {"calibration": {"three numbers": (1.0, 1.0, 1.0), "zero": (0.0, 40.0, 35.0, 11.0), "negative": (-4.0, 40.0, 35.0, 11.0), "nan": (NAN, 40.0, 35.0, 11.0), "text": "ab"}, "height": POSITIVE},
+            {
+                "calibration": {
+                    "three numbers": (1.0, 1.0, 1.0),
+                    "zero": (0.0, 40.0, 35.0, 11.0),
+                    "negative": (-4.0, 40.0, 35.0, 11.0),
+                    "nan": (NAN, 40.0, 35.0, 11.0),
+                    "text": "ab",
+                },
+                "height": POSITIVE,
+            },
             lambda made: made(TensorDict({"pixels": torch.rand(6, 24, 72)})),
         ),
     ]
@@ -77,10 +120,39 @@ def _losses() -> list[Subject]:
     particles = lambda: {"filter": bootstrap(8, resampling="soft")}  # noqa: E731
     filter_ = {"nothing": None, "text": "x", "no filter": torch.nn.Linear(2, 2)}
     return [
-        Subject("DEnKFLoss", o.DEnKFLoss, ensemble, {**common, "filter": filter_, **dict.fromkeys(("state", "transition", "observation", "nll", "kl"), weight)}, _batch),
-        Subject("GaussianLoss", o.GaussianLoss, gaussian, {**common, "filter": filter_, **dict.fromkeys(("state", "transition", "nll"), weight), "dims": dims(2)}, _batch),
-        Subject("MixtureLoss", o.MixtureLoss, particles, {**common, "filter": filter_, "component_std": POSITIVE, **dict.fromkeys(("state", "transition", "mean", "nll"), weight)}, _batch),
-        Subject("TransitionLoss", o.TransitionLoss, lambda: {"filter": linear_denkf("etkf")}, {**common, "spread": NOT_NEGATIVE, "members": LARGE_COUNT}, _batch),
+        Subject(
+            "DEnKFLoss",
+            o.DEnKFLoss,
+            ensemble,
+            {**common, "filter": filter_, **dict.fromkeys(("state", "transition", "observation", "nll", "kl"), weight)},
+            _batch,
+        ),
+        Subject(
+            "GaussianLoss",
+            o.GaussianLoss,
+            gaussian,
+            {**common, "filter": filter_, **dict.fromkeys(("state", "transition", "nll"), weight), "dims": dims(2)},
+            _batch,
+        ),
+        Subject(
+            "MixtureLoss",
+            o.MixtureLoss,
+            particles,
+            {
+                **common,
+                "filter": filter_,
+                "component_std": POSITIVE,
+                **dict.fromkeys(("state", "transition", "mean", "nll"), weight),
+            },
+            _batch,
+        ),
+        Subject(
+            "TransitionLoss",
+            o.TransitionLoss,
+            lambda: {"filter": linear_denkf("etkf")},
+            {**common, "spread": NOT_NEGATIVE, "members": LARGE_COUNT},
+            _batch,
+        ),
     ]
 
 
@@ -93,17 +165,42 @@ def _rows() -> EpisodeReplay:
 
 def _linear() -> dict[str, Any]:
     eye = torch.eye(2)
-    return {"transition": 0.9 * eye, "observation": eye.clone(), "transition_std": [0.1, 0.1], "observation_std": [0.1, 0.1]}
+    return {
+        "transition": 0.9 * eye,
+        "observation": eye.clone(),
+        "transition_std": [0.1, 0.1],
+        "observation_std": [0.1, 0.1],
+    }
 
 
 def _environments() -> list[Subject]:
     roll = lambda env: env.rollout(3)  # noqa: E731
     std = vector(2, negative=False)
-    stretches = {"start": {"negative": -1, "beyond": 100, "unknown": "somewhere", "a fraction": 1.5}, "length": {"one": 1, "negative": -1, "beyond": 100, "text": "x"}}
+    stretches = {
+        "start": {"negative": -1, "beyond": 100, "unknown": "somewhere", "a fraction": 1.5},
+        "length": {"one": 1, "negative": -1, "beyond": 100, "text": "x"},
+    }
     batch = {"negative": [-1], "text": "x", "a fraction": [1.5]}
     return [
-        Subject("ReplayEnv", envs.ReplayEnv, lambda: {"data": _rows()}, {"data": {"nothing": None, "text": "x"}, "episodes": {"unknown": "z", "beyond": 7, "none": []}, "batch_size": batch, **stretches}, roll),
-        Subject("KITTIReplayEnv", envs.KITTIReplayEnv, lambda: {"drive": kitti.reference()}, {**stretches, "batch_size": batch}, roll),
+        Subject(
+            "ReplayEnv",
+            envs.ReplayEnv,
+            lambda: {"data": _rows()},
+            {
+                "data": {"nothing": None, "text": "x"},
+                "episodes": {"unknown": "z", "beyond": 7, "none": []},
+                "batch_size": batch,
+                **stretches,
+            },
+            roll,
+        ),
+        Subject(
+            "KITTIReplayEnv",
+            envs.KITTIReplayEnv,
+            lambda: {"drive": kitti.reference()},
+            {**stretches, "batch_size": batch},
+            roll,
+        ),
         Subject(
             "LinearGaussianEnv",
             envs.LinearGaussianEnv,
@@ -143,7 +240,14 @@ def _car() -> list[Subject]:
         "five channels": [np.zeros((24, 72, 5), np.uint8)] * 3,
         "text": ["a", "b", "c"],
     }
-    times = {"backwards": [3.0, 2.0, 1.0, 0.0], "the same": [0.0] * 4, "nan": [0.0, NAN, 0.2, 0.3], "too few": [0.0, 0.1], "text": ["a", "b", "c", "d"], "a gap of a day": [0.0, 0.1, 86400.0, 86400.1]}
+    times = {
+        "backwards": [3.0, 2.0, 1.0, 0.0],
+        "the same": [0.0] * 4,
+        "nan": [0.0, NAN, 0.2, 0.3],
+        "too few": [0.0, 0.1],
+        "text": ["a", "b", "c", "d"],
+        "a gap of a day": [0.0, 0.1, 86400.0, 86400.1],
+    }
     settings = {
         "dt": POSITIVE,
         "ensemble_size": LARGE_COUNT,
@@ -172,20 +276,44 @@ def _car() -> list[Subject]:
                 "height": POSITIVE,
                 "pitch": {**FINITE, "a right angle": 1.57},
                 "black_level": {"negative": -1, "beyond": 300, "text": "x"},
-                "calibration": {"three numbers": (1.0, 1.0, 1.0), "zero": (0.0, 40.0, 35.0, 11.0), "nan": (NAN, 40.0, 35.0, 11.0), "text": "abcd"},
+                "calibration": {
+                    "three numbers": (1.0, 1.0, 1.0),
+                    "zero": (0.0, 40.0, 35.0, 11.0),
+                    "nan": (NAN, 40.0, 35.0, 11.0),
+                    "text": "abcd",
+                },
             },
             also={"frames": ("frame",), "times": ("time",)},
         ),
         Subject("CanonicalCamera", vision.CanonicalCamera, lambda: {"focal": 40.0}, {"focal": POSITIVE}),
-        Subject("Updates", odometry.Updates, dict, {"sensor": COUNT, "filter": COUNT, "end_to_end": COUNT, "length": COUNT}, also=dict.fromkeys(("sensor", "filter", "end_to_end", "length"), ("Updates",))),
+        Subject(
+            "Updates",
+            odometry.Updates,
+            dict,
+            {"sensor": COUNT, "filter": COUNT, "end_to_end": COUNT, "length": COUNT},
+            also=dict.fromkeys(("sensor", "filter", "end_to_end", "length"), ("Updates",)),
+        ),
         Subject("bridge_gaps", bridge_gaps, lambda: {"drive": kitti.reference()}, {"longest": COUNT}),
         Subject(
             "sigma_points",
             sigma_points,
             lambda: {"mean": torch.zeros(2), "cov": torch.eye(2)},
-            {"cov": {k: v for k, v in {"negative": -torch.eye(2), "nan": torch.full((2, 2), NAN), "a row more": torch.eye(3, 2)}.items()}, "alpha": {"zero": 0.0, "nan": NAN}, "kappa": {"minus the dimension": -2.0, "nan": NAN}},
+            {
+                "cov": {
+                    "negative": -torch.eye(2),
+                    "nan": torch.full((2, 2), NAN),
+                    "a row more": torch.eye(3, 2),
+                },
+                "alpha": {"zero": 0.0, "nan": NAN},
+                "kappa": {"minus the dimension": -2.0, "nan": NAN},
+            },
         ),
-        Subject("lorenz96_step", lorenz96_step, lambda: {"state": torch.zeros(5)}, {"dt": POSITIVE, "state": {"nan": torch.full((5,), NAN), "three numbers": torch.zeros(3)}}),
+        Subject(
+            "lorenz96_step",
+            lorenz96_step,
+            lambda: {"state": torch.zeros(5)},
+            {"dt": POSITIVE, "state": {"nan": torch.full((5,), NAN), "three numbers": torch.zeros(3)}},
+        ),
     ]
 
 

@@ -48,7 +48,9 @@ def _right(result: tuple[TensorDict, TensorDict, bool, list[str]]) -> bool:
 
 
 def _file(entry: Path, part: str) -> Path:
-    files = sorted((path for path in entry.rglob("*") if path.is_file()), key=lambda path: (path.stat().st_size, path.name))
+    files = sorted(
+        (path for path in entry.rglob("*") if path.is_file()), key=lambda path: (path.stat().st_size, path.name)
+    )
     if part == "description":
         return next(path for path in files if path.suffix == ".json")
     return files[-1] if part == "largest" else next(path for path in files if path.suffix != ".json")

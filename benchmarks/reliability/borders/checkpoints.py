@@ -85,7 +85,7 @@ def _zip(file: Path) -> None:
 
 
 def _pickle_in_zip(file: Path) -> None:
-    """torch's layout, with a pickle of somebody else's."""
+    """Torch's layout, with a pickle of somebody else's."""
     buffer = io.BytesIO()
     torch.save({"format": "torch_denkf.training/1"}, buffer)
     with zipfile.ZipFile(buffer) as archive, zipfile.ZipFile(file, "w") as out:
@@ -154,7 +154,21 @@ CONTENT: dict[str, Callable[[dict], Any]] = {
     "a weight of another shape": _weights(lambda value: value[..., :1]),
     "a weight of another precision": _weights(lambda value: value.double()),
     "a weight less": _weights(lambda value: None),
-    **{f"without {key}": (lambda content, key=key: content.pop(key) is None) for key in ("stage", "update", "model", "updates", "results", "settings", "best", "logs", "hooks", "last_metrics")},
+    **{
+        f"without {key}": (lambda content, key=key: content.pop(key) is None)
+        for key in (
+            "stage",
+            "update",
+            "model",
+            "updates",
+            "results",
+            "settings",
+            "best",
+            "logs",
+            "hooks",
+            "last_metrics",
+        )
+    },
 }
 
 
@@ -177,7 +191,9 @@ def cases() -> Iterator[Case]:
             yield Case(border, f"resume, {run}: {what}", words, act, right, needs=sound)
     yield Case(border, "read: taken away", words, partial(_read, gone), needs=sound)
     act = partial(_resume, "done", gone)
-    yield Case(border, "resume: last.pt taken away, best files there", (LAST, "best_sensor.pt"), act, _right, needs=sound)
+    yield Case(
+        border, "resume: last.pt taken away, best files there", (LAST, "best_sensor.pt"), act, _right, needs=sound
+    )
     yield from _settings()
 
 
@@ -230,8 +246,15 @@ def _stages() -> Iterator[Case]:
 
             return TensorDict({"x": torch.rand(8, 1, generator=generator)}, [8])
 
-        settings = {"name": "fit", "loss": lambda batch: {"loss_fit": net(batch["x"]).square().mean()}, "sample": sample, "updates": 2}
-        return FilterTrainer(net, [Stage(**{**settings, **given})], out=folder / "out", device="cpu", progress=False).fit()
+        settings = {
+            "name": "fit",
+            "loss": lambda batch: {"loss_fit": net(batch["x"]).square().mean()},
+            "sample": sample,
+            "updates": 2,
+        }
+        return FilterTrainer(
+            net, [Stage(**{**settings, **given})], out=folder / "out", device="cpu", progress=False
+        ).fit()
 
     for name, values in wrong.items():
         for what, value in values.items():

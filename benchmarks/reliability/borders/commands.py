@@ -30,7 +30,7 @@ def run(words: Sequence[str]) -> str:
     """
 
     def again(message: str) -> int:
-        raise  # noqa: PLE0704 - the error that is being handled
+        raise
 
     command_module._mistake = again  # of this process alone
     out, err = io.StringIO(), io.StringIO()
@@ -196,7 +196,9 @@ OPTIONAL = {("demo", "--out"), ("evaluate", "--out"), ("plot", "--out")}
 def _words(name: str, given: dict[str, Any]) -> list[str]:
     words = [name]
     for option, value in given.items():
-        parts = [] if value is None else [value] if option in ("", "--out", "--root", "--poses") else str(value).split(" ")
+        parts = (
+            [] if value is None else [value] if option in ("", "--out", "--root", "--poses") else str(value).split(" ")
+        )
         words += ([option] if option else []) + list(map(str, parts))
     return words
 
@@ -213,7 +215,12 @@ def _nothing(root: Path) -> None:
 
 
 FILES: dict[str, tuple[str, ...]] = {
-    "odometry": (f"{DRIVE}/calib.txt", f"{DRIVE}/times.txt", "car-odometry/config.json", "car-odometry/weights.safetensors"),
+    "odometry": (
+        f"{DRIVE}/calib.txt",
+        f"{DRIVE}/times.txt",
+        "car-odometry/config.json",
+        "car-odometry/weights.safetensors",
+    ),
     "evaluate": ("kitti/poses/town.txt", f"{DRIVE}/calib.txt", "car-odometry/config.json"),
     "plot": ("path.csv",),
     "collect-ur5": ("ur5/demo-000001.npz", "ur5/demos.jsonl"),
@@ -224,11 +231,15 @@ def _files() -> Iterator[Case]:
     for name, files in FILES.items():
         for file in files:
             for what, change in BYTES.items():
-                sound = "cut by a byte" in what and not file.endswith((".npz", ".json", ".safetensors")) or (file.endswith("calib.txt") and "UTF" not in what)
+                sound = ("cut by a byte" in what and not file.endswith((".npz", ".json", ".safetensors"))) or (
+                    file.endswith("calib.txt") and "UTF" not in what
+                )
                 changes = {} if name != "collect-ur5" else {"--out": "ur5", "--verify": None}
                 act = partial(_act, name, changes, lambda root, file=file, change=change: written(root / file, change))
                 right = (lambda said: bool(said)) if sound else None
-                yield Case("commands", f"{name}, {Path(file).name} {what}", (Path(file).name,), act, right, WITHIN, base)
+                yield Case(
+                    "commands", f"{name}, {Path(file).name} {what}", (Path(file).name,), act, right, WITHIN, base
+                )
             act = partial(_act, name, changes, lambda root, file=file: gone(root / file))
             words = (Path(file).name, "town")
             may = (lambda said: bool(said)) if file.endswith("times.txt") and name == "evaluate" else None
@@ -241,8 +252,13 @@ def _files() -> Iterator[Case]:
         "another header": lambda lines: ["a,b,c", *lines[1:]],
     }
     for what, change in row.items():
-        edit = lambda root, change=change: (root / "path.csv").write_text("\n".join(change((root / "path.csv").read_text().splitlines())) + "\n")  # noqa: E731
-        yield Case("commands", f"plot, path.csv {what}", ("path.csv",), partial(_act, "plot", {}, edit), None, WITHIN, base)
+
+        def rewrite(root: Path, change: Callable[[list[str]], list[str]] = change) -> None:
+            file = root / "path.csv"
+            file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
+
+        act = partial(_act, "plot", {}, rewrite)
+        yield Case("commands", f"plot, path.csv {what}", ("path.csv",), act, None, WITHIN, base)
     for what, change in {**kitti.POSES, "three poses 1e7 m apart": lambda line: line}.items():
         if what == "an empty line":
             continue
@@ -268,9 +284,22 @@ def cases() -> Iterator[Case]:
                 changes = {option: value}
                 if (name, option) == ("odometry", "--fps"):
                     changes["--times"] = None
-                words = (option or "FRAMES_OR_VIDEO", option.removeprefix("--").replace("-", "_"), value, *ALSO.get((name, option), ()))
+                words = (
+                    option or "FRAMES_OR_VIDEO",
+                    option.removeprefix("--").replace("-", "_"),
+                    value,
+                    *ALSO.get((name, option), ()),
+                )
                 shown = _without_times if "--times" in changes and option == "--fps" else _act
-                yield Case("commands", f"{name} {option} {what}", tuple(filter(None, words)), partial(shown, name, changes, _nothing), None, WITHIN, base)
+                yield Case(
+                    "commands",
+                    f"{name} {option} {what}",
+                    tuple(filter(None, words)),
+                    partial(shown, name, changes, _nothing),
+                    None,
+                    WITHIN,
+                    base,
+                )
         for option in COMMANDS[name]:
             if option in ("--out", "--root", "--calibration") and (name, option) not in OPTIONAL:
                 act = partial(_without, name, option)

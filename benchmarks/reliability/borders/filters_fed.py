@@ -298,7 +298,9 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], Callable[[Filter, TensorDict], Any]]] 
     "chunk a fraction": (("chunk",), lambda f, x: f.compile(chunk=1.5)),
     "flat slices without marks": (
         ("is_init", "SliceSampler", "sequence", "episode"),
-        lambda f, x: DEnKFTransform(f)(x.exclude("is_init").set("episode", torch.arange(B)[:, None].expand(B, T)).reshape(-1)),
+        lambda f, x: DEnKFTransform(f)(
+            x.exclude("is_init").set("episode", torch.arange(B)[:, None].expand(B, T)).reshape(-1)
+        ),
     ),
     "diagnostics that are not written": (("diagnostics",), lambda f, x: DEnKFTransform(f, diagnostics=["nothing"])),
     "a transform of no filter": (("Filter", "filter"), lambda f, x: DEnKFTransform(torch.nn.Linear(2, 2))),
@@ -323,7 +325,11 @@ def cases() -> Iterator[Case]:
                 act = partial(_damaged, subject, run, _hidden(value))
                 yield Case(border, f"{subject.name}, {run}: {value} where the mask says missing", words, act, right)
             for what, damage in MASKS.items():
-                right = partial(_equals, subject, run, _sound) if what in ("float", "int64", "without its last dimension") else None
+                right = (
+                    partial(_equals, subject, run, _sound)
+                    if what in ("float", "int64", "without its last dimension")
+                    else None
+                )
                 act = partial(_damaged, subject, run, damage)
                 yield Case(border, f"{subject.name}, {run}: mask {what}", ("observed",), act, right)
         for number, key in enumerate(_seeded(subject.make).carry_keys):
@@ -350,7 +356,13 @@ def _rejecting() -> Iterator[Case]:
                 return _rollout(_seeded(subject.make), damage(subject, _frames(subject)), check_finite=False)
 
             right = partial(_goes_on, subject, damage)
-            yield Case("readings", f"{subject.name}, transform without check_finite: reading {what}", (subject.reading,), act, right)
+            yield Case(
+                "readings",
+                f"{subject.name}, transform without check_finite: reading {what}",
+                (subject.reading,),
+                act,
+                right,
+            )
 
 
 def _goes_on(subject: Subject, damage: Damage, result: TensorDict) -> bool:

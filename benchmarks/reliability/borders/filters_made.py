@@ -24,8 +24,18 @@ from benchmarks.reliability.damage import (
     matrix,
     vector,
 )
-from torch_denkf.filters import DPF, EKF, UKF, BackpropKF, DEnKF, Filter, KalmanFilter, LSTMFilter
-from torch_denkf.filters import MixtureParticleFilter, ParticleFilter
+from torch_denkf.filters import (
+    DPF,
+    EKF,
+    UKF,
+    BackpropKF,
+    DEnKF,
+    Filter,
+    KalmanFilter,
+    LSTMFilter,
+    MixtureParticleFilter,
+    ParticleFilter,
+)
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianLikelihood,
@@ -113,7 +123,7 @@ def _make_filter(modules: Any, **options: Any) -> Filter:
 
 def subjects() -> list[Subject]:
     """All filters, with what each takes."""
-    modules = {name: MODULE for name in ("transition", "observation", "noise", "initial")}
+    modules = dict.fromkeys(("transition", "observation", "noise", "initial"), MODULE)
     same_for_all = {"variance_ceiling": CEILING}
     gaussian = {"process_noise": STDS, "inflation": POSITIVE, "angles": dims(2), **same_for_all}
     sigma = {"alpha": POSITIVE, "beta": {"nan": float("nan"), "inf": float("inf"), "text": "much"}}

@@ -17,7 +17,13 @@ from tensordict import TensorDict
 
 from benchmarks.reliability.case import Case, apart
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, same, same_but, written
-from torch_denkf.data import KITTIOdometryExperienceReplay, list_kitti_drives, read_kitti_drive, with_motion, write_drives
+from torch_denkf.data import (
+    KITTIOdometryExperienceReplay,
+    list_kitti_drives,
+    read_kitti_drive,
+    with_motion,
+    write_drives,
+)
 
 DRIVE, FRAMES, SIZE = "town", 10, (24, 72)
 ROWS = (0, 4, FRAMES - 1)  # that are damaged
@@ -95,7 +101,11 @@ def _true_times(row: int, root_times: np.ndarray, result: TensorDict) -> bool:
     expected = reference()
     keep = [k for k in range(FRAMES) if k != row and not (row == 0 and k == 1)]
     others = torch.equal(result["state"][keep], expected["state"][keep]) if len(result) == FRAMES else False
-    masks = [key for key in result.keys() if result[key].dtype == torch.bool and key in ("frame_valid", "state_valid", "motion_valid", "observed")]
+    masks = [
+        key
+        for key in result.keys()  # noqa: SIM118 - a tensordict's values are rows
+        if result[key].dtype == torch.bool and key in ("frame_valid", "state_valid", "motion_valid", "observed")
+    ]
     marked = any(not bool(result[key][row].all()) for key in masks)
     dt = np.diff(root_times)[max(row - 1, 0)]
     way = (expected["state"][max(row, 1), :2] - expected["state"][max(row, 1) - 1, :2]).norm()
@@ -214,17 +224,28 @@ PICTURES: dict[str, tuple[Change, bool]] = {
 
 
 def _files() -> Iterator[Case]:
-    files = {"poses": poses, "times.txt": lambda root: sequence(root) / "times.txt", "calib.txt": lambda root: sequence(root) / "calib.txt"}
+    files = {
+        "poses": poses,
+        "times.txt": lambda root: sequence(root) / "times.txt",
+        "calib.txt": lambda root: sequence(root) / "calib.txt",
+    }
     for name, file in files.items():
         word = f"{DRIVE}.txt" if name == "poses" else name
         for what, change in BYTES.items():
             act = partial(_act, lambda root, file=file, change=change: written(file(root), change))
             right = _equal if name == "calib.txt" else _equal_so_far  # of calib.txt another row may be damaged
             yield Case("kitti", f"{name} {what}", (word,), act, right)
-        yield Case("kitti", f"{name} is a folder", (word,), partial(_act, lambda root, file=file: (gone(file(root)), file(root).mkdir())))
+        yield Case(
+            "kitti",
+            f"{name} is a folder",
+            (word,),
+            partial(_act, lambda root, file=file: (gone(file(root)), file(root).mkdir())),
+        )
     for name in ("poses", "calib.txt"):
         word = f"{DRIVE}.txt" if name == "poses" else name
-        yield Case("kitti", f"{name} taken away", (word,), partial(_act, lambda root, file=files[name]: gone(file(root))))
+        yield Case(
+            "kitti", f"{name} taken away", (word,), partial(_act, lambda root, file=files[name]: gone(file(root)))
+        )
     for what, (change, may_go_on) in PICTURES.items():
         right = partial(_equal_or_missing, 4) if may_go_on else None
         words = ("000004.png", "0004.png", "4.png", "-00004.png", "000004.PNG", "000999.png", "9" * 30 + ".png")
@@ -245,8 +266,14 @@ def _files() -> Iterator[Case]:
 def _numbers() -> Iterator[Case]:
     for row in ROWS:
         for what, change in POSES.items():
-            right = (lambda result: _equal(result[: FRAMES - 1]) or same(result, reference()[: FRAMES - 1])) if row == FRAMES - 1 and what == "an empty line" else None
-            yield Case("kitti", f"pose {row}: {what}", (f"{DRIVE}.txt",), partial(_act, on_line(poses, row, change)), right)
+            right = (
+                (lambda result: _equal(result[: FRAMES - 1]) or same(result, reference()[: FRAMES - 1]))
+                if row == FRAMES - 1 and what == "an empty line"
+                else None
+            )
+            yield Case(
+                "kitti", f"pose {row}: {what}", (f"{DRIVE}.txt",), partial(_act, on_line(poses, row, change)), right
+            )
         for what, change in TIMES.items():
             act = partial(_act, on_line(lambda root: sequence(root) / "times.txt", row, change))
             yield Case("kitti", f"time {row}: {what}", ("times.txt",), act)
@@ -270,9 +297,23 @@ def _numbers() -> Iterator[Case]:
 
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "size": {"zero": (0, 10), "negative": (-5, 10), "one number": (10,), "text": "ab", "fractions": (1.5, 2.5), "a number": 10},
+    "size": {
+        "zero": (0, 10),
+        "negative": (-5, 10),
+        "one number": (10,),
+        "text": "ab",
+        "fractions": (1.5, 2.5),
+        "a number": 10,
+    },
     "camera": {"unknown": "image_9", "outside": "../../../etc", "absolute": "/etc", "a number": 2},
-    "drive": {"unknown": "nope", "outside": "../..", "absolute": "/etc", "negative": -1, "a fraction": 0.5, "empty": ""},
+    "drive": {
+        "unknown": "nope",
+        "outside": "../..",
+        "absolute": "/etc",
+        "negative": -1,
+        "a fraction": 0.5,
+        "empty": "",
+    },
     "colour": {"text": "yes", "a number": 3},
 }
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -292,13 +333,19 @@ OPTIONS: dict[str, dict[str, Any]] = {
 def _arguments() -> Iterator[Case]:
     for name, values in ARGUMENTS.items():
         for what, value in values.items():
-            words = {"drive": ("sequence", "sequences", "poses", "drive", "/etc"), "camera": ("camera", "image_9")}.get(name, (name,))
-            yield Case("kitti", f"read_kitti_drive({name}: {what})", words, partial(_act, lambda root: None, **{name: value}))
+            words = {"drive": ("sequence", "sequences", "poses", "drive", "/etc"), "camera": ("camera", "image_9")}.get(
+                name, (name,)
+            )
+            yield Case(
+                "kitti", f"read_kitti_drive({name}: {what})", words, partial(_act, lambda root: None, **{name: value})
+            )
     for name, values in OPTIONS.items():
         for what, value in values.items():
 
             def act(folder: Path, name: str = name, value: Any = value) -> Any:
-                data = KITTIOdometryExperienceReplay(copied(sound(), folder), **{"size": SIZE, "cache": None, name: value})
+                data = KITTIOdometryExperienceReplay(
+                    copied(sound(), folder), **{"size": SIZE, "cache": None, name: value}
+                )
                 return data.sample() if name in ("batch_size", "num_slices", "slice_len") else data[:]
 
             also = {"cameras": ("camera", "image_7"), "drives": ("sequences",), "slice_len": ("slices",)}.get(name, ())

@@ -10,7 +10,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 import torch
@@ -144,7 +143,9 @@ def _metadata() -> Iterator[Case]:
             act = partial(_act, 2, lambda root, file=file, change=change: written(root / file, change))
             right = partial(_equal, 2) if what == "cut by a byte" and file == EPISODES else None
             yield Case("lerobot", f"{file} {what}", (Path(file).name,), act, right)
-        act = partial(_act, 3, lambda root, change=change: written(root / "meta/episodes/chunk-000/file-000.parquet", change))
+        act = partial(
+            _act, 3, lambda root, change=change: written(root / "meta/episodes/chunk-000/file-000.parquet", change)
+        )
         yield Case("lerobot", f"episodes of version 3 {what}", ("file-000.parquet",), act, partial(_equal, 3))
     for path, values in FIELDS.items():
         words = (*path, Path(INFO).name, "episode_000002.parquet")
@@ -155,11 +156,29 @@ def _metadata() -> Iterator[Case]:
         right = partial(_equal, 2) if path[0] == "chunks_size" else None
         yield Case("lerobot", f"info.json without {'/'.join(path)}", words, partial(_act, 2, _drop(*path)), right)
     for what, value in HOSTILE_PATHS.items():
-        value = value.replace("episode_index", "file_index").replace("episode_chunk", "chunk_index") if isinstance(value, str) else value
-        yield Case("lerobot", f"info.json video_path: {what}", ("video_path", "info.json"), partial(_act, 3, _set("video_path", value=value)))
+        value = (
+            value.replace("episode_index", "file_index").replace("episode_chunk", "chunk_index")
+            if isinstance(value, str)
+            else value
+        )
+        yield Case(
+            "lerobot",
+            f"info.json video_path: {what}",
+            ("video_path", "info.json"),
+            partial(_act, 3, _set("video_path", value=value)),
+        )
     for file in (INFO, EPISODES, DATA):
-        yield Case("lerobot", f"{file} taken away", (Path(file).name,), partial(_act, 2, lambda root, file=file: gone(root / file)))
-    for what, change in (("no root", gone), ("no data", lambda root: gone(root / "data")), ("no meta", lambda root: gone(root / "meta"))):
+        yield Case(
+            "lerobot",
+            f"{file} taken away",
+            (Path(file).name,),
+            partial(_act, 2, lambda root, file=file: gone(root / file)),
+        )
+    for what, change in (
+        ("no root", gone),
+        ("no data", lambda root: gone(root / "data")),
+        ("no meta", lambda root: gone(root / "meta")),
+    ):
         yield Case("lerobot", what, ("info.json", "data", "meta"), partial(_act, 2, change))
 
 
@@ -174,10 +193,22 @@ def _line(change: Callable[[dict], Any]) -> Change:
 
 
 def _episodes() -> Iterator[Case]:
-    lines: dict[str, Callable[[dict], Any]] = {"a list": lambda line: [], "a number": lambda line: 3, "a text": lambda line: "x"}
+    lines: dict[str, Callable[[dict], Any]] = {
+        "a list": lambda line: [],
+        "a number": lambda line: 3,
+        "a text": lambda line: "x",
+    }
     for key in ("episode_index", "length"):
         lines[f"without {key}"] = lambda line, key=key: line.pop(key) and None
-        for what, value in {"text": "x", "nothing": None, "negative": -2, "huge": 10**12, "a fraction": 1.5, "nan": NAN, "one more": None}.items():
+        for what, value in {
+            "text": "x",
+            "nothing": None,
+            "negative": -2,
+            "huge": 10**12,
+            "a fraction": 1.5,
+            "nan": NAN,
+            "one more": None,
+        }.items():
             if what == "one more":
                 lines[f"{key} one more"] = lambda line, key=key: line.update({key: line[key] + 1})
             else:
@@ -190,7 +221,14 @@ def _episodes() -> Iterator[Case]:
     for name, values in columns.items():
         for value in values:
             act = partial(_act, 3, _episode_column(f"videos/{CAMERA}/{name}", value))
-            words = ("file-000.parquet", "file-000.mkv", name, f"chunk-{value:03d}" if isinstance(value, int) else name, "file--01.mkv", "file-1000000000.mkv")
+            words = (
+                "file-000.parquet",
+                "file-000.mkv",
+                name,
+                f"chunk-{value:03d}" if isinstance(value, int) else name,
+                "file--01.mkv",
+                "file-1000000000.mkv",
+            )
             yield Case("lerobot", f"version 3, {name} {value}", words, act)
 
 
@@ -262,10 +300,24 @@ def _data() -> Iterator[Case]:
             if what == "1e38":
                 continue
             yield Case("lerobot", f"{key} {what}", (*words, key), partial(_act, 2, _cell(key, value)), masked)
-        yield Case("lerobot", f"{key} of another width in a row", (*words, key), partial(_act, 2, _column(key, lambda v: [*v[:2], v[2][:1], *v[3:]])), masked)
+        yield Case(
+            "lerobot",
+            f"{key} of another width in a row",
+            (*words, key),
+            partial(_act, 2, _column(key, lambda v: [*v[:2], v[2][:1], *v[3:]])),
+            masked,
+        )
         yield Case("lerobot", f"{key} of text", (*words, key), partial(_act, 2, _column(key, lambda v: ["x"] * len(v))))
-        yield Case("lerobot", f"{key} taken away", (*words, key), partial(_act, 2, _table(lambda c, key=key: c.pop(key))))
-        yield Case("lerobot", f"{key} all nan", (*words, key), partial(_act, 2, _column(key, lambda v: [[NAN] * len(r) for r in v])), partial(_masked, list(range(6, 11)), 2))
+        yield Case(
+            "lerobot", f"{key} taken away", (*words, key), partial(_act, 2, _table(lambda c, key=key: c.pop(key)))
+        )
+        yield Case(
+            "lerobot",
+            f"{key} all nan",
+            (*words, key),
+            partial(_act, 2, _column(key, lambda v: [[NAN] * len(r) for r in v])),
+            partial(_masked, list(range(6, 11)), 2),
+        )
     stamps: dict[str, Callable[[list], list]] = {
         "all zero": lambda v: [0.0] * len(v),
         "nan": lambda v: [*v[:2], NAN, *v[3:]],
@@ -279,14 +331,24 @@ def _data() -> Iterator[Case]:
     }
     for what, values in stamps.items():
         right = masked if what in ("a repeated stamp", "nan", "null", "inf", "1e30") else None
-        yield Case("lerobot", f"timestamp {what}", (*words, "timestamp"), partial(_act, 2, _column("timestamp", values)), right)
+        yield Case(
+            "lerobot", f"timestamp {what}", (*words, "timestamp"), partial(_act, 2, _column("timestamp", values)), right
+        )
     for key in ("frame_index", "episode_index"):
-        for what, values in {"all zero": lambda v: [0] * len(v), "null": lambda v: [*v[:2], None, *v[3:]], "text": lambda v: ["x"] * len(v), "backwards": lambda v: v[::-1], "nan": lambda v: [NAN, *map(float, v[1:])]}.items():
+        for what, values in {
+            "all zero": lambda v: [0] * len(v),
+            "null": lambda v: [*v[:2], None, *v[3:]],
+            "text": lambda v: ["x"] * len(v),
+            "backwards": lambda v: v[::-1],
+            "nan": lambda v: [NAN, *map(float, v[1:])],
+        }.items():
             if key == "episode_index" and what == "backwards":
                 continue
             yield Case("lerobot", f"{key} {what}", (*words, key), partial(_act, 2, _column(key, values)))
     yield Case("lerobot", "a row less", words, partial(_act, 2, _table(lambda c: [v.pop() for v in c.values()])))
-    yield Case("lerobot", "a row more", words, partial(_act, 2, _table(lambda c: [v.append(v[-1]) for v in c.values()])))
+    yield Case(
+        "lerobot", "a row more", words, partial(_act, 2, _table(lambda c: [v.append(v[-1]) for v in c.values()]))
+    )
     pictures: dict[str, Any] = {
         "null": lambda cell: None,
         "no bytes": lambda cell: {"bytes": b"", "path": None},
@@ -301,13 +363,14 @@ def _data() -> Iterator[Case]:
     }
     for what, value in pictures.items():
         yield Case("lerobot", f"picture {what}", (*words, CAMERA), partial(_act, 2, _picture(value)), masked)
-    outside = lambda root: (root.parent / "secret.png").write_bytes(parquet.read_table(root / DATA)[CAMERA][2].as_py()["bytes"])  # noqa: E731
 
     def planted(root: Path) -> None:
-        outside(root)
+        (root.parent / "secret.png").write_bytes(parquet.read_table(root / DATA)[CAMERA][2].as_py()["bytes"])
         _picture(lambda cell: {"bytes": None, "path": "../secret.png"})(root)
 
-    yield Case("lerobot", "picture of a file outside that is there", (*words, "secret.png"), partial(_act, 2, planted), _hidden)
+    yield Case(
+        "lerobot", "picture of a file outside that is there", (*words, "secret.png"), partial(_act, 2, planted), _hidden
+    )
     video = f"videos/{CAMERA}/chunk-000/file-000.mkv"
     for what, change in BYTES.items():
         if "flipped" in what:  # a video has no checksum: a picture may be wrong, and nothing can tell
@@ -315,7 +378,12 @@ def _data() -> Iterator[Case]:
         act = partial(_act, 3, lambda root, change=change: written(root / video, change))
         yield Case("lerobot", f"video {what}", ("file-000.mkv",), act, _video)
     yield Case("lerobot", "video taken away", ("file-000.mkv",), partial(_act, 3, lambda root: gone(root / video)))
-    yield Case("lerobot", "video a link to a device", ("file-000.mkv",), partial(_act, 3, lambda root: (gone(root / video), (root / video).symlink_to("/dev/zero"))))
+    yield Case(
+        "lerobot",
+        "video a link to a device",
+        ("file-000.mkv",),
+        partial(_act, 3, lambda root: (gone(root / video), (root / video).symlink_to("/dev/zero"))),
+    )
 
 
 def _hidden(result: TensorDict) -> bool:

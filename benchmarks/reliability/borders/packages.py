@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from tensordict import TensorDict
 
 from benchmarks.reliability.borders.checkpoints import HOSTILE
 from benchmarks.reliability.case import Case, apart
-from benchmarks.reliability.damage import BYTES, finite, gone, same, written
+from benchmarks.reliability.damage import BYTES, gone, same, written
 from benchmarks.reliability.hostile import ran
 from tests.filters.factories import linear_kalman
 from torch_denkf.deployment import export_step, load_step
@@ -77,7 +76,10 @@ CALLS: dict[str, tuple[tuple[str, ...], Callable[[dict[str, Any]], Any]]] = {}
 for _name in ("observation", "observed", "belief.mean", "belief.cov"):
     CALLS |= {
         f"without {_name}": ((_name,), lambda given, name=_name: given.pop(name) is None or None),
-        f"{_name} too wide": ((_name,), lambda given, name=_name: given.update({name: given[name].repeat(*[2] * given[name].ndim)})),
+        f"{_name} too wide": (
+            (_name,),
+            lambda given, name=_name: given.update({name: given[name].repeat(*[2] * given[name].ndim)}),
+        ),
         f"{_name} a batch": ((_name,), lambda given, name=_name: given.update({name: given[name][None]})),
         f"{_name} float64": ((_name,), lambda given, name=_name: given.update({name: given[name].double()})),
         f"{_name} int64": ((_name,), lambda given, name=_name: given.update({name: given[name].long()})),
@@ -109,7 +111,9 @@ SIGNATURES: dict[str, Callable[[str], str]] = {
     "no JSON": lambda text: "x",
     "a list": lambda text: "[]",
     "an empty object": lambda text: "{}",
-    "an input less": lambda text: text.replace('["observed", [1], "torch.bool"]', "").replace(", ,", ",").replace("[,", "[").replace(", ]", "]"),
+    "an input less": lambda text: (
+        text.replace('["observed", [1], "torch.bool"]', "").replace(", ,", ",").replace("[,", "[").replace(", ]", "]")
+    ),
     "an output less": lambda text: text.replace('"belief.var"', "").replace(", ]", "]"),
     "another shape": lambda text: text.replace('["observation", [2]', '["observation", [3]'),
 }
@@ -120,20 +124,30 @@ EXPORT: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "an example without a reading": (("observation",), {"example": TensorDict({})}),
     "an example of nothing": (("example",), {"example": None}),
     "no filter": (("filter",), {"filter": torch.nn.Linear(2, 2)}),
-    "a NaN in the example": (("observation", "example"), {"example": TensorDict({"observation": torch.full((2,), torch.nan)})}),
+    "a NaN in the example": (
+        ("observation", "example"),
+        {"example": TensorDict({"observation": torch.full((2,), torch.nan)})},
+    ),
 }
 
 
 def _export(given: dict[str, Any], folder: Path) -> Any:
     (folder / "file").write_text("")
-    settings = {"filter": linear_kalman(), "example": TensorDict({"observation": torch.ones(2)}), "path": "step.pt2", **given}
+    settings = {
+        "filter": linear_kalman(),
+        "example": TensorDict({"observation": torch.ones(2)}),
+        "path": "step.pt2",
+        **given,
+    }
     settings["path"] = folder / settings["path"]
     return export_step(**settings, compiled=False)
 
 
 def _too_large(folder: Path) -> Any:
     """Writing to a disk that is full."""
-    return export_step(linear_kalman(), TensorDict({"observation": torch.ones(2)}), "/dev/full/step.pt2", compiled=False)
+    return export_step(
+        linear_kalman(), TensorDict({"observation": torch.ones(2)}), "/dev/full/step.pt2", compiled=False
+    )
 
 
 def cases() -> Iterator[Case]:

@@ -107,7 +107,13 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "car-odometry": {
         "ensemble_size": {"zero": 0, "negative": -3, "text": "x", "nothing": None},
         "dt": {"zero": 0.0, "negative": -1.0, "nan": NAN, "text": "x", "nothing": None},
-        "velocity_std": {"negative": [-1.0, 1.0], "zero": [0.0, 0.0], "nan": [NAN, NAN], "text": "x", "too long": [1.0] * 3},
+        "velocity_std": {
+            "negative": [-1.0, 1.0],
+            "zero": [0.0, 0.0],
+            "nan": [NAN, NAN],
+            "text": "x",
+            "too long": [1.0] * 3,
+        },
         "velocity_mean": {"nan": [NAN, 0.0], "too long": [1.0] * 3, "text": "x"},
         "lags": {"zero": 0, "negative": -3, "text": "x", "a fraction": 1.5},
         "longest": {"zero": 0, "negative": -3, "text": "x", "a fraction": 1.5},
@@ -141,13 +147,25 @@ def cases() -> Iterator[Case]:
             for what, change in BYTES.items():
                 act = partial(_load, name, lambda folder, file=file, change=change: written(folder / file, change))
                 yield Case(border, f"{name}, {file}: {what}", (file,), act, _right)
-            yield Case(border, f"{name}, {file} taken away", (file,), partial(_load, name, lambda folder, file=file: gone(folder / file)))
-            yield Case(border, f"{name}, {file} a folder", (file,), partial(_load, name, lambda folder, file=file: (gone(folder / file), (folder / file).mkdir())))
+            yield Case(
+                border,
+                f"{name}, {file} taken away",
+                (file,),
+                partial(_load, name, lambda folder, file=file: gone(folder / file)),
+            )
+            yield Case(
+                border,
+                f"{name}, {file} a folder",
+                (file,),
+                partial(_load, name, lambda folder, file=file: (gone(folder / file), (folder / file).mkdir())),
+            )
             link = lambda folder, file=file: (gone(folder / file), (folder / file).symlink_to("/dev/zero"))  # noqa: E731
             yield Case(border, f"{name}, {file} a link to a device", (file,), partial(_load, name, link), within=4)
         for field, values in FIELDS.items():
             for what, value in values.items():
-                act = partial(_load, name, config(lambda content, field=field, value=value: content.update({field: value})))
+                act = partial(
+                    _load, name, config(lambda content, field=field, value=value: content.update({field: value}))
+                )
                 yield Case(border, f"{name}, {field}: {what}", (CONFIG,), act)
             act = partial(_load, name, config(lambda content, field=field: content.pop(field) is None or None))
             yield Case(border, f"{name} without {field}", (CONFIG,), act)
@@ -166,8 +184,17 @@ def cases() -> Iterator[Case]:
                     _signed(folder)
 
             if what != "a device":
-                yield Case(border, f"{name}, weights that are {what}", (WEIGHTS,), partial(_load, name, plant), within=4)
-    for what, value in {"unknown": "walker", "outside": "../../etc", "absolute": "/etc", "empty": "", "a zero byte": "a\0b", "a number": 3}.items():
+                yield Case(
+                    border, f"{name}, weights that are {what}", (WEIGHTS,), partial(_load, name, plant), within=4
+                )
+    for what, value in {
+        "unknown": "walker",
+        "outside": "../../etc",
+        "absolute": "/etc",
+        "empty": "",
+        "a zero byte": "a\0b",
+        "a number": 3,
+    }.items():
         words = (str(value), "config.json", "name_or_folder", "trained filter")
         yield Case(border, f"from_pretrained({what})", words, lambda folder, value=value: from_pretrained(value))
     model = torch.nn.Linear(2, 2)
@@ -179,4 +206,9 @@ def cases() -> Iterator[Case]:
         "training that JSON does not know": ("training", {"builder": "x", "settings": {}, "training": {"a": object()}}),
     }
     for what, (word, given) in saves.items():
-        yield Case(border, f"save_pretrained: {what}", (word,), lambda folder, given=given: save_pretrained(model, folder, **given))
+        yield Case(
+            border,
+            f"save_pretrained: {what}",
+            (word,),
+            lambda folder, given=given: save_pretrained(model, folder, **given),
+        )

@@ -90,16 +90,47 @@ def _tables() -> Iterator[Case]:
     for file in ("table.csv", "table.parquet"):
         for what, change in BYTES.items():
             act = partial(_act, lambda root, file=file, change=change: written(root / file, change), table=file)
-            yield Case("recordings", f"{file} {what}", (file,), act, partial(_equal, "") if file == "table.parquet" or what == "cut by a byte" else None)
-        yield Case("recordings", f"{file} taken away", (file,), partial(_act, lambda root, file=file: gone(root / file), table=file))
-        yield Case("recordings", f"{file} a folder", (file,), partial(_act, lambda root, file=file: (gone(root / file), (root / file).mkdir()), table=file))
+            yield Case(
+                "recordings",
+                f"{file} {what}",
+                (file,),
+                act,
+                partial(_equal, "") if file == "table.parquet" or what == "cut by a byte" else None,
+            )
+        yield Case(
+            "recordings",
+            f"{file} taken away",
+            (file,),
+            partial(_act, lambda root, file=file: gone(root / file), table=file),
+        )
+        yield Case(
+            "recordings",
+            f"{file} a folder",
+            (file,),
+            partial(_act, lambda root, file=file: (gone(root / file), (root / file).mkdir()), table=file),
+        )
         link = lambda root, file=file: (gone(root / file), (root / file).symlink_to("/dev/zero"))  # noqa: E731
         yield Case("recordings", f"{file} a link to a device", (file,), partial(_act, link, table=file))
-    values = {"nan": "nan", "inf": "inf", "a word": "far", "empty": "", "a comma for a point": '"1,5"', "hexadecimal": "0x1f", "1e400": "1e400", "NULL": "NULL", "two points": "1.2.3"}
+    values = {
+        "nan": "nan",
+        "inf": "inf",
+        "a word": "far",
+        "empty": "",
+        "a comma for a point": '"1,5"',
+        "hexadecimal": "0x1f",
+        "1e400": "1e400",
+        "NULL": "NULL",
+        "two points": "1.2.3",
+    }
     for row in (1, 5, ROWS):
         for column, name in enumerate(("time", "x", "y")):
             for what, value in values.items():
-                yield Case("recordings", f"{name} in row {row}: {what}", ("table.csv",), partial(_act, _cell(row, column, value)))
+                yield Case(
+                    "recordings",
+                    f"{name} in row {row}: {what}",
+                    ("table.csv",),
+                    partial(_act, _cell(row, column, value)),
+                )
     times = {"back": "0.05", "the same": "0.3", "an hour on": "3600.4", "1e300": "1e300", "negative": "-3"}
     for what, value in times.items():
         right = _with_gap if what == "an hour on" else None
@@ -135,7 +166,13 @@ def _pictures() -> Iterator[Case]:
             act = partial(_act, lambda root, change=change: written(root / "run.mkv", change), camera="video")
             yield Case("recordings", f"video {what}", ("run.mkv", "stamps.csv"), act, partial(_shown, "video"))
         act = partial(_act, lambda root, change=change: written(root / "stamps.csv", change), camera="video")
-        yield Case("recordings", f"video's stamps {what}", ("stamps.csv",), act, partial(_equal, "video") if what == "cut by a byte" else None)
+        yield Case(
+            "recordings",
+            f"video's stamps {what}",
+            ("stamps.csv",),
+            act,
+            partial(_equal, "video") if what == "cut by a byte" else None,
+        )
         act = partial(_act, lambda root, change=change: written(root / "images/0.5.png", change), camera="images")
         yield Case("recordings", f"image {what}", ("0.5.png",), act, partial(_shown, "images"))
     images = lambda root: root / "images"  # noqa: E731
@@ -145,16 +182,46 @@ def _pictures() -> Iterator[Case]:
         "a name that is no time": (lambda root: (images(root) / "0.5.png").rename(images(root) / "half.png"), False),
         "a name that is nan": (lambda root: (images(root) / "0.5.png").rename(images(root) / "nan.png"), False),
         "a name that is inf": (lambda root: (images(root) / "0.5.png").rename(images(root) / "inf.png"), False),
-        "a time twice": (lambda root: (images(root) / "0.50.png").write_bytes((images(root) / "0.5.png").read_bytes()), False),
-        "a folder as an image": (lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").mkdir()), True),
-        "a link to nowhere": (lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").symlink_to("nowhere")), True),
-        "a link to a device": (lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").symlink_to("/dev/zero")), True),
+        "a time twice": (
+            lambda root: (images(root) / "0.50.png").write_bytes((images(root) / "0.5.png").read_bytes()),
+            False,
+        ),
+        "a folder as an image": (
+            lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").mkdir()),
+            True,
+        ),
+        "a link to nowhere": (
+            lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").symlink_to("nowhere")),
+            True,
+        ),
+        "a link to a device": (
+            lambda root: (gone(images(root) / "0.5.png"), (images(root) / "0.5.png").symlink_to("/dev/zero")),
+            True,
+        ),
     }
     for what, (change, may_go_on) in changes.items():
         words = ("images", "0.5.png", "half.png", "nan.png", "inf.png", "0.50.png")
-        yield Case("recordings", f"images: {what}", words, partial(_act, change, camera="images"), partial(_shown, "images") if may_go_on else None)
-    yield Case("recordings", "video taken away", ("run.mkv",), partial(_act, lambda root: gone(root / "run.mkv"), camera="video"))
-    yield Case("recordings", "video a link to a device", ("run.mkv", "/dev/zero"), partial(_act, lambda root: (gone(root / "run.mkv"), (root / "run.mkv").symlink_to("/dev/zero")), camera="video"))
+        yield Case(
+            "recordings",
+            f"images: {what}",
+            words,
+            partial(_act, change, camera="images"),
+            partial(_shown, "images") if may_go_on else None,
+        )
+    yield Case(
+        "recordings",
+        "video taken away",
+        ("run.mkv",),
+        partial(_act, lambda root: gone(root / "run.mkv"), camera="video"),
+    )
+    yield Case(
+        "recordings",
+        "video a link to a device",
+        ("run.mkv", "/dev/zero"),
+        partial(
+            _act, lambda root: (gone(root / "run.mkv"), (root / "run.mkv").symlink_to("/dev/zero")), camera="video"
+        ),
+    )
 
 
 def _shown(camera: str, result: TensorDict) -> bool:
@@ -165,8 +232,14 @@ def _shown(camera: str, result: TensorDict) -> bool:
     found, places = leaves(result), result["time"].squeeze(-1)
     rows = [int((expected["time"].squeeze(-1) - time).abs().argmin()) for time in places]
     seen = found["observed"].squeeze(-1)
-    equal = all(bool((value == leaves(expected)[key][rows]).all()) for key, value in found.items() if key in ("state", "state_observed"))
-    pictures = bool((found["pixels"][seen] == expected["pixels"][rows][seen]).all()) and not bool(found["pixels"][~seen].any())
+    equal = all(
+        bool((value == leaves(expected)[key][rows]).all())
+        for key, value in found.items()
+        if key in ("state", "state_observed")
+    )
+    pictures = bool((found["pixels"][seen] == expected["pixels"][rows][seen]).all()) and not bool(
+        found["pixels"][~seen].any()
+    )
     return finite(result) and equal and pictures and len(result) >= ROWS - 2
 
 
@@ -189,14 +262,32 @@ REPLAY: dict[str, dict[str, Any]] = {
 def _arguments() -> Iterator[Case]:
     for name, values in ARGUMENTS.items():
         for what, value in values.items():
-            yield Case("recordings", f"Table({name}: {what})", (name, "table.csv"), partial(_act, lambda root: None, **{name: value}))
+            yield Case(
+                "recordings",
+                f"Table({name}: {what})",
+                (name, "table.csv"),
+                partial(_act, lambda root: None, **{name: value}),
+            )
     for name, values in REPLAY.items():
         for what, value in values.items():
             also = ("rows", "slices") if name in ("clock", "slice_len") else ()
-            yield Case("recordings", f"RecordingReplay({name}: {what})", (name, *also), partial(_act, lambda root: None, replay={name: value}))
-    for name, values in {"start": {"nan": NAN, "inf": INF, "text": "x"}, "rate": {"zero": 0.0, "negative": -1.0, "nan": NAN, "text": "x"}}.items():
+            yield Case(
+                "recordings",
+                f"RecordingReplay({name}: {what})",
+                (name, *also),
+                partial(_act, lambda root: None, replay={name: value}),
+            )
+    for name, values in {
+        "start": {"nan": NAN, "inf": INF, "text": "x"},
+        "rate": {"zero": 0.0, "negative": -1.0, "nan": NAN, "text": "x"},
+    }.items():
         for what, value in values.items():
-            yield Case("recordings", f"Images({name}: {what})", (name,), lambda folder, name=name, value=value: Images(sound() / "images", **{name: value}))
+            yield Case(
+                "recordings",
+                f"Images({name}: {what})",
+                (name,),
+                lambda folder, name=name, value=value: Images(sound() / "images", **{name: value}),
+            )
     makes: dict[str, tuple[tuple[str, ...], Callable[[], Any]]] = {
         "no streams": (("streams",), lambda: Recording()),
         "a stream of text": (("state",), lambda: Recording(state="table.csv")),
@@ -218,7 +309,9 @@ def _rows() -> Iterator[Case]:
     def rows(change: Callable[[TensorDict], Any]) -> TensorDict:
         import torch
 
-        made = TensorDict({"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": torch.rand(12, 2)}}, [12])
+        made = TensorDict(
+            {"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": torch.rand(12, 2)}}, [12]
+        )
         made["episode"] = torch.arange(3).repeat_interleave(4)
         change(made)
         return made
@@ -235,8 +328,16 @@ def _rows() -> Iterator[Case]:
         "no image": ("image", lambda rows: rows["observation"].pop("image")),
         "no episode": ("episode", lambda rows: rows.pop("episode")),
         "nan in the state": ("state", lambda rows: rows["observation", "state"].view(-1)[3:4].fill_(NAN)),
-        "images of two dimensions": ("image", lambda rows: rows.set(("observation", "image"), rows["observation", "image"][:, 0, 0])),
-        "images of five channels": ("image", lambda rows: rows.set(("observation", "image"), rows["observation", "image"][:, :1].expand(12, 5, 8, 8).clone())),
+        "images of two dimensions": (
+            "image",
+            lambda rows: rows.set(("observation", "image"), rows["observation", "image"][:, 0, 0]),
+        ),
+        "images of five channels": (
+            "image",
+            lambda rows: rows.set(
+                ("observation", "image"), rows["observation", "image"][:, :1].expand(12, 5, 8, 8).clone()
+            ),
+        ),
         "episodes as floats with nan": ("episode", lambda rows: rows.set("episode", rows["episode"] * NAN)),
         "an episode in two parts": ("episode", lambda rows: rows["episode"][-2:].fill_(0)),
     }

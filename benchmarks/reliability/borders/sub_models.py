@@ -75,8 +75,20 @@ def _priors() -> list[Subject]:
     size = {"ensemble_size": LARGE_COUNT}
     prior = lambda: {"mean": [0.0, 0.0], "std": [1.0, 1.0]}  # noqa: E731
     return [
-        Subject("GaussianPrior", m.GaussianPrior, prior, {"mean": vector(2), "std": {**STDS, "too long": [1.0] * 3}, **size}, on_row),
-        Subject("AroundState", m.AroundState, lambda: {"std": [1.0, 1.0]}, {"std": {**STDS, "too long": [1.0] * 3}, **size}, on_row),
+        Subject(
+            "GaussianPrior",
+            m.GaussianPrior,
+            prior,
+            {"mean": vector(2), "std": {**STDS, "too long": [1.0] * 3}, **size},
+            on_row,
+        ),
+        Subject(
+            "AroundState",
+            m.AroundState,
+            lambda: {"std": [1.0, 1.0]},
+            {"std": {**STDS, "too long": [1.0] * 3}, **size},
+            on_row,
+        ),
         Subject(
             "FromSensor",
             m.FromSensor,
@@ -91,7 +103,13 @@ def _priors() -> list[Subject]:
             {"mean": vector(2), "cov": covariance(2)},
             on_row,
         ),
-        Subject("GaussianAround", m.GaussianAround, lambda: {"std": [1.0, 1.0]}, {"std": {**STDS, "too long": [1.0] * 3}}, on_row),
+        Subject(
+            "GaussianAround",
+            m.GaussianAround,
+            lambda: {"std": [1.0, 1.0]},
+            {"std": {**STDS, "too long": [1.0] * 3}},
+            on_row,
+        ),
         Subject(
             "WithMemory",
             m.WithMemory,
@@ -139,16 +157,36 @@ def _motions() -> list[Subject]:
             "UnicycleTransition",
             m.UnicycleTransition,
             lambda: {"velocity": net(), "dt": 0.1},
-            {"velocity": MODULE, "dt": {k: v for k, v in POSITIVE.items() if k != "text"}, "loc": vector(2), "scale": SCALE},
+            {
+                "velocity": MODULE,
+                "dt": {k: v for k, v in POSITIVE.items() if k != "text"},
+                "loc": vector(2),
+                "scale": SCALE,
+            },
             on_car,
         ),
-        Subject("UnicycleMotion", m.UnicycleMotion, lambda: {"dt": 0.1}, {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}}, on_car),
-        Subject("UnicyclePose", m.UnicyclePose, lambda: {"dt": 0.1}, {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}}),
+        Subject(
+            "UnicycleMotion",
+            m.UnicycleMotion,
+            lambda: {"dt": 0.1},
+            {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}},
+            on_car,
+        ),
+        Subject(
+            "UnicyclePose",
+            m.UnicyclePose,
+            lambda: {"dt": 0.1},
+            {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}},
+        ),
         Subject(
             "LinearTransition",
             m.LinearTransition,
             lambda: {"matrix": 0.9 * EYE, "noise": 0.1 * EYE, "control": torch.ones(2, 1)},
-            {"matrix": matrix(2, 2), "noise": covariance(2), "control": {k: v for k, v in matrix(2, 1).items() if k != "a column more"}},
+            {
+                "matrix": matrix(2, 2),
+                "noise": covariance(2),
+                "control": {k: v for k, v in matrix(2, 1).items() if k != "a column more"},
+            },
             on_row,
         ),
         Subject(
@@ -162,7 +200,12 @@ def _motions() -> list[Subject]:
             "UKFTransition",
             m.UKFTransition,
             lambda: {"transition": m.LearnedTransition(net()), "process_noise": _process_noise()},
-            {"transition": MODULE, "process_noise": MODULE, "alpha": POSITIVE, "kappa": {**FINITE, "minus the dimension": -2.0}},
+            {
+                "transition": MODULE,
+                "process_noise": MODULE,
+                "alpha": POSITIVE,
+                "kappa": {**FINITE, "minus the dimension": -2.0},
+            },
             on_row,
         ),
         Subject(
@@ -239,12 +282,22 @@ def _noises() -> list[Subject]:
             },
             on_row,
         ),
-        Subject("ConstantNoise", m.ConstantNoise, lambda: {"r": [0.5, 0.5]}, {"r": {k: v for k, v in stds.items() if k not in ("too long", "a matrix", "zero")}}, on_row),
+        Subject(
+            "ConstantNoise",
+            m.ConstantNoise,
+            lambda: {"r": [0.5, 0.5]},
+            {"r": {k: v for k, v in stds.items() if k not in ("too long", "a matrix", "zero")}},
+            on_row,
+        ),
         Subject(
             "CholeskyNoise",
             m.CholeskyNoise,
             lambda: {"dim": 2},
-            {"dim": COUNT, "r": stds, "floor": {"negative": -0.1, "nan": float("nan"), "beyond r": 5.0, "text": "much"}},
+            {
+                "dim": COUNT,
+                "r": stds,
+                "floor": {"negative": -0.1, "nan": float("nan"), "beyond r": 5.0, "text": "much"},
+            },
             on_row,
         ),
         Subject(
@@ -280,7 +333,13 @@ def _networks() -> list[Subject]:
             "StochasticMLP",
             m.StochasticMLP,
             lambda: {"in_features": 2, "out_features": 2},
-            {"in_features": COUNT, "out_features": COUNT, **layer, "posterior_std": NOT_NEGATIVE, "output_gain": FINITE},
+            {
+                "in_features": COUNT,
+                "out_features": COUNT,
+                **layer,
+                "posterior_std": NOT_NEGATIVE,
+                "output_gain": FINITE,
+            },
             lambda made: made(torch.zeros(8, 2)),
         ),
         Subject(
@@ -311,14 +370,27 @@ def _networks() -> list[Subject]:
             "VectorSensor",
             m.VectorSensor,
             lambda: {"in_features": 4, "observation_dim": 2, "ensemble_size": 4},
-            {"in_features": COUNT, "observation_dim": COUNT, "ensemble_size": COUNT, "loc": vector(4), "scale": vector(4, positive=True), **layer},
+            {
+                "in_features": COUNT,
+                "observation_dim": COUNT,
+                "ensemble_size": COUNT,
+                "loc": vector(4),
+                "scale": vector(4, positive=True),
+                **layer,
+            },
             on_row,
         ),
         Subject(
             "FlowSensor",
             m.FlowSensor,
             lambda: {"dt": 0.1},
-            {"dt": POSITIVE, "ensemble_size": COUNT, "features": COUNT, "trunk_dropout": {**SHARE, "one": 1.0}, **layer},
+            {
+                "dt": POSITIVE,
+                "ensemble_size": COUNT,
+                "features": COUNT,
+                "trunk_dropout": {**SHARE, "one": 1.0},
+                **layer,
+            },
         ),
         Subject(
             "MemberGain",
@@ -334,12 +406,26 @@ def _networks() -> list[Subject]:
             {"in_channels": COUNT, "channels": cells, "keypoints": COUNT, "features": COUNT, "pooled": COUNT},
             lambda made: made(image),
         ),
-        Subject("SpatialSoftArgmax", m.SpatialSoftArgmax, lambda: {"channels": 3}, {"channels": COUNT}, lambda made: made(image)),
+        Subject(
+            "SpatialSoftArgmax",
+            m.SpatialSoftArgmax,
+            lambda: {"channels": 3},
+            {"channels": COUNT},
+            lambda made: made(image),
+        ),
         Subject(
             "LSTMUpdate",
             m.LSTMUpdate,
             lambda: {"state_dim": 2, "features": 4},
-            {"state_dim": COUNT, "features": COUNT_OR_NONE, "hidden_size": COUNT, "num_layers": COUNT, "floor": NOT_NEGATIVE, "loc": vector(2), "scale": SCALE},
+            {
+                "state_dim": COUNT,
+                "features": COUNT_OR_NONE,
+                "hidden_size": COUNT,
+                "num_layers": COUNT,
+                "floor": NOT_NEGATIVE,
+                "loc": vector(2),
+                "scale": SCALE,
+            },
         ),
     ]
 
@@ -351,11 +437,16 @@ def _updates() -> list[Subject]:
             m.EnsembleAnalysis,
             lambda: {"scheme": "sensor"},
             {
-                "scheme": {k: v for k, v in CHOICE.items()},
+                "scheme": CHOICE,
                 "inflation": POSITIVE,
                 "relaxation": SHARE,
                 "angles": dims(2),
-                "taper": {"one matrix": torch.ones(2, 2), "wrong shapes": (torch.ones(3, 2), torch.ones(2, 2)), "nan": (torch.full((2, 2), float("nan")), torch.ones(2, 2)), "text": "near"},
+                "taper": {
+                    "one matrix": torch.ones(2, 2),
+                    "wrong shapes": (torch.ones(3, 2), torch.ones(2, 2)),
+                    "nan": (torch.full((2, 2), float("nan")), torch.ones(2, 2)),
+                    "text": "near",
+                },
             },
             on_row,
         ),
@@ -364,7 +455,12 @@ def _updates() -> list[Subject]:
             m.LocalEnsembleAnalysis,
             lambda: {"near": torch.ones(2, 2)},
             {
-                "near": {"nan": torch.full((2, 2), float("nan")), "negative": -torch.ones(2, 2), "a vector": torch.ones(2), "text": "near"},
+                "near": {
+                    "nan": torch.full((2, 2), float("nan")),
+                    "negative": -torch.ones(2, 2),
+                    "a vector": torch.ones(2),
+                    "text": "near",
+                },
                 "inflation": POSITIVE,
                 "relaxation": SHARE,
                 "tile": COUNT,
@@ -376,15 +472,32 @@ def _updates() -> list[Subject]:
             "KalmanAnalysis",
             m.KalmanAnalysis,
             lambda: {"matrix": EYE.clone(), "noise": EYE.clone()},
-            {"matrix": {k: v for k, v in matrix(2, 2).items() if k != "a row more"}, "noise": covariance(2), "inflation": POSITIVE, "angles": dims(2)},
+            {
+                "matrix": {k: v for k, v in matrix(2, 2).items() if k != "a row more"},
+                "noise": covariance(2),
+                "inflation": POSITIVE,
+                "angles": dims(2),
+            },
             on_row,
         ),
-        Subject("EKFAnalysis", m.EKFAnalysis, lambda: {"observation": m.Select([0, 1])}, {"observation": MODULE, "inflation": POSITIVE, "angles": dims(2)}, on_row),
+        Subject(
+            "EKFAnalysis",
+            m.EKFAnalysis,
+            lambda: {"observation": m.Select([0, 1])},
+            {"observation": MODULE, "inflation": POSITIVE, "angles": dims(2)},
+            on_row,
+        ),
         Subject(
             "UKFAnalysis",
             m.UKFAnalysis,
             lambda: {"observation": m.Select([0, 1])},
-            {"observation": MODULE, "inflation": POSITIVE, "angles": dims(2), "alpha": POSITIVE, "kappa": {**FINITE, "minus the dimension": -2.0}},
+            {
+                "observation": MODULE,
+                "inflation": POSITIVE,
+                "angles": dims(2),
+                "alpha": POSITIVE,
+                "kappa": {**FINITE, "minus the dimension": -2.0},
+            },
             on_row,
         ),
         Subject("GaussianLikelihood", m.GaussianLikelihood, dict, {"angles": dims(2)}, on_row),
@@ -395,7 +508,13 @@ def _updates() -> list[Subject]:
             {"encoding_dim": COUNT, "observation_dim": COUNT, "bound": CHOICE, "loc": vector(2), "scale": SCALE},
             on_row,
         ),
-        Subject("ParticleAnalysis", m.ParticleAnalysis, dict, {"tempering": POSITIVE}, lambda made: made(row().set(("forecast", "log_likelihood"), torch.zeros(8)))),
+        Subject(
+            "ParticleAnalysis",
+            m.ParticleAnalysis,
+            dict,
+            {"tempering": POSITIVE},
+            lambda made: made(row().set(("forecast", "log_likelihood"), torch.zeros(8))),
+        ),
     ]
 
 

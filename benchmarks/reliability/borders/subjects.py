@@ -40,7 +40,9 @@ def cases_of(border: str, subjects: Sequence[Subject]) -> Iterator[Case]:
         for argument, values in subject.damage.items():
             words = (argument, *subject.also.get(argument, ()))
             for what, value in values.items():
-                yield Case(border, f"{subject.name}({argument}: {what})", words, partial(_act, subject, argument, value))
+                yield Case(
+                    border, f"{subject.name}({argument}: {what})", words, partial(_act, subject, argument, value)
+                )
 
 
 def _act(subject: Subject, argument: str, value: Any, folder: Path) -> Any:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tensordict import TensorDict
 
 from benchmarks.reliability.case import Case
@@ -107,12 +106,31 @@ def _manifest() -> Iterator[Case]:
     for what, change in BYTES.items():
         act = partial(_warned, lambda root, change=change: written(root / MANIFEST, change))
         yield Case("ur5", f"manifest {what}", (MANIFEST,), act, _all_or_said)
-    lines: dict[str, Callable[[dict], Any]] = {"a list": lambda line: [], "a number": lambda line: 3, "one field more": lambda line: line.update(colour="red")}
+    lines: dict[str, Callable[[dict], Any]] = {
+        "a list": lambda line: [],
+        "a number": lambda line: 3,
+        "one field more": lambda line: line.update(colour="red"),
+    }
     values: dict[str, dict[str, Any]] = {
         "demo": {"negative": -1, "text": "x", "another": 7, "nothing": None, "a fraction": 1.5},
-        "file": {"outside": "../../../etc/passwd", "absolute": "/etc/passwd", "another demo": "demo-000000.npz", "empty": "", "a number": 3, "a device": "/dev/zero"},
+        "file": {
+            "outside": "../../../etc/passwd",
+            "absolute": "/etc/passwd",
+            "another demo": "demo-000000.npz",
+            "empty": "",
+            "a number": 3,
+            "a device": "/dev/zero",
+        },
         "sha256": {"empty": "", "another": "0" * 64, "a number": 3, "nothing": None},
-        "rows": {"negative": -1, "zero": 0, "text": "x", "huge": 10**12, "a fraction": 5.5, "nothing": None, "one more": 6},
+        "rows": {
+            "negative": -1,
+            "zero": 0,
+            "text": "x",
+            "huge": 10**12,
+            "a fraction": 5.5,
+            "nothing": None,
+            "one more": 6,
+        },
         "frames": {"negative": -1, "text": "x", "huge": 10**12, "nothing": None, "one more": 4},
         "failures": {"negative": -1, "text": "x"},
     }
@@ -122,7 +140,9 @@ def _manifest() -> Iterator[Case]:
             lines[f"{key} {what}"] = lambda line, key=key, value=value: line.update({key: value})
     for what, change in lines.items():
         right = _equal if "failures" in what else None
-        yield Case("ur5", f"manifest's line: {what}", (MANIFEST, DEMO, "demo-000000.npz"), partial(_act, _line(change)), right)
+        yield Case(
+            "ur5", f"manifest's line: {what}", (MANIFEST, DEMO, "demo-000000.npz"), partial(_act, _line(change)), right
+        )
     texts: dict[str, Callable[[str], str]] = {
         "a line that is no JSON in the middle": lambda text: text.replace("}\n", "}\nnothing\n", 1),
         "the last line cut": lambda text: text[: len(text) - 40],
@@ -150,7 +170,9 @@ def _all_or_said(result: tuple[TensorDict, list[str]]) -> bool:
 def _demos() -> Iterator[Case]:
     words = (DEMO,)
     for what, change in BYTES.items():
-        yield Case("ur5", f"demo {what}", words, partial(_act, lambda root, change=change: written(root / DEMO, change)))
+        yield Case(
+            "ur5", f"demo {what}", words, partial(_act, lambda root, change=change: written(root / DEMO, change))
+        )
         signed = lambda root, change=change: _signed(root, change((root / DEMO).read_bytes()))  # noqa: E731
         right = _equal  # a date in the archive, which nobody reads
         yield Case("ur5", f"demo {what}, checksum adapted", words, partial(_act, signed), right)
@@ -183,11 +205,20 @@ def _demos() -> Iterator[Case]:
             yield Case("ur5", f"demo's {name} {value}", words, partial(_act, _poke(name, value)))
     yield Case("ur5", "demo taken away", words, partial(_act, lambda root: gone(root / DEMO)))
     yield Case("ur5", "demo a folder", words, partial(_act, lambda root: (gone(root / DEMO), (root / DEMO).mkdir())))
-    yield Case("ur5", "demo a link to a device", words, partial(_act, lambda root: (gone(root / DEMO), (root / DEMO).symlink_to("/dev/zero"))))
+    yield Case(
+        "ur5",
+        "demo a link to a device",
+        words,
+        partial(_act, lambda root: (gone(root / DEMO), (root / DEMO).symlink_to("/dev/zero"))),
+    )
     hostile = Bomb.npz("state")
-    yield Case("ur5", "demo with a pickle that runs code", words, partial(_act, lambda root: _signed(root, hostile)), within=2)
+    yield Case(
+        "ur5", "demo with a pickle that runs code", words, partial(_act, lambda root: _signed(root, hostile)), within=2
+    )
     bomb = npz_of_zeros(1 << 30)
-    yield Case("ur5", "demo that unpacks to a gigabyte", words, partial(_act, lambda root: _signed(root, bomb)), within=2)
+    yield Case(
+        "ur5", "demo that unpacks to a gigabyte", words, partial(_act, lambda root: _signed(root, bomb)), within=2
+    )
 
     def many(root: Path) -> None:
         buffer = io.BytesIO()
@@ -197,12 +228,22 @@ def _demos() -> Iterator[Case]:
         _signed(root, buffer.getvalue())
 
     yield Case("ur5", "demo of 20,000 arrays", words, partial(_act, many), within=4)
-    for what, change, also in (("no root", gone, ("ur5",)), ("no manifest", lambda root: gone(root / MANIFEST), (MANIFEST,))):
+    for what, change, also in (
+        ("no root", gone, ("ur5",)),
+        ("no manifest", lambda root: gone(root / MANIFEST), (MANIFEST,)),
+    ):
         yield Case("ur5", what, also, partial(_act, change))
 
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "size": {"zero": (0, 4), "negative": (-4, 4), "one number": (4,), "text": "ab", "larger": (500, 500), "fractions": (1.5, 2.5)},
+    "size": {
+        "zero": (0, 4),
+        "negative": (-4, 4),
+        "one number": (4,),
+        "text": "ab",
+        "larger": (500, 500),
+        "fractions": (1.5, 2.5),
+    },
     "split": {"unknown": "best"},
     "validation_share": {"one": 1.0, "negative": -1.0},
 }
@@ -222,7 +263,12 @@ COLLECTION: dict[str, dict[str, Any]] = {
 def _arguments() -> Iterator[Case]:
     for name, values in ARGUMENTS.items():
         for what, value in values.items():
-            yield Case("ur5", f"UR5ExperienceReplay({name}: {what})", (name,), partial(_act, lambda root: None, **{name: value}))
+            yield Case(
+                "ur5",
+                f"UR5ExperienceReplay({name}: {what})",
+                (name,),
+                partial(_act, lambda root: None, **{name: value}),
+            )
     for name, values in COLLECTION.items():
         for what, value in values.items():
 

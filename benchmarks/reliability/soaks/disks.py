@@ -101,11 +101,22 @@ def _drives(folder: Path) -> Any:
 
 
 WRITERS: dict[str, Writer] = {
-    "cache of a drive": Writer(lambda folder: read_kitti_drive(_large_drive(), "a", size=(100, 300), cache=folder).clone(), ("cache",)),
+    "cache of a drive": Writer(
+        lambda folder: read_kitti_drive(_large_drive(), "a", size=(100, 300), cache=folder).clone(), ("cache",)
+    ),
     "cache of a drive's motion": Writer(lambda folder: _motion(folder).clone(), ("cache",)),
-    "cache of demos": Writer(lambda folder: UR5ExperienceReplay(_large_demos(), split="all", cache=folder, progress=False)[:], ("cache",)),
-    "cache of a LeRobot recording": Writer(lambda folder: lerobot.read(lerobot.sound(2), size=(200, 300), cache=folder), ("cache",)),
-    "cache of pictures": Writer(lambda folder: recordings.read(recordings.sound(), camera="images", replay={"cache": folder, "size": (300, 300)}), ("cache",)),
+    "cache of demos": Writer(
+        lambda folder: UR5ExperienceReplay(_large_demos(), split="all", cache=folder, progress=False)[:], ("cache",)
+    ),
+    "cache of a LeRobot recording": Writer(
+        lambda folder: lerobot.read(lerobot.sound(2), size=(200, 300), cache=folder), ("cache",)
+    ),
+    "cache of pictures": Writer(
+        lambda folder: recordings.read(
+            recordings.sound(), camera="images", replay={"cache": folder, "size": (300, 300)}
+        ),
+        ("cache",),
+    ),
     "checkpoint": Writer(_checkpoint, ("last.pt",)),
     "trainer": Writer(_trainer, ("last.pt", "best_sensor.pt", "best_filter.pt", "best_end_to_end.pt", "logs", "run")),
     "package": Writer(_package, ("step.pt2",)),
@@ -157,7 +168,9 @@ def _on_disk(name: str, kind: str) -> dict[str, Any]:
     }
 
 
-def _two(name: str, work: Callable[[Path], Any], result: Callable[[Path], Any], one_may_be_refused: bool) -> dict[str, Any]:
+def _two(
+    name: str, work: Callable[[Path], Any], result: Callable[[Path], Any], one_may_be_refused: bool
+) -> dict[str, Any]:
     """Two processes that do the same in one folder at a time."""
     began = time.time()
     root = Path(tempfile.mkdtemp(prefix="two-"))
@@ -180,7 +193,9 @@ def _two(name: str, work: Callable[[Path], Any], result: Callable[[Path], Any], 
             "message": " ".join(line[0].replace(str(shared), "FOLDER") for line in said if line),
             "result": verdict.kind,
             "left behind": left,
-            "right": verdict.kind == "right" and not left and (refused == 0 or (one_may_be_refused and refused == 1 and named)),
+            "right": verdict.kind == "right"
+            and not left
+            and (refused == 0 or (one_may_be_refused and refused == 1 and named)),
             "seconds": round(time.time() - began, 1),
         }
     finally:
@@ -199,8 +214,16 @@ def _cached(folder: Path) -> bytes:
 
 PAIRS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], bool]] = {
     "trainer": (lambda folder: make_trainer(folder / "run", updates=12, progress=False).fit(), _weights, True),
-    "collection of demos": (lambda folder: collect_ur5_demos(folder / "demos", 4, frames=None, max_steps=60), lambda folder: _files(folder / "demos"), True),
-    "rendered drives": (lambda folder: render_drives(folder / "drives", names=["a", "b"], frames=20), lambda folder: _files(folder / "drives"), True),
+    "collection of demos": (
+        lambda folder: collect_ur5_demos(folder / "demos", 4, frames=None, max_steps=60),
+        lambda folder: _files(folder / "demos"),
+        True,
+    ),
+    "rendered drives": (
+        lambda folder: render_drives(folder / "drives", names=["a", "b"], frames=20),
+        lambda folder: _files(folder / "drives"),
+        True,
+    ),
     "cache of a drive": (_cached, _cached, False),
     "package": (_package, lambda folder: str(_package(folder)), False),
     "pretrained folder": (_pretrained, lambda folder: _files(folder / "filter"), False),

@@ -1,4 +1,4 @@
-"""Work that is killed at random moments and started again: does it end as if it had not been, and what is left behind?"""
+"""Work that is killed at random moments and started again: does it end as if it had not been, and what is left?"""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def _tensors(content: Any) -> bytes:
     if isinstance(content, torch.Tensor):
         return content.contiguous().numpy().tobytes()
     if isinstance(content, dict):
-        return b"".join(str(key).encode() + _tensors(value) for key, value in sorted(content.items(), key=lambda item: str(item[0])))
+        return b"".join(
+            str(key).encode() + _tensors(value) for key, value in sorted(content.items(), key=lambda item: str(item[0]))
+        )
     if isinstance(content, list | tuple):
         return b"".join(map(_tensors, content))
     return repr(content).encode()

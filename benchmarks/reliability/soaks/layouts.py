@@ -71,7 +71,9 @@ def _rollouts(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBas
     try:
         carry, steps = env.reset(), FRAMES // ROWS
         for _ in range(total // FRAMES):
-            out = env.rollout(steps, auto_reset=False, tensordict=carry, break_when_any_done=False, return_contiguous=True)
+            out = env.rollout(
+                steps, auto_reset=False, tensordict=carry, break_when_any_done=False, return_contiguous=True
+            )
             yield out
             carry = env.maybe_reset(env._step_mdp(out[..., -1]))
     finally:

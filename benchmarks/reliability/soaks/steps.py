@@ -132,7 +132,7 @@ def soak(name: str, steps: int) -> dict[str, Any]:
         # The last chunk again, by a filter that starts there, under the same random numbers.
         torch.manual_seed(1)
         fresh = Run(step, _start(step, filter))
-        again, spread = fresh.chunk(readings, observed)
+        again, _ = fresh.chunk(readings, observed)
     off = float((again - mean)[SETTLE:].abs().max())
     first, last = errors[0], errors[-1]
     alike = off < 1e-4 if exact else abs(float((again - truth)[SETTLE:].square().mean()) / last - 1) < 0.1
