@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import re
@@ -17,12 +18,13 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import torch_denkf
 
-__all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge"]
+__all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge", "workshop"]
 
 Kind = Literal["clear", "right", "unclear", "silent", "hang", "crash"]
 
@@ -90,6 +92,14 @@ def apart(work: Callable[[], Any]) -> None:
     _, status = os.waitpid(child, 0)
     if status:
         raise RuntimeError(f"{work} failed; see above")
+
+
+@cache
+def workshop() -> Path:
+    """A folder for what cases start from; it goes with the process that asked for it first."""
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)  # not in forked children, which leave by os._exit
+    return folder
 
 
 def judge(case: Case) -> Verdict:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -12,7 +11,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.reliability.case import Case, apart
+from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, copied, gone, same, written
 from benchmarks.reliability.hostile import Bomb, npz_of_zeros, ran
 from tests.training.problem import make_trainer
@@ -26,7 +25,7 @@ Change = Callable[[Path], Any]
 @cache
 def sound() -> Path:
     """Two trainings, one at its end, one that was left after its first stage."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "training"
+    root = workshop() / "training"
 
     def train() -> None:
         make_trainer(root / "done", updates=UPDATES, progress=False).fit()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 import torch_denkf.cli._command as command_module
 from benchmarks.reliability.borders import kitti, pretrained, ur5
-from benchmarks.reliability.case import Case, Refused, apart
+from benchmarks.reliability.case import Case, Refused, apart, workshop
 from benchmarks.reliability.damage import BYTES, copied, gone, written
 from torch_denkf.cli.main import main
 from torch_denkf.odometry import load_car_filter, track, write_path
@@ -44,7 +43,7 @@ def run(words: Sequence[str]) -> str:
 @cache
 def base() -> Path:
     """A folder with a drive, demos, a path, and a trained filter."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "work"
+    root = workshop() / "work"
     root.mkdir()
     for source in (kitti.sound(), ur5.sound(), pretrained.FOLDERS / "car-odometry"):
         copied(source, root)

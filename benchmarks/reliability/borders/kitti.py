@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import struct
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case, apart
+from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, same, same_but, written
 from torch_denkf.data import (
     KITTIOdometryExperienceReplay,
@@ -33,7 +32,7 @@ Change = Callable[[Path], Any]
 @cache
 def sound() -> Path:
     """A rendered drive."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "kitti"
+    root = workshop() / "kitti"
     apart(lambda: write_drives(root, [DRIVE], frames=FRAMES, size=SIZE))
     return root
 
@@ -362,6 +361,7 @@ def _arguments() -> Iterator[Case]:
 
 def cases() -> Iterator[Case]:
     """All damaged drives."""
+    sound()  # here, not in each case's process
     yield from _files()
     yield from _numbers()
     yield from _arguments()

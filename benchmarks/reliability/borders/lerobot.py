@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +14,7 @@ import pyarrow.parquet as parquet
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case, apart
+from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, leaves, same, same_but, written
 from tests.data.lerobot.lerobot_folder import SIZE, write_version_2, write_version_3
 from torch_denkf.data import LeRobotReplay
@@ -32,7 +31,7 @@ Change = Callable[[Path], Any]
 @cache
 def sound(version: int) -> Path:
     """Three episodes: of version 2 with pictures in the tables, of version 3 with a video."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / f"lerobot{version}"
+    root = workshop() / f"lerobot{version}"
     root.mkdir()
     if version == 2:
         apart(lambda: write_version_2(root, LENGTHS, images="bytes"))
@@ -411,6 +410,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 
 def cases() -> Iterator[Case]:
     """All damaged recordings."""
+    sound(2), sound(3)  # here, not in each case's process
     yield from _metadata()
     yield from _episodes()
     yield from _data()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -13,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.reliability.borders.checkpoints import HOSTILE
-from benchmarks.reliability.case import Case, apart
+from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, gone, same, written
 from benchmarks.reliability.hostile import ran
 from tests.filters.factories import linear_kalman
@@ -23,15 +22,9 @@ STEP = "step.pt2"
 
 
 @cache
-def folder_of() -> Path:
-    """Where the packages are."""
-    return Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
-
-
-@cache
 def sound(compiled: bool) -> Path:
     """A packaged step."""
-    file = folder_of() / ("compiled" if compiled else "graph") / STEP
+    file = workshop() / ("compiled" if compiled else "graph") / STEP
     frame = TensorDict({"observation": torch.ones(2), "observed": torch.ones(1, dtype=torch.bool)})
     apart(lambda: export_step(linear_kalman(), frame, file, compiled=compiled))
     return file

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case, apart
+from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, copied, finite, gone, leaves, same, written
 from tests.data.recordings.own_files import SIZE, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video, recording_from_rows, write_trajectory
@@ -26,7 +25,7 @@ Change = Callable[[Path], Any]
 @cache
 def sound() -> Path:
     """A table as CSV and as Parquet, a video, and a folder of images."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "own"
+    root = workshop() / "own"
     root.mkdir()
     apart(lambda: _write(root))  # OpenCV's threads are not to be forked
     return root
@@ -368,6 +367,7 @@ def _trajectories() -> Iterator[Case]:
 
 def cases() -> Iterator[Case]:
     """All damaged recordings."""
+    sound()  # here, not in each case's process
     yield from _tables()
     yield from _pictures()
     yield from _arguments()

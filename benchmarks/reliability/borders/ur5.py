@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case
+from benchmarks.reliability.case import Case, workshop
 from benchmarks.reliability.damage import BYTES, copied, gone, same, written
 from benchmarks.reliability.hostile import Bomb, npz_of_zeros
 from tests.data.ur5.ur5_demos import make_demo, write_folder
@@ -32,7 +31,7 @@ Change = Callable[[Path], Any]
 @cache
 def sound() -> Path:
     """Three demos."""
-    root = Path(tempfile.mkdtemp(prefix="fuzz-sound-")) / "ur5"
+    root = workshop() / "ur5"
     root.mkdir()
     return write_folder(root, [make_demo(number, rows) for number, rows in enumerate(ROWS)])
 
@@ -280,6 +279,7 @@ def _arguments() -> Iterator[Case]:
 
 def cases() -> Iterator[Case]:
     """All damaged demos."""
+    sound()  # here, not in each case's process
     yield from _manifest()
     yield from _demos()
     yield from _arguments()
