@@ -42,11 +42,35 @@ def all_cases(borders: Sequence[str] = BORDERS) -> list[Case]:
     return [case for name in borders for case in import_module(f"benchmarks.reliability.borders.{name}").cases()]
 
 
+def drawn(cases: Sequence[Case], count: int, seed: int) -> list[Case]:
+    """Some of the cases, as many of each border as it has a share of all, at least one; none that takes long to prepare.
+
+    Args:
+        cases: all of them.
+        count: how many, about.
+        seed: another one draws others.
+    """
+    chance = random.Random(seed)
+    borders: dict[str, list[Case]] = {}
+    for case in cases:
+        if not case.slow:
+            borders.setdefault(case.border, []).append(case)
+    total = sum(map(len, borders.values()))
+    return [
+        case
+        for some in borders.values()
+        for case in chance.sample(some, min(len(some), max(1, round(count * len(some) / total))))
+    ]
+
+
 def run(cases: Sequence[Case], progress: bool = True) -> list[tuple[Case, Verdict]]:
     """Each case with its verdict."""
     out, told = [], time.monotonic()
     for number, case in enumerate(cases, start=1):
-        out.append((case, judge(case)))
+        verdict = judge(case)
+        out.append((case, verdict))
+        if verdict.kind not in ("clear", "right"):
+            print(f"{verdict.kind}: {case.border}: {case.name}: {verdict.text}", flush=True)
         if progress and (time.monotonic() - told > 10 or number == len(cases)):
             counts = Counter(verdict.kind for _, verdict in out)
             print(f"{number} of {len(cases)}: {dict(counts)}", flush=True)
@@ -89,11 +113,9 @@ class Fuzz:
         cases = [case for case in all_cases(self.borders) if self.match in f"{case.border} {case.name}"]
         sample = self.sample or (20 if self.smoke else 0)
         if sample:
-            cases = random.Random(self.seed).sample(cases, min(sample, len(cases)))
+            cases = drawn(cases, sample, self.seed)
         found = summary(run(cases))
         found["seconds"] = round(time.time() - began)
-        for row in found["wrong"]:
-            print(f"{row['kind']}: {row['border']}: {row['case']}: {row['what']}")
         print({kind: found[kind] for kind in ("records", *KINDS)})
         if not self.smoke:
             self.out.parent.mkdir(parents=True, exist_ok=True)
