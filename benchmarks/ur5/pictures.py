@@ -19,6 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from benchmarks.common.plots import BAND, draw_band, plt, save
 from torch_denkf._files import replacing
 from torch_denkf.envs import UR5TableEnv
+from torch_denkf.plots._frames import write_mp4
 
 STEP = 0.08  # s
 NAMES = ("J1", "J2", "J3", "J4", "J5", "J6", "J7, gripper", "x", "y", "z")
@@ -141,13 +142,7 @@ def _encode(path: Path, frames: Iterable[np.ndarray]) -> None:
     try:
         import av
     except ImportError:  # it comes with the extra [lerobot] only
-        writer = None
-        for frame in frames:
-            if writer is None:
-                code = cv2.VideoWriter_fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(path), code, 1 / STEP, frame.shape[1::-1])
-            writer.write(frame[..., ::-1])
-        writer.release()
+        write_mp4(path, frames, 1 / STEP)
         return
     with av.open(str(path), "w") as container:
         rate = Fraction(1 / STEP).limit_denominator(100)

@@ -101,10 +101,19 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
     """None for a file with the manifest's checksum, or else what is the matter, for a message."""
     try:
-        data = (root / entry.file).read_bytes()
+        data = _place(root, entry).read_bytes()
     except OSError as error:
         return f"{root / entry.file} cannot be read ({error.strerror})"
     return _compare(root, entry, data)
+
+
+def _place(root: Path, entry: Entry) -> Path:
+    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file:
+        raise ValueError(
+            f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
+            "anything of yours: download it from where you trust it, or take the line out"
+        )
+    return root / entry.file
 
 
 def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
@@ -170,9 +179,16 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
+<<<<<<< HEAD
         ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
     """
     file = root / entry.file
+=======
+        ValueError: if it was changed, does not hold what the line says, or lies outside of the folder.
+    """
+    file = _place(root, entry)
+    again = f"the collecting command ({COMMAND}), repeated, makes it again"
+>>>>>>> h-caches
     try:
         size = file.stat().st_size
         if size > MOST_BYTES:
