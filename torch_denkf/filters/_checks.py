@@ -86,11 +86,11 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
     else:
         why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+    state = "to be trusted" if finite else "finite"
     raise ValueError(
-        f"The new belief is not {'to be trusted' if finite else 'finite'}, because of {why}. The tensordict was left as "
-        f"it is. Hide what is broken or missing with a mask ({list(structure.optional)}), or leave it out with "
-        "step(..., without=[...]) or predict(...). A filter with reject=True counts such readings as missing; "
-        "check_finite=False switches this off."
+        f"The new belief is not {state}, because of {why}. The tensordict was left as it is. Hide what is broken or "
+        f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
+        "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
 
 

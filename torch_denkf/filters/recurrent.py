@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter
+from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules.kalman import MomentPrior
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 
@@ -89,6 +89,7 @@ class LSTMFilter(Filter):
                 f"state_dim=5 and initial=GaussianAround(...), and not update_at_reset; got state_dim={state_dim}, "
                 f"initial={initial}, update_at_reset={update_at_reset}."
             )
+        options = {name: kwargs.pop(name) for name in FilterOptions.__annotations__ if name in kwargs}
         update = LSTMUpdate(
             2 if vehicle else state_dim,
             features=features,
@@ -114,4 +115,5 @@ class LSTMFilter(Filter):
             control_keys=control_keys,
             init_key=init_key,
             update_at_reset=update_at_reset,
+            **options,
         )

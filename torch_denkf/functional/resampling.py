@@ -99,7 +99,8 @@ def soft_resample(
     index = _pick(proposal.detach(), uniform)
     # Picked first, then their logarithm: a particle that was picked has a positive probability.
     ratio = log_weights.gather(-1, index) - proposal.gather(-1, index).log()
-    return _take(particles, index), ratio.log_softmax(-1)
+    known = proposal.detach().sum(-1, keepdim=True) > 0
+    return _take(particles, index), torch.where(known, ratio.log_softmax(-1), torch.nan)
 
 
 def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
