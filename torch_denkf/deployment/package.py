@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 SIGNATURE = "torch_denkf"  # name of the description inside a package
+_MOST_UNPACKED = 50  # times its size, that a package may be; torch does not compress, and text shrinks to a tenth
 
 
 class PackagedStep:
@@ -52,6 +53,8 @@ class PackagedStep:
             if name not in entries:
                 raise KeyError(f"the step needs {name!r} {list(shape)}; it got {sorted(entries)}")
             value = entries[name]
+            if not isinstance(value, Tensor):
+                raise TypeError(f"{name!r} must be a tensor, {dtype} {list(shape)}, got a {type(value).__name__}")
             if tuple(value.shape) != shape or str(value.dtype) != dtype:
                 raise ValueError(
                     f"{name!r} must be {dtype} {list(shape)}, got {value.dtype} {list(value.shape)}; a package has "
@@ -77,13 +80,9 @@ def load_step(path: str | Path) -> PackagedStep:
         OSError: if there is no space to unpack it; names the folder and its free space.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; export_step(filter, example, path) writes it")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            compiled = any("aotinductor" in name for name in archive.namelist())
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{path} is no package of a step, or it was cut; export it again") from error
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file; export_step(filter, example, path) writes it")
+    compiled = _is_compiled(path)
     run: Callable[..., tuple[Tensor, ...]]
     if compiled:
         try:
@@ -94,16 +93,67 @@ def load_step(path: str | Path) -> PackagedStep:
                 (os.environ[name] for name in ("TMPDIR", "TMP", "TEMP", "TEMPDIR") if name in os.environ), "/tmp"
             )
             if shutil.disk_usage(folder).free > 4 * path.stat().st_size:
-                raise
+                raise ValueError(
+                    f"{path} cannot be loaded ({error}); export it again, on this kind of machine"
+                ) from error
             raise OSError(
                 f"cannot unpack {path} in {folder}, which has {shutil.disk_usage(folder).free / 1e3:.0f} kB free: free "
                 "some space, or set TMPDIR to another folder"
             ) from error
         signature = run.get_metadata().get(SIGNATURE, "")
+        counts = None
     else:
         files = {SIGNATURE: ""}
-        run = torch.export.load(path, extra_files=files).module()
-        signature = files[SIGNATURE]
+        try:
+            program = torch.export.load(path, extra_files=files)
+        except Exception as error:  # torch, json and pickle have a dozen kinds for a file that is none of theirs
+            raise ValueError(f"{path} cannot be loaded ({type(error).__name__}: {error}); export it again") from error
+        run, signature = program.module(), files[SIGNATURE]
+        counts = len(program.graph_signature.user_inputs), len(program.graph_signature.user_outputs)
     if not signature:
         raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
-    return PackagedStep(run, json.loads(signature))
+    return PackagedStep(run, _described(path, signature, counts))
+
+
+def _is_compiled(path: Path) -> bool:
+    """Whether a package holds native code, where it is whole: code that was changed would end the process.
+
+    Raises:
+        ValueError: if it is no package, or one of its parts does not have its checksum.
+    """
+    again = "export it again"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+            size = sum(part.file_size for part in parts)
+            if size > _MOST_UNPACKED * path.stat().st_size:
+                raise ValueError(f"it would unpack to {size} bytes")
+            damaged = archive.testzip()
+    except Exception as error:  # zipfile has half a dozen kinds for a file that was cut or changed
+        raise ValueError(f"{path} is no package of a step, or it was cut ({error}); {again}") from error
+    if damaged is not None:
+        raise ValueError(f"{path} is damaged: the checksum of its part {damaged!r} is wrong; {again}")
+    return any("aotinductor" in part.filename for part in parts)
+
+
+def _described(path: Path, text: str, counts: tuple[int, int] | None) -> dict:
+    """The description in a package.
+
+    Args:
+        path: for the message.
+        text: the description.
+        counts: how many inputs and outputs the package has, where that is known.
+
+    Raises:
+        ValueError: if it is none of export_step, or does not fit the package.
+    """
+    try:
+        found = json.loads(text)
+        inputs = [(str(name), [int(n) for n in shape], str(dtype)) for name, shape, dtype in found["inputs"]]
+        outputs, carry = list(map(str, found["outputs"])), list(map(str, found["carry"]))
+        fits = counts is None or counts == (len(inputs), len(outputs))
+        if not fits or not set(carry) <= set(outputs):
+            raise ValueError(f"{len(inputs)} inputs, outputs {outputs}, of which {carry} are carried on")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} has a description that does not fit it ({error}); export it again") from error
+    return {"inputs": inputs, "outputs": outputs, "carry": carry}

@@ -179,16 +179,10 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
-<<<<<<< HEAD
-        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
-    """
-    file = root / entry.file
-=======
-        ValueError: if it was changed, does not hold what the line says, or lies outside of the folder.
+        ValueError: if it was changed, does not hold what the line says, lies outside of the folder, or has numbers that
+            are not finite.
     """
     file = _place(root, entry)
-    again = f"the collecting command ({COMMAND}), repeated, makes it again"
->>>>>>> h-caches
     try:
         size = file.stat().st_size
         if size > MOST_BYTES:
