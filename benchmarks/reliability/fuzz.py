@@ -43,7 +43,7 @@ def all_cases(borders: Sequence[str] = BORDERS) -> list[Case]:
 
 
 def drawn(cases: Sequence[Case], count: int, seed: int) -> list[Case]:
-    """Some of the cases, as many of each border as it has a share of all, at least one; none that takes long to prepare.
+    """Some of the cases, of each border its share, at least one; none that takes long to prepare.
 
     Args:
         cases: all of them.

@@ -76,7 +76,7 @@ def load_step(path: str | Path) -> PackagedStep:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is not a packaged step.
+        ValueError: if it is not a packaged step, or one that is damaged.
         OSError: if there is no space to unpack it; names the folder and its free space.
     """
     path = Path(path)
@@ -93,9 +93,8 @@ def load_step(path: str | Path) -> PackagedStep:
                 (os.environ[name] for name in ("TMPDIR", "TMP", "TEMP", "TEMPDIR") if name in os.environ), "/tmp"
             )
             if shutil.disk_usage(folder).free > 4 * path.stat().st_size:
-                raise ValueError(
-                    f"{path} cannot be loaded ({error}); export it again, on this kind of machine"
-                ) from error
+                reason = " ".join(str(error).split())
+                raise ValueError(f"{path} cannot be loaded ({reason}); export it again, on such a machine") from error
             raise OSError(
                 f"cannot unpack {path} in {folder}, which has {shutil.disk_usage(folder).free / 1e3:.0f} kB free: free "
                 "some space, or set TMPDIR to another folder"
@@ -107,7 +106,8 @@ def load_step(path: str | Path) -> PackagedStep:
         try:
             program = torch.export.load(path, extra_files=files)
         except Exception as error:  # torch, json and pickle have a dozen kinds for a file that is none of theirs
-            raise ValueError(f"{path} cannot be loaded ({type(error).__name__}: {error}); export it again") from error
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ValueError(f"{path} cannot be loaded ({reason}); export it again") from error
         run, signature = program.module(), files[SIGNATURE]
         counts = len(program.graph_signature.user_inputs), len(program.graph_signature.user_outputs)
     if not signature:
@@ -155,5 +155,5 @@ def _described(path: Path, text: str, counts: tuple[int, int] | None) -> dict:
         if not fits or not set(carry) <= set(outputs):
             raise ValueError(f"{len(inputs)} inputs, outputs {outputs}, of which {carry} are carried on")
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} has a description that does not fit it ({error}); export it again") from error
+        raise ValueError(f"{path} has a damaged description ({error}); export it again") from error
     return {"inputs": inputs, "outputs": outputs, "carry": carry}

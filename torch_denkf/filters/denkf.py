@@ -47,8 +47,8 @@ class DEnKF(Filter):
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
         angles: components of the observation that are angles in radians, for the default ``analysis``.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: if it is not clear where the reading is.

@@ -45,7 +45,8 @@ class LSTMFilter(Filter):
         init_key: see :class:`Filter`.
         update_at_reset: see :class:`Filter`; not with ``dt``, as there is no motion into the first frame.
         **kwargs: passed on to :class:`~torch_denkf.modules.LSTMUpdate`: ``extra_keys`` and ``extra_features``,
-            ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``.
+            ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: if a vehicle's state does not have five dimensions, or it lacks ``initial``, or has

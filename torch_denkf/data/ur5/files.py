@@ -101,19 +101,10 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
     """None for a file with the manifest's checksum, or else what is the matter, for a message."""
     try:
-        data = _place(root, entry).read_bytes()
+        data = (root / entry.file).read_bytes()
     except OSError as error:
         return f"{root / entry.file} cannot be read ({error.strerror})"
     return _compare(root, entry, data)
-
-
-def _place(root: Path, entry: Entry) -> Path:
-    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file:
-        raise ValueError(
-            f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
-            "anything of yours: download it from where you trust it, or take the line out"
-        )
-    return root / entry.file
 
 
 def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
@@ -179,10 +170,9 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, does not hold what the line says, lies outside of the folder, or has numbers that
-            are not finite.
+        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
     """
-    file = _place(root, entry)
+    file = root / entry.file
     try:
         size = file.stat().st_size
         if size > MOST_BYTES:
@@ -266,8 +256,10 @@ def _entry(line: str) -> Entry:
     entry = Entry(**fields)
     for name, least in (("demo", 0), ("rows", 1), ("frames", 0), ("failures", 0)):
         check_count(name, getattr(entry, name), least=least)
-    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file or not isinstance(entry.sha256, str):
-        raise ValueError(f"file is the name of a file in the folder, and sha256 its checksum; got {entry.file!r}")
+    if not isinstance(entry.file, str) or not entry.file or Path(entry.file).name != entry.file:
+        raise ValueError(f"it names a file outside of its folder, {entry.file!r}; such a list may read all of yours")
+    if not isinstance(entry.sha256, str):
+        raise ValueError(f"sha256 is a checksum in hexadecimal; got {entry.sha256!r}")
     return entry
 
 
