@@ -52,6 +52,11 @@ def dims(size: int) -> Values:
     }
 
 
+def angles(size: int) -> Values:
+    """Indices of angles, likewise; one that is there twice is wrapped twice, and right."""
+    return {what: value for what, value in dims(size).items() if what != "twice the same"}
+
+
 def vector(size: int, *, positive: bool = False, negative: bool = True, length: bool = True) -> Values:
     """Vectors that are none of ``size`` finite numbers; ``positive`` where zero is wrong, too."""
 

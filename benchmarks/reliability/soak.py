@@ -94,6 +94,7 @@ def _cell(value: Any) -> str:
 #: The columns of each part's table; all others stay in the JSON file.
 COLUMNS = {
     "steps": (
+        "package",
         "steps",
         "unobserved",
         "not finite",

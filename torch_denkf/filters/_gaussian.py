@@ -10,6 +10,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.modules._base import check_module
 
 __all__ = ["GaussianFilter", "GaussianOptions"]
 
@@ -66,6 +67,8 @@ class GaussianFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("noise", noise)
+        check_module("initial", initial)
         update = analysis(
             inflation=inflation,
             angles=angles,

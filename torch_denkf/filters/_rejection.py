@@ -96,7 +96,7 @@ def usable(guards: Sequence[Guard], entries: Entries, batch_size: Sequence[int])
     return out
 
 
-def rejected_keys(guards: Sequence[Guard], entries: Entries) -> list[NestedKey]:
+def rejected_keys(guards: Sequence[Guard], entries: Mapping[NestedKey, Tensor]) -> list[NestedKey]:
     """The readings that :func:`usable` would reject, for a message; not those that a mask hides already."""
     found: dict[NestedKey, None] = {}
     for guard in guards:

@@ -41,7 +41,7 @@ from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.filters._steps import Steps, blank, previous_key, where_rows
 from torch_denkf.filters._structure import Structure, submodels
 from torch_denkf.filters._summaries import summaries
-from torch_denkf.modules._base import Call, Entries, flat_noise, named_modules_of, reads, run_module
+from torch_denkf.modules._base import Call, Entries, check_module, flat_noise, named_modules_of, reads, run_module
 
 __all__ = ["Filter", "FilterOptions", "LastAction", "submodels", "where_rows"]
 
@@ -129,6 +129,9 @@ class Filter(TensorDictSequential):
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
             modules = (OrderedDict(modules[0]),)
+        for part in modules[0].values() if len(modules) == 1 and isinstance(modules[0], Mapping) else modules:
+            check_module("modules", part)
+        check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
         self.init_key = unravel_key(init_key)

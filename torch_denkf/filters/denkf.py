@@ -23,6 +23,7 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
+from torch_denkf.modules._base import check_module
 
 __all__ = ["DEnKF"]
 
@@ -79,6 +80,10 @@ class DEnKF(Filter):
         observation_key: NestedKey | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_module("noise", noise)
+        check_module("initial", initial)
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
         if analysis is not None and (angles or observation_key is not None):

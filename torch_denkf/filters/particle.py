@@ -19,6 +19,7 @@ from torch_denkf.modules import (
     WithWeights,
     as_process_noise,
 )
+from torch_denkf.modules._base import check_module
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -93,6 +94,9 @@ class ParticleFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_module("initial", initial)
         if process_noise is not None:
             if isinstance(transition, ResampledTransition):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")

@@ -82,7 +82,7 @@ class GaussianPrior(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [], out_keys)
-        mean = as_floating(mean)
+        mean = as_floating(mean, "mean")
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
         check_values("mean", mean)

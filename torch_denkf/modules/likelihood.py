@@ -10,10 +10,10 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count
 from torch_denkf.functional import mean_observation, wrap_angles
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, check_dims, mean_of_members
+from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
@@ -183,9 +183,9 @@ class LearnedLikelihood(SubModel):
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
         self.observed_key = unravel_key(observed_key)
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
-            value = as_floating(default if value is None else value)
-            check_values(name, value, above=0 if name == "scale" else None)
-            self.register_buffer(name, value.expand(observation_dim).clone())
+            limit = 0 if name == "scale" else None
+            vector = as_vector(name, default if value is None else value, observation_dim, above=limit)
+            self.register_buffer(name, vector)
 
     def without_reading(self, encoding, predicted, *_):
         """The log-likelihoods where there is no reading: zero."""

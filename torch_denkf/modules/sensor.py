@@ -9,9 +9,9 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, register_location, register_scale
+from torch_denkf.modules._tensors import as_vector, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -189,9 +189,9 @@ class ImageSensor(_Sensor):
         self.trunk_memory, self.recompute, self.trunk_dtype = trunk_memory, recompute, trunk_dtype
         self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
         for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
-            channels = as_floating(default if value is None else value)
-            check_values(name, channels, above=0 if name == "pixel_scale" else None)
-            self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
+            limit = 0 if name == "pixel_scale" else None
+            channels = as_vector(name, default if value is None else value, image_shape[0], above=limit)
+            self.register_buffer(name, channels[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
 
     def _frames_at_once(self, device: torch.device) -> int | None:

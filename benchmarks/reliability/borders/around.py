@@ -21,6 +21,7 @@ from benchmarks.reliability.damage import (
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
+    angles,
     dims,
     matrix,
     vector,
@@ -114,7 +115,7 @@ def _losses() -> list[Subject]:
     o = objectives
     weight = {"negative": -1.0, "nan": NAN, "inf": float("inf"), "text": "x"}
     scale = {**vector(2, positive=True), "inf": [float("inf")] * 2}
-    common = {"score": CHOICE, "state_scale": scale, "reduction": CHOICE, "angles": dims(2)}
+    common = {"score": CHOICE, "state_scale": scale, "reduction": CHOICE, "angles": angles(2)}
     ensemble = lambda: {"filter": linear_denkf("etkf"), "sensor": 0.0}  # noqa: E731
     gaussian = lambda: {"filter": linear_kalman()}  # noqa: E731
     particles = lambda: {"filter": bootstrap(8, resampling="soft")}  # noqa: E731

@@ -19,6 +19,7 @@ from benchmarks.reliability.damage import (
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
+    angles,
     covariance,
     dims,
     matrix,
@@ -125,7 +126,7 @@ def subjects() -> list[Subject]:
     """All filters, with what each takes."""
     modules = dict.fromkeys(("transition", "observation", "noise", "initial"), MODULE)
     same_for_all = {"variance_ceiling": CEILING}
-    gaussian = {"process_noise": STDS, "inflation": POSITIVE, "angles": dims(2), **same_for_all}
+    gaussian = {"process_noise": STDS, "inflation": POSITIVE, "angles": angles(2), **same_for_all}
     sigma = {"alpha": POSITIVE, "beta": {"nan": float("nan"), "inf": float("inf"), "text": "much"}}
     sigma["kappa"] = {"minus the dimension": -2.0, "nan": float("nan"), "inf": float("inf"), "text": "much"}
     particle = {
@@ -152,7 +153,7 @@ def subjects() -> list[Subject]:
                 "cov": covariance(2),
                 "mean": vector(2),
                 "control": {k: v for k, v in matrix(2, 1).items() if k != "a column more"},
-                "angles": dims(2),
+                "angles": angles(2),
                 **same_for_all,
             },
             use,
@@ -167,7 +168,7 @@ def subjects() -> list[Subject]:
             {**gaussian, **linear, "process_noise": covariance(2), "initial": MODULE, "noise": MODULE},
             use,
         ),
-        Subject("DEnKF", DEnKF, _denkf, {**modules, "process_noise": STDS, "angles": dims(2), **same_for_all}, use),
+        Subject("DEnKF", DEnKF, _denkf, {**modules, "process_noise": STDS, "angles": angles(2), **same_for_all}, use),
         Subject("ParticleFilter", ParticleFilter, _particle, particle, use),
         Subject("DPF", DPF, _dpf, {"noisy_dims": dims(2), "initial": MODULE}, use),
         Subject("MixtureParticleFilter", MixtureParticleFilter, _mixture, {"alpha": SHARE, "initial": MODULE}, use),

@@ -21,6 +21,7 @@ from benchmarks.reliability.damage import (
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
+    angles,
     covariance,
     dims,
     matrix,
@@ -30,7 +31,8 @@ from torch_denkf import modules as m
 
 RATE = {**SHARE, "one": 1.0, "too small for eight bits": 0.001}
 STDS = vector(2, negative=False, length=False)
-SCALE = vector(2, positive=True)
+SCALE = {what: value for what, value in vector(2, positive=True).items() if what != "inf"}  # infinity hides an input
+DT = {what: value for what, value in POSITIVE.items() if what not in ("text", "zero")}  # text is a key
 EYE = torch.eye(2)
 
 
@@ -159,7 +161,7 @@ def _motions() -> list[Subject]:
             lambda: {"velocity": net(), "dt": 0.1},
             {
                 "velocity": MODULE,
-                "dt": {k: v for k, v in POSITIVE.items() if k != "text"},
+                "dt": DT,
                 "loc": vector(2),
                 "scale": SCALE,
             },
@@ -169,14 +171,14 @@ def _motions() -> list[Subject]:
             "UnicycleMotion",
             m.UnicycleMotion,
             lambda: {"dt": 0.1},
-            {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}},
+            {"dt": DT},
             on_car,
         ),
         Subject(
             "UnicyclePose",
             m.UnicyclePose,
             lambda: {"dt": 0.1},
-            {"dt": {k: v for k, v in POSITIVE.items() if k != "text"}},
+            {"dt": DT},
         ),
         Subject(
             "LinearTransition",
@@ -240,7 +242,7 @@ def _motions() -> list[Subject]:
 
 def _observations() -> list[Subject]:
     return [
-        Subject("Select", m.Select, lambda: {"dims": [0, 1]}, {"dims": dims(2)}, on_row),
+        Subject("Select", m.Select, lambda: {"dims": [0, 1]}, {"dims": angles(2)}, on_row),
         Subject(
             "LinearObservation",
             m.LinearObservation,
@@ -318,7 +320,7 @@ def _noises() -> list[Subject]:
             "UnicycleNoise",
             m.UnicycleNoise,
             lambda: {"noise": _process_noise(), "dt": 0.1},
-            {"noise": MODULE, "dt": {k: v for k, v in POSITIVE.items() if k != "text"}},
+            {"noise": MODULE, "dt": DT},
             on_car,
         ),
     ]
@@ -440,7 +442,7 @@ def _updates() -> list[Subject]:
                 "scheme": CHOICE,
                 "inflation": POSITIVE,
                 "relaxation": SHARE,
-                "angles": dims(2),
+                "angles": angles(2),
                 "taper": {
                     "one matrix": torch.ones(2, 2),
                     "wrong shapes": (torch.ones(3, 2), torch.ones(2, 2)),
@@ -464,7 +466,7 @@ def _updates() -> list[Subject]:
                 "inflation": POSITIVE,
                 "relaxation": SHARE,
                 "tile": COUNT,
-                "angles": dims(2),
+                "angles": angles(2),
             },
             on_row,
         ),
@@ -476,7 +478,7 @@ def _updates() -> list[Subject]:
                 "matrix": {k: v for k, v in matrix(2, 2).items() if k != "a row more"},
                 "noise": covariance(2),
                 "inflation": POSITIVE,
-                "angles": dims(2),
+                "angles": angles(2),
             },
             on_row,
         ),
@@ -484,7 +486,7 @@ def _updates() -> list[Subject]:
             "EKFAnalysis",
             m.EKFAnalysis,
             lambda: {"observation": m.Select([0, 1])},
-            {"observation": MODULE, "inflation": POSITIVE, "angles": dims(2)},
+            {"observation": MODULE, "inflation": POSITIVE, "angles": angles(2)},
             on_row,
         ),
         Subject(
@@ -494,13 +496,13 @@ def _updates() -> list[Subject]:
             {
                 "observation": MODULE,
                 "inflation": POSITIVE,
-                "angles": dims(2),
+                "angles": angles(2),
                 "alpha": POSITIVE,
                 "kappa": {**FINITE, "minus the dimension": -2.0},
             },
             on_row,
         ),
-        Subject("GaussianLikelihood", m.GaussianLikelihood, dict, {"angles": dims(2)}, on_row),
+        Subject("GaussianLikelihood", m.GaussianLikelihood, dict, {"angles": angles(2)}, on_row),
         Subject(
             "LearnedLikelihood",
             m.LearnedLikelihood,

@@ -105,6 +105,14 @@ def _start(step: PackagedStep, filter: Filter) -> dict[str, torch.Tensor]:
     return {name: begun[tuple(name.split("."))].clone() for name in step.carry}
 
 
+def _packaged(filter: Filter, frame: TensorDict, folder: Path) -> tuple[PackagedStep, str]:
+    """A package, compiled where inductor can: it has no vmap of a Jacobian, which an EKF needs."""
+    try:
+        return load_step(export_step(filter, frame, folder / "step.pt2")), "compiled"
+    except torch._inductor.exc.InductorError:
+        return load_step(export_step(filter, frame, folder / "graph.pt2", compiled=False)), "graph"
+
+
 def soak(name: str, steps: int) -> dict[str, Any]:
     """A row of the table."""
     make, exact = FILTERS[name]
@@ -113,7 +121,7 @@ def soak(name: str, steps: int) -> dict[str, Any]:
     frame = TensorDict({"observation": torch.zeros(2), "observed": torch.ones(1, dtype=torch.bool)})
     chunks, began = steps // CHUNK, time.time()
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
-        step = load_step(export_step(filter, frame, Path(folder) / "step.pt2"))
+        step, kind = _packaged(filter, frame, Path(folder))
         run, held = Run(step, _start(step, filter)), 0
         errors, spreads, unobserved = [], [], 0
         for number in range(chunks):
@@ -139,6 +147,7 @@ def soak(name: str, steps: int) -> dict[str, Any]:
     right = run.not_finite == 0 and grown < 16 << 20 and alike and abs(last / first - 1) < 0.25
     return {
         "name": name,
+        "package": kind,
         "steps": chunks * CHUNK,
         "unobserved": unobserved,
         "not finite": run.not_finite,
