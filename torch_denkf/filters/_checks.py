@@ -79,7 +79,9 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
     """
     finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
-    if finite and not absurd:
+    # -inf is the log-weight of a particle that is out of the question.
+    lost = [key for key in structure.carry if key in entries and not bool(entries[key].amax() < torch.inf)]
+    if finite and not absurd and not lost:
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl.envs.transforms import Compose, TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters._checks import (
     check_inputs,
     refuse_missing_actions,
@@ -237,8 +237,7 @@ class Filter(TensorDictSequential):
             RuntimeError: if there is no C++ compiler, which processors need.
             ValueError: if ``chunk`` is negative.
         """
-        if chunk < 0:
-            raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
+        check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
         self.compiled = CompiledSteps(chunk, options) if chunk else None
         return self
 
@@ -409,6 +408,8 @@ class Filter(TensorDictSequential):
             ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
             KeyError: if an entry is missing.
         """
+        if detach_every is not None:
+            check_count("detach_every", detach_every)
         size = tensordict.batch_size
         if not size or not size[-1]:
             raise ValueError(

@@ -206,11 +206,9 @@ class SubModel(TensorDictModule):
             return self.on_entries(entries, call)
         except (RuntimeError, TypeError, ValueError, IndexError) as error:
             self._explain_dtypes(error, entries)
-            if type(error) not in _EXPLAINED or getattr(error, "explained", False):
+            if type(error) not in _EXPLAINED:  # it may not be made of a message alone
                 raise
-            explained: Any = type(error)(f"{error} {self._what_there_was(entries)}")
-            explained.explained = True  # a module around this one has nothing to add
-            raise explained from error
+            raise type(error)(f"{error} {self._what_there_was(entries)}") from error
 
     def _what_there_was(self, entries: Entries) -> str:
         """What was read, and constants, with their shapes: for the message of an error."""

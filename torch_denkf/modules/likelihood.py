@@ -83,6 +83,11 @@ class GaussianLikelihood(SubModel):
             )
         if reading.ndim > len(batch_size) + 1:
             reading = mean_observation(reading, self.angles)
+        if not reading.shape[-1] == predicted.shape[-1] == variance.shape[-1]:
+            widths = {
+                key: value.shape[-1] for key, value in zip(self.in_keys, (predicted, reading, variance), strict=True)
+            }
+            raise ValueError(f"GaussianLikelihood compares vectors of one width; their widths are {widths}.")
         reading, variance = reading.unsqueeze(-2), variance.unsqueeze(-2)
         if observed is not None:
             # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.

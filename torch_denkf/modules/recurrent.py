@@ -237,6 +237,11 @@ class LSTMUpdate(SubModel):
             parts.append(encoding if observed is None else torch.where(observed.any(-1, keepdim=True), encoding, 0.0))
         if self.observation_key is not None:
             reading, *inputs = inputs
+            if reading.shape[-1] != len(self.observation_loc):
+                raise ValueError(
+                    f"{self.observation_key!r} has {reading.shape[-1]} components; observation_dim is "
+                    f"{len(self.observation_loc)}."
+                )
             reading = (mean_of_members(reading, batch_size) - self.observation_loc) / self.observation_scale
             parts.append(reading if observed is None else torch.where(observed, reading, 0.0))
             flag = torch.ones_like(reading) if observed is None else observed.expand_as(reading)

@@ -13,6 +13,7 @@ from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._checks import check_count
 from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
@@ -114,8 +115,10 @@ class FilterTrainer(HookPoints):
         names = [stage.name for stage in stages]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"A training needs stages, each with a name of its own; got {names}.")
-        if min(validate_every, save_every, log_every) < 1:
-            raise ValueError("validate_every, save_every and log_every are numbers of updates, at least 1.")
+        for name, value in {"validate_every": validate_every, "save_every": save_every, "log_every": log_every}.items():
+            check_count(name, value, cure="It is a number of updates")
+        check_count("max_skipped", max_skipped, least=0, cure="It is a number of updates")
+        check_count("seed", seed, least=0)
         if keep not in ("best", "last"):
             raise ValueError(f'keep is "best" or "last"; got {keep!r}.')
         self.model, self.stages, self.out = model, list(stages), Path(out)

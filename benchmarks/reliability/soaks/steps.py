@@ -80,7 +80,7 @@ def memory() -> int:
 class Run:
     """Steps of a package, and what is looked at."""
 
-    def __init__(self, step: PackagedStep, start: dict[str, torch.Tensor]):
+    def __init__(self, step: PackagedStep | Eager, start: dict[str, torch.Tensor]):
         self.step, self.carry = step, start
         self.not_finite = 0
         self.taken = 0.0
@@ -100,17 +100,30 @@ class Run:
         return mean, variance
 
 
-def _start(step: PackagedStep, filter: Filter) -> dict[str, torch.Tensor]:
+def _start(step: PackagedStep | Eager, filter: Filter) -> dict[str, torch.Tensor]:
     begun = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
     return {name: begun[tuple(name.split("."))].clone() for name in step.carry}
 
 
-def _packaged(filter: Filter, frame: TensorDict, folder: Path) -> tuple[PackagedStep, str]:
-    """A package, compiled where inductor can: it has no vmap of a Jacobian, which an EKF needs."""
+class Eager:
+    """A filter's own step, called as a package is."""
+
+    def __init__(self, filter: Filter):
+        self.filter, self.carry = filter, [".".join(key) for key in filter.carry_keys]
+
+    def __call__(self, entries: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Takes one step."""
+        row = TensorDict({tuple(name.split(".")): value for name, value in entries.items()})
+        out = self.filter.step(row)
+        return {name: out[tuple(name.split("."))] for name in (*self.carry, "belief.var")}
+
+
+def _packaged(filter: Filter, frame: TensorDict, folder: Path) -> tuple[PackagedStep | Eager, str]:
+    """A package, or the filter itself where torch.export cannot follow it: an EKF's Jacobians."""
     try:
         return load_step(export_step(filter, frame, folder / "step.pt2")), "compiled"
-    except torch._inductor.exc.InductorError:
-        return load_step(export_step(filter, frame, folder / "graph.pt2", compiled=False)), "graph"
+    except (torch._inductor.exc.InductorError, NotImplementedError):
+        return Eager(filter), "eager"
 
 
 def soak(name: str, steps: int) -> dict[str, Any]:
@@ -122,6 +135,7 @@ def soak(name: str, steps: int) -> dict[str, Any]:
     chunks, began = steps // CHUNK, time.time()
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         step, kind = _packaged(filter, frame, Path(folder))
+        chunks = chunks if kind == "compiled" else max(chunks // 10, 2)
         run, held = Run(step, _start(step, filter)), 0
         errors, spreads, unobserved = [], [], 0
         for number in range(chunks):

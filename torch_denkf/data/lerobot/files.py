@@ -83,7 +83,9 @@ class Layout:
         feature = self.features[key]
         if len(feature["shape"]) != 1 or feature["dtype"] in ("string", "image", "video"):
             raise ValueError(f"feature {key!r} of {self.root} is no vector: {feature['dtype']} {feature['shape']}")
-        return int(feature["shape"][0])
+        width = feature["shape"][0]
+        check_count(f"the width of feature {key!r} in {self.meta[0]}", width)
+        return int(width)
 
     def names(self, key: str) -> tuple[str, ...] | None:
         """Names of a feature's numbers, where each has one: LeRobot writes lists, or lists below a common name."""
@@ -113,7 +115,7 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
     check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
     _check_features(file, features)
-    if version not in VERSIONS:
+    if not isinstance(version, str) or version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
     stay_inside(root, f"images/{camera}", f"{file}, by the name of a camera,")
@@ -123,12 +125,12 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         episodes, meta = _episodes_of_version_3(root, info, camera)
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
-        raise ValueError(f"{root} has no episodes; {COMPLETE}")
+        raise ValueError(f"{root} has no episodes: {meta[0]} lists none; {COMPLETE}")
     _check_episodes(meta, episodes)
     rows = sum(episode.length for episode in episodes)
     if rows > MOST_ROWS:
         raise ValueError(
-            f"{root} announces {rows} rows, more than the {MOST_ROWS} that are read; its metadata are wrong"
+            f"{meta[0]} announces {rows} rows, more than the {MOST_ROWS} that are read; its numbers are wrong"
         )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
@@ -162,7 +164,8 @@ def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) ->
         if camera is not None and camera in (name, name.removeprefix("observation.images.")):
             return name
     if not cameras:
-        raise ValueError(f"{root} has no camera: no feature of dtype video or image among {sorted(features)}")
+        file = root / "meta" / "info.json"
+        raise ValueError(f"{file} names no camera: no feature of dtype video or image among {sorted(features)}")
     raise ValueError(
         f"{root} has no camera {camera!r}; it has {cameras}"
         if camera is not None
