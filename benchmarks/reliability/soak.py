@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
+
 from benchmarks.common.arguments import command, processor, some_of
 from benchmarks.common.tables import head, line
 from benchmarks.reliability.soaks import disks, kills, layouts, steps
@@ -39,11 +41,13 @@ class Soak:
                 print(row)
             return
         for part in self.parts:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
             if self.anew:
                 self._keep(part, [])
             for row in self._rows(part):
                 print(part, json.dumps(row), flush=True)
-                self._keep(part, [*self._found(part), row])
+                with FileLock(self.out.with_suffix(".lock")):  # parts may run in processes of their own
+                    self._keep(part, [*self._found(part), row])
         write_table(self.out)
 
     def _rows(self, part: str) -> Iterator[dict[str, Any]]:
