@@ -6,6 +6,7 @@ import io
 import os
 import pickle
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,7 @@ def ran(folder: Path) -> bool:
     return (folder / MARK).exists()
 
 
+@cache
 def npz_of_zeros(size: int) -> bytes:
     """A small archive with an array of so many bytes."""
     buffer, head = io.BytesIO(), io.BytesIO()

@@ -16,7 +16,7 @@ from torchrl.record.loggers.common import Logger
 from torch_denkf._checks import check_count
 from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
-from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
@@ -286,6 +286,7 @@ class FilterTrainer(HookPoints):
         self.out.mkdir(parents=True, exist_ok=True)
         if resume and self.last_checkpoint.exists():
             state = read_checkpoint(self.last_checkpoint)
+            check_state(self.last_checkpoint, state)
             check_settings(self.last_checkpoint, state["settings"], self._settings, state["stage"])
             if state["best"] is not None:  # the file may be from validations that are about to be repeated
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])

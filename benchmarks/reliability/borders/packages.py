@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from benchmarks.reliability.borders.checkpoints import HOSTILE
 from benchmarks.reliability.case import Case, apart, workshop
 from benchmarks.reliability.damage import BYTES, gone, same, written
-from benchmarks.reliability.hostile import ran
+from benchmarks.reliability.hostile import npz_of_zeros, ran
 from tests.filters.factories import linear_kalman
 from torch_denkf.deployment import export_step, load_step
 
@@ -145,6 +145,7 @@ def _too_large(folder: Path) -> Any:
 
 def cases() -> Iterator[Case]:
     """All damaged packages."""
+    npz_of_zeros(1 << 30)  # here, not in each case's process
     border = "packages"
     for compiled in (False, True):
         kind, needs = "compiled" if compiled else "graph", partial(sound, compiled)

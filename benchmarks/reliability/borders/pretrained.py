@@ -17,7 +17,7 @@ import torch_denkf.pretrained
 from benchmarks.reliability.borders.checkpoints import HOSTILE
 from benchmarks.reliability.case import Case
 from benchmarks.reliability.damage import BYTES, copied, gone, same, written
-from benchmarks.reliability.hostile import ran
+from benchmarks.reliability.hostile import npz_of_zeros, ran
 from torch_denkf.odometry import load_car_filter
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 
@@ -141,6 +141,7 @@ DAMAGE: dict[str, Change] = {
 
 def cases() -> Iterator[Case]:
     """All damaged folders."""
+    npz_of_zeros(1 << 30)  # here, not in each case's process
     border = "pretrained"
     for name in LOADERS:
         for file in (CONFIG, WEIGHTS):

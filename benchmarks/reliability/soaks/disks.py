@@ -32,7 +32,7 @@ from torch_denkf.training import read_checkpoint, write_checkpoint
 
 __all__ = ["rows"]
 
-SMALL, LARGE = "size=600k", "size=400m"
+SMALL, LARGE = "size=64k", "size=400m"
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _on_disk(name: str, kind: str) -> dict[str, Any]:
     """Writing where there is no room, or nothing may be written; and again where there is."""
     writer, began = WRITERS[name], time.time()
     full = kind == "full"
-    with _disk("size=64k" if full and name in ("package", "trainer") else SMALL if full else LARGE) as disk:
+    with _disk(SMALL if full else LARGE) as disk:
         if not full:
             subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
         refused = judge(Case("disk", name, (*writer.words, str(disk)), lambda folder: writer.write(disk), within=120))

@@ -258,7 +258,11 @@ def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key)
         fails(ValueError, rf"info.json.* names a file outside of the data set, '{prefix}.*download it from where", root)
     for template in ("{x}", "{0}", "{episode_index:99999999d}", "{episode_index.real}", "{", 7):
         file.write_text(json.dumps({**info, key: template}))
-        fails(ValueError, r"info.json has a path .* that cannot be filled in: ", root)
+        fails(
+            ValueError,
+            r"info.json (has a path .* that cannot be filled in|is malformed: '.*_path' is no template)",
+            root,
+        )
     file.write_text(json.dumps({**info, key: f"{root}/{info[key]}"}))  # absolute, but inside
     assert len(open_all(root)) == 8
 
