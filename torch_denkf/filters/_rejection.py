@@ -46,7 +46,7 @@ def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[Ne
     readers: dict[NestedKey, list[SubModel]] = {}
     for part in parts:
         mask = getattr(part, "observed_key", None)
-        if mask is not None and getattr(part, "reading_keys", ()):
+        if mask is not None and getattr(part, "reading_keys", None):
             readers.setdefault(unravel_key(mask), []).append(part)
     guards = []
     for mask, sharing in readers.items():

@@ -11,6 +11,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters.base import Filter, FilterOptions
 from torch_denkf.modules import (
     DiagonalNoise,
@@ -26,6 +27,11 @@ from torch_denkf.modules import (
 from torch_denkf.modules._base import check_module
 
 __all__ = ["DEnKF"]
+
+
+def _check_image_shape(shape: Sequence[int]) -> None:
+    if len(shape) != 3 or not all(isinstance(side, int) and side > 0 for side in shape):
+        raise ValueError(f"image_shape is (channels, height, width), positive; got {shape!r}")
 
 
 class DEnKF(Filter):
@@ -124,6 +130,10 @@ class DEnKF(Filter):
             initial: the initial belief; N(0, I) of the standardised state by default.
             **kwargs: passed on to the constructor.
         """
+        check_count("state_dim", state_dim)
+        check_count("observation_dim", observation_dim)
+        _check_image_shape(image_shape)
+        check_number("r", r, above=0)
         return cls(
             transition=LearnedTransition(StochasticMLP(state_dim, state_dim, (32, 32, 64, 64), rate=rate)),
             sensor=ImageSensor(

@@ -97,6 +97,8 @@ class ParticleFilter(Filter):
         check_module("transition", transition)
         check_module("observation", observation)
         check_module("initial", initial)
+        if resampling not in ("systematic", "soft", "transport", None):
+            raise ValueError(f'resampling is "systematic", "soft", "transport" or None; got {resampling!r}.')
         if process_noise is not None:
             if isinstance(transition, ResampledTransition):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")

@@ -178,6 +178,11 @@ class ImageSensor(_Sensor):
     ):
         if trunk_memory is not None and trunk_memory <= 0:
             raise ValueError(f"trunk_memory is in bytes and positive; got {trunk_memory}.")
+        if trunk_memory is not None:
+            check_count("trunk_memory", trunk_memory, cure="It is in bytes")
+        check_count("observation_dim", observation_dim)
+        if len(image_shape) != 3 or not all(isinstance(side, int) and side > 0 for side in image_shape):
+            raise ValueError(f"image_shape is (channels, height, width), positive; got {image_shape!r}")
         trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
         # Twice as fast on a CPU, and nothing else changes. torch lacks this keyword among the overloads of Module.to.
         trunk = trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -66,13 +66,13 @@ ODOMETRY = {
     "": f"{DRIVE}/image_2",
     "--calibration": f"{DRIVE}/calib.txt",
     "--times": f"{DRIVE}/times.txt",
-    "--checkpoint": "car-odometry",
+    "--checkpoint": "./car-odometry",
     "--out": "out",
     "--no-pictures": None,
 }
 COMMANDS: dict[str, dict[str, Any]] = {
     "odometry": ODOMETRY,
-    "evaluate": {"--checkpoint": "car-odometry", "--root": "kitti", "--draws": 1, "--window": 3, "--out": "out"},
+    "evaluate": {"--checkpoint": "./car-odometry", "--root": "kitti", "--draws": 1, "--window": 3, "--out": "out"},
     "plot": {"": "path.csv", "--out": "out"},
     "render-kitti": {"--out": "out", "--names": "a", "--frames": 3, "--size": "12 36", "--processes": 1},
     "train": {
@@ -96,7 +96,7 @@ NO_FOLDER = {"a file": "path.csv", "in a file": "path.csv/below", "in a device":
 NOTHING = {"not there": "nowhere", "empty": ""}
 WRONG: dict[str, dict[str, dict[str, str]]] = {
     "odometry": {
-        "": {**NOTHING, "a text file": f"{DRIVE}/times.txt", "an empty folder": "kitti/poses"},
+        "": {"not there": "nowhere", "a text file": f"{DRIVE}/times.txt", "an empty folder": "kitti/poses"},
         "--calibration": {**NOTHING, "a folder": "kitti", "another file": "path.csv"},
         "--times": {**NOTHING, "a folder": "kitti", "another file": "path.csv"},
         "--checkpoint": {**NOTHING, "a folder without one": "kitti"},
@@ -125,7 +125,11 @@ WRONG: dict[str, dict[str, dict[str, str]]] = {
         "--seed": WHOLE,
         "--threads": AT_LEAST_ONE,
     },
-    "plot": {"": {**NOTHING, "a folder without one": "kitti"}, "--out": NO_FOLDER, "--level": {**POSITIVE, "one": "1"}},
+    "plot": {
+        "": {"not there": "nowhere", "a folder without one": "kitti"},
+        "--out": NO_FOLDER,
+        "--level": {**POSITIVE, "one": "1"},
+    },
     "render-kitti": {
         "--out": NO_FOLDER,
         "--poses": {**NOTHING, "a folder without poses": "ur5", "a file": "path.csv"},

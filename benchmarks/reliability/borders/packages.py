@@ -160,7 +160,13 @@ def cases() -> Iterator[Case]:
     for what, change in HOSTILE.items():
         yield Case(border, f"a package that is {what}", (STEP,), partial(_load, False, change), within=4, needs=needs)
     for what, text in SIGNATURES.items():
-        yield Case(border, f"its description: {what}", (STEP,), partial(_load, False, _signature(text)), needs=needs)
+        yield Case(
+            border,
+            f"its description: {what}",
+            (STEP, "observation"),
+            partial(_load, False, _signature(text)),
+            needs=needs,
+        )
     yield Case(border, "taken away", (STEP,), partial(_load, False, gone), needs=needs)
     for what, (words, call) in CALLS.items():
         yield Case(border, f"called with {what}", words, partial(_call, call), needs=needs)
