@@ -132,7 +132,8 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
         weights = load_file(file)
     except (SafetensorError, ValueError) as error:
         raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train anew") from error
-    strange = [name for name, value in weights.items() if value.is_floating_point() and not value.isfinite().all()]
+    trained = [name for name, _ in model.named_parameters()]  # a constant may be infinite, where nothing limits it
+    strange = [name for name in trained if name in weights and not weights[name].isfinite().all()]
     if strange:
         raise ValueError(f"{file} holds NaN or infinity in {strange[:3]}; restore it from a copy, or train anew")
     try:

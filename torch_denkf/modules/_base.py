@@ -284,7 +284,7 @@ def check_module(name: str, module: Any) -> None:
     Raises:
         TypeError: if it is none; ``name`` is the argument's.
     """
-    if not isinstance(module, TensorDictModuleBase):
+    if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
         raise TypeError(f"{name} must be a TensorDict module, such as those of torch_denkf.modules; got {module!r}")
 
 
