@@ -167,3 +167,15 @@ def test_what_cannot_be_made_again_is_moved_and_not_deleted(tmp_path, resume, ca
     assert {file.name: file.read_bytes() for file in (tmp_path / "earlier-1").glob("best_*.pt")} == before
     assert csv_files(tmp_path / "earlier-1") == logs
     assert len(before) == len(list((tmp_path / "earlier-2").glob("best_*.pt"))) == 3
+
+
+def test_a_finished_training_that_is_started_again_says_so(tmp_path, caplog):
+    make_trainer(tmp_path).fit()
+    assert not caplog.messages
+    make_trainer(tmp_path).fit()
+    (message,) = caplog.messages
+    assert str(tmp_path) in message
+    assert "fit(resume=False)" in message
+    caplog.clear()
+    make_trainer(tmp_path).fit(resume=False)
+    assert not caplog.messages

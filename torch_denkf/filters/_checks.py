@@ -9,8 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
-from torch_denkf.filters._steps import previous_key
-from torch_denkf.filters._structure import Structure
+from torch_denkf.filters._structure import Structure, previous_key
 from torch_denkf.modules._base import Entries, random_parts
 
 if TYPE_CHECKING:
@@ -58,8 +57,9 @@ def check_inputs(
         if key not in entries and key not in without and previous_key(key) not in entries
     ]
     if missing:
-        modules = (*structure.frames, structure.transition, *structure.update)
-        readers = [type(m).__name__ for _, m in modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))]
+        readers = [
+            type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
+        ]
         present = ", ".join(sorted(map(str, tensordict.keys(True, True)))) or "nothing"
         raise KeyError(
             f"{', '.join(readers) or name} reads {', '.join(map(repr, missing))}, which the tensordict lacks. It holds "
@@ -122,7 +122,7 @@ def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool
 def refuse_unknown_noise(filter: Filter, noise: Entries) -> None:
     """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
     structure = filter.structure
-    modules = (*structure.frames, structure.transition, *structure.update, ("initial", filter.initial))
+    modules = (*structure.modules, ("initial", filter.initial))
     places = {place for name, module in modules for place, _ in random_parts(module, name)}
     unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
     if unknown:

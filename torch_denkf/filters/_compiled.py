@@ -30,6 +30,8 @@ class CompiledSteps:
     """
 
     def __init__(self, chunk: int, options: Mapping[str, Any]):
+        if chunk < 0:
+            raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
         if options.get("backend", "inductor") == "inductor":
             from torch_denkf.filters.inductor import need_compiler
 
@@ -84,13 +86,13 @@ class CompiledSteps:
                 carry, values = (tuple(value.clone() for value in part) for part in (carry, values))
             outputs.append(values)
             begin += length
+        if len(outputs) == 1:
+            return dict(zip(keep, outputs[0], strict=True))
         columns = zip(*outputs, strict=True)
         return {key: torch.cat(values, time) for key, values in zip(keep, columns, strict=True)}
 
     def _function(self, kind: tuple, steps: Steps, device: torch.device, make: Callable[[], Callable]) -> Callable:
-        structure = steps.structure
-        modules = (*structure.frames, structure.transition, *structure.update)  # a part may be replaced
-        kind = (*kind, modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
+        kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
                 from torch_denkf.filters.inductor import clear_damaged_libraries

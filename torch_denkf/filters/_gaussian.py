@@ -6,13 +6,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Unpack
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules._base import check_module
 
-__all__ = ["GaussianFilter", "GaussianOptions"]
+__all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
 
 class GaussianOptions(FilterOptions, total=False):
@@ -51,6 +52,9 @@ class GaussianFilter(Filter):
         observation_key: likewise.
         observed_key: likewise.
         **kwargs: of :class:`Filter`.
+
+    Raises:
+        ValueError: if ``initial`` writes no mean and covariance.
     """
 
     def __init__(
@@ -69,6 +73,7 @@ class GaussianFilter(Filter):
     ):
         check_module("noise", noise)
         check_module("initial", initial)
+        refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         update = analysis(
             inflation=inflation,
             angles=angles,
@@ -79,3 +84,14 @@ class GaussianFilter(Filter):
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, analysis=update)
         super().__init__(modules, initial=initial, **kwargs)
+
+
+def refuse_other_beliefs(owner: str, initial: TensorDictModuleBase, carry: Sequence[NestedKey]) -> None:
+    """Raises a ``ValueError`` where an initial belief lacks the mean or the covariance that a filter carries."""
+    written = [unravel_key(key) for key in initial.out_keys]
+    if not set(map(unravel_key, carry)).issubset(written):
+        raise ValueError(
+            f"{owner} carries {list(carry)}, and its initial belief, {type(initial).__name__}, writes {written}. Use "
+            "MomentPrior(mean, cov), or GaussianAround(std) around a known state; GaussianPrior, AroundState and "
+            "FromSensor are for ensembles and particles."
+        )

@@ -46,19 +46,24 @@ def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[Ne
     readers: dict[NestedKey, list[SubModel]] = {}
     for part in parts:
         mask = getattr(part, "observed_key", None)
-        if mask is not None and getattr(part, "reading_keys", None):
+        if mask is not None and _readings(part):
             readers.setdefault(unravel_key(mask), []).append(part)
     guards = []
     for mask, sharing in readers.items():
         whole: dict[NestedKey, None] = {}
         components: dict[NestedKey, None] = {}
-        by_component = len(sharing) == 1 and getattr(sharing[0], "reads_components", False)
-        for key in (unravel_key(key) for part in sharing for key in part.reading_keys):
+        same = len({tuple(map(unravel_key, _readings(part))) for part in sharing}) == 1
+        by_component = same and all(getattr(part, "reads_components", False) for part in sharing)
+        for key in (unravel_key(key) for part in sharing for key in _readings(part)):
             for source in sources.get(key, ()):
                 (components if by_component and source == key else whole)[source] = None
         whole = {key: None for key in whole if key not in components}
         guards.append(Guard(mask, tuple(whole), tuple(components)))
     return tuple(guards)
+
+
+def _readings(part: SubModel) -> Sequence[NestedKey]:
+    return getattr(part, "reading_keys", None) or ()
 
 
 def usable(guards: Sequence[Guard], entries: Entries, batch_size: Sequence[int]) -> Entries:

@@ -10,7 +10,8 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules._tensors import as_floating, check_dims
 
@@ -33,6 +34,7 @@ class KalmanFilter(Filter):
         control: B, ``[S, A]``, of the action; ``None`` for none.
         angles: components of the observation that are angles in radians.
         observation_key: readings ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
             ``update_at_reset``, ``variance_ceiling``, ``check_finite`` and ``reject`` of :class:`Filter`.
 
@@ -60,6 +62,7 @@ class KalmanFilter(Filter):
         control: torch.Tensor | None = None,
         angles: Sequence[int] = (),
         observation_key: NestedKey = "observation",
+        observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
         given = {"transition": transition, "transition_noise": transition_noise, "observation": observation}
@@ -90,6 +93,12 @@ class KalmanFilter(Filter):
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(
             transition=LinearTransition(transition, transition_noise, **action),
-            analysis=KalmanAnalysis(observation, observation_noise, observation_key=observation_key, angles=angles),
+            analysis=KalmanAnalysis(
+                observation,
+                observation_noise,
+                observation_key=observation_key,
+                observed_key=observed_key,
+                angles=angles,
+            ),
         )
         super().__init__(modules, initial=MomentPrior(mean, cov), **kwargs)

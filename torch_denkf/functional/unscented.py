@@ -124,6 +124,30 @@ def unscented_moments(
     return mean, _weighted_gram(deviations, weights.cov, deviations)
 
 
+def unscented_cross(points: Tensor, images: Tensor, weights: UnscentedWeights) -> Tensor:
+    """Covariance of a state and a function of it, from sigma points (Särkkä 2013, eq. 5.75).
+
+    Args:
+        points: of the state, ``[*B, 2 S + 1, S]``.
+        images: the function's values there, ``[*B, 2 S + 1, N]``.
+        weights: see :func:`unscented_weights`.
+
+    Returns:
+        The covariances, ``[*B, S, N]``.
+
+    Raises:
+        ValueError: if there are not as many points as weights.
+
+    Examples:
+        >>> points = sigma_points(torch.zeros(1), torch.eye(1))
+        >>> unscented_cross(points, 3 * points, unscented_weights(1)).round(decimals=4)
+        tensor([[3.]])
+    """
+    # The points lie evenly around their mean, so that the mean of the images need not be taken off, but for digits.
+    deviations = _deviations(images, weights, ())[1]
+    return (points - points[..., :1, :]).mT @ (weights.cov.unsqueeze(-1) * deviations)
+
+
 def unscented_update(
     points: Tensor,
     predicted: Tensor,

@@ -79,15 +79,21 @@ class GaussianTransition(SubModel):
 
     def on_entries(self, entries, call):
         """The forecast."""
+        return self.with_cross(entries, call)[0]
+
+    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
+        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
-        mean, cov = self._forecast(entries, mean, cov, call._replace(sample=False))
+        mean, cov, cross = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}
         noise = run_module(self.process_noise, work, call.part("process_noise"))
         cov = cov + as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
-        return {self.out_keys[0]: mean, self.out_keys[1]: cov}
+        return {self.out_keys[0]: mean, self.out_keys[1]: cov}, cross
 
-    def _forecast(self, entries: Entries, mean, cov, call: Call) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and covariance before the process noise is added."""
+    def _forecast(
+        self, entries: Entries, mean, cov, call: Call, wanted: bool
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Mean and covariance before the process noise is added, and where wanted the cross-covariance."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:

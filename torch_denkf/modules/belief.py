@@ -3,6 +3,7 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -130,7 +131,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -173,6 +174,14 @@ class FromSensor(_InitialEnsemble):
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
         self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
+
+    def on_entries(self, entries, call):
+        """The belief; without its reading the prior."""
+        if call.missing.isdisjoint(self.in_keys):
+            return super().on_entries(entries, call)
+        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
+        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
+        return self.by_key(self._members(mean, std, noise, call.batch_size))
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

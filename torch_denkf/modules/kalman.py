@@ -11,7 +11,7 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
-from torch_denkf.modules._base import SubModel, run_module
+from torch_denkf.modules._base import Call, Entries, SubModel, run_module
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
 
@@ -149,6 +149,10 @@ class LinearTransition(SubModel):
 
     def on_entries(self, entries, call):
         """The forecast."""
+        return self.with_cross(entries, call)[0]
+
+    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
+        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         noise = self.noise
         constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
@@ -159,7 +163,8 @@ class LinearTransition(SubModel):
         if not isinstance(noise, torch.Tensor):
             written = run_module(noise, {**entries, self.out_keys[0]: forecast}, call.part("noise"))
             forecast_cov = forecast_cov + as_covariance(written[unravel_key(noise.out_keys[0])], mean)
-        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}
+        cross = cov @ self.matrix.mT if wanted else None
+        return {self.out_keys[0]: forecast, self.out_keys[1]: forecast_cov}, cross
 
 
 class KalmanAnalysis(SubModel):

@@ -11,6 +11,7 @@ from torch_denkf._checks import check_number
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
+    unscented_cross,
     unscented_moments,
     unscented_update,
     unscented_weights,
@@ -81,9 +82,11 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
             check_number(name, value, above=0 if name == "alpha" else None)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
-    def _forecast(self, entries, mean, cov, call):
+    def _forecast(self, entries, mean, cov, call, wanted):
         points, weights = self._points(mean, cov)
-        return unscented_moments(self._move(entries, points, call), weights)
+        moved = self._move(entries, points, call)
+        cross = unscented_cross(points, moved, weights) if wanted else None
+        return *unscented_moments(moved, weights), cross
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):

@@ -42,8 +42,9 @@ class FilterTrainer(HookPoints):
     **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
-    outside of their ``state_dict``, and a sampler none at all. Where ``last.pt`` is missing, what else an earlier run
-    left is not overwritten: it is moved to ``out/earlier-1``. One process at a time trains in ``out``.
+    outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
+    logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an
+    earlier run left is not overwritten: it is moved to ``out/earlier-1``. One process at a time trains in ``out``.
 
     **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
     another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
@@ -291,6 +292,12 @@ class FilterTrainer(HookPoints):
             if state["best"] is not None:  # the file may be from validations that are about to be repeated
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])
             self._logs.open(state["logs"])
+            if state["stage"] == len(self.stages):
+                _LOG.warning(
+                    "The training in %s is finished: its result is read and nothing is trained. Start anew with "
+                    "fit(resume=False), or give another out.",
+                    self.out,
+                )
             return state
         if self.last_checkpoint.exists():  # the caller wants to start anew
             for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):

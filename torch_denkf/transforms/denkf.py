@@ -15,8 +15,11 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters._one_step import first_belief
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
-from torch_denkf.filters.base import where_rows
+from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
+from torch_denkf.filters._steps import where_rows
+from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
@@ -40,8 +43,9 @@ class DEnKFTransform(Transform):
     In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
     :class:`~torch_denkf.filters.Filter`.
 
-    A filter belongs either here or into the policy, not both: a policy's filter carries its own belief, under
-    ``("previous", ...)``, and would overwrite this one. Behind this transform, torchrl's ``FrameSkipTransform`` makes
+    A filter belongs either here or into the policy, not both: a policy's filter would start from a belief that has seen
+    the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
+    belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
     groups of agents, the belief is the environment's, and starts anew where any agent does.
 
@@ -49,8 +53,10 @@ class DEnKFTransform(Transform):
         filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
             its ``initial`` belief.
         initial: the initial belief of a plain ``TensorDictSequential``.
+        lag: fixed-lag smoothing: beside the belief of t what is believed of t - lag, ``("smoothed", "mean")``,
+            ``("smoothed", "var")`` and what else :class:`~torch_denkf.smoothers.FixedLag` writes; ``None`` for none.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
-        store_ensemble: if ``False``, rollouts and collected data hold the belief's mean and variance alone; the
+        store_ensemble: if ``False``, rollouts and collected data hold means and variances alone; the
             ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
@@ -65,7 +71,8 @@ class DEnKFTransform(Transform):
             worker, because it cannot be pickled. Resets and specs come from ``filter``.
 
     Raises:
-        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
+        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``, or cannot be
+            smoothed although there is a ``lag``.
         KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
@@ -85,6 +92,7 @@ class DEnKFTransform(Transform):
         filter: Filter | TensorDictSequential,
         *,
         initial: TensorDictModuleBase | None = None,
+        lag: int | None = None,
         diagnostics: Sequence[NestedKey] = (),
         store_ensemble: bool = True,
         no_grad: bool = True,
@@ -100,6 +108,8 @@ class DEnKFTransform(Transform):
             filter = Filter(*filter._module_iter(), initial=initial)
         elif initial is not None:
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
+        if lag is not None:
+            filter = FixedLag(filter, lag)
         self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
         self._reject = filter.reject or not check_finite
         written = [*filter.out_keys, *([REJECTED] if self._reject else [])]
@@ -108,7 +118,7 @@ class DEnKFTransform(Transform):
             raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {written}.")
         structure = filter.structure
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
-        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var")]
+        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var", "age")]
         super().__init__(
             in_keys=list(structure.needed),
             out_keys=[key for key in self._keep if key not in dropped],
@@ -147,9 +157,7 @@ class DEnKFTransform(Transform):
             if kept is not None:  # otherwise what follows says what is missing
                 if self.check_finite:
                     self._assert_finite({**_present(next_tensordict, (*self.in_keys, *self._optional)), **kept})
-                for key, name in self._names.items():
-                    next_tensordict.set(name, kept[key])
-                return next_tensordict
+                return self._emit(kept, next_tensordict)
         entries = {}
         for key in self.filter.carry_keys:
             name = self._names[key]
@@ -166,17 +174,22 @@ class DEnKFTransform(Transform):
             value = next_tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
+        say_ignored_mask(self.filter, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
             written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
         if self.check_finite:
             self._assert_finite({**entries, **written})
+        return self._emit(written, next_tensordict)
+
+    def _emit(self, written: Mapping[NestedKey, torch.Tensor], next_tensordict: TensorDictBase) -> TensorDictBase:
         for key, name in self._names.items():
             next_tensordict.set(name, written[key])
+        mark_up_to_date(written[self.filter.carry_keys[0]])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
-            start = self.filter.initialise_or_reject(tensordict_reset.copy(), self._reject)
+            start = first_belief(self.filter, tensordict_reset.copy(), reject=self._reject)
             if any(start.get(key, None) is None for key in self._keep):
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
                 template = self._trial(start.copy())
@@ -189,7 +202,8 @@ class DEnKFTransform(Transform):
                 start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
             start = self.filter.summarise(start)
         if self.check_finite:
-            self._assert_finite(_present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys)))
+            entries = _present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys))
+            self._assert_finite(entries, used=self.filter.update_at_reset)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(key))
         return tensordict_reset
@@ -226,9 +240,10 @@ class DEnKFTransform(Transform):
             else:
                 target.set(key, value)
 
-    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor]) -> None:
+    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
+        """Raises where the belief is not finite, or a reading that was ``used`` is not."""
         finite = all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys)
-        absurd = [] if self._reject else rejected_keys(self.filter.structure.guards, entries)
+        absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:
             return
         given = {key: entries[key] for key in self.in_keys if key in entries}
