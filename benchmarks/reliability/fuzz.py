@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import time
 from collections import Counter
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.arguments import some_of
-from benchmarks.reliability.case import Case, Verdict, judge
+from benchmarks.reliability.case import Case, Verdict, judge, workshop
 
 __all__ = ["BORDERS", "Fuzz", "all_cases", "run"]
 
@@ -78,6 +79,29 @@ def run(cases: Sequence[Case], progress: bool = True) -> list[tuple[Case, Verdic
     return out
 
 
+def run_side_by_side(cases: Sequence[Case], processes: int) -> list[tuple[Case, Verdict]]:
+    """As :func:`run`, in several processes, each of which takes its share of the cases."""
+    if processes == 1:
+        return run(cases)
+    for needs in {case.needs for case in cases if case.needs is not None}:
+        needs()  # once for all
+    files = [workshop() / f"verdicts-{number}.json" for number in range(processes)]
+    children = []
+    for number, file in enumerate(files):
+        child = os.fork()
+        if child == 0:
+            try:
+                verdicts = [vars(verdict) for _, verdict in run(cases[number::processes])]
+                file.write_text(json.dumps(verdicts))
+            finally:
+                os._exit(0)
+        children.append(child)
+    for child in children:
+        os.waitpid(child, 0)
+    shares = [[Verdict(**found) for found in json.loads(file.read_text())] for file in files]
+    return [(case, shares[number % processes][number // processes]) for number, case in enumerate(cases)]
+
+
 def summary(judged: Sequence[tuple[Case, Verdict]]) -> dict[str, Any]:
     """Counts of all, by border, and the cases that are neither clear nor right."""
 
@@ -103,6 +127,7 @@ class Fuzz:
     sample: int = 0  # so many of the cases, drawn evenly; 0 for all
     seed: int = 0  # of the sample
     borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]  # where the inputs come in
+    processes: int = 1  # that take cases side by side
     match: str = ""  # only cases that have this in their names
     out: Path = RESULTS / "fuzz.json"
     smoke: bool = False  # a tiny run
@@ -114,7 +139,7 @@ class Fuzz:
         sample = self.sample or (20 if self.smoke else 0)
         if sample:
             cases = drawn(cases, sample, self.seed)
-        found = summary(run(cases))
+        found = summary(run_side_by_side(cases, self.processes))
         found["seconds"] = round(time.time() - began)
         print({kind: found[kind] for kind in ("records", *KINDS)})
         if not self.smoke:
