@@ -30,7 +30,7 @@ from torch_denkf.training import read_checkpoint
 __all__ = ["JOBS", "rows"]
 
 LEFT = re.compile(r"^\.(writing|demo|collection|.*\.part)|\.part$|\.tmp$|-[0-9a-f]{8}$")
-GRACE = 10.0  # s in which workers of a killed process end themselves
+GRACE = 90.0  # s in which workers of a killed process end themselves: they may be importing torch
 
 
 @dataclass(frozen=True)
