@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.arguments import some_of
+from benchmarks.common.tables import head, line
 from benchmarks.reliability.case import Case, Verdict, judge, workshop
 
 __all__ = ["BORDERS", "Fuzz", "all_cases", "run"]
@@ -120,6 +121,13 @@ def summary(judged: Sequence[tuple[Case, Verdict]]) -> dict[str, Any]:
     return {**everything, "borders": {name: counts(kinds) for name, kinds in borders.items()}, "wrong": wrong}
 
 
+def table(found: dict[str, Any]) -> str:
+    """A summary as Markdown."""
+    rows = [*found["borders"].items(), ("all", found)]
+    lines = [line(name, row["records"], *(row[kind] for kind in KINDS)) for name, row in rows]
+    return "\n".join([*head("border", "inputs", *KINDS), *lines, ""])
+
+
 @dataclass(frozen=True)
 class Fuzz:
     """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
@@ -145,3 +153,4 @@ class Fuzz:
         if not self.smoke:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             self.out.write_text(json.dumps(found, indent=1) + "\n")
+            self.out.with_suffix(".md").write_text(table(found))

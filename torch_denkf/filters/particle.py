@@ -103,6 +103,8 @@ class ParticleFilter(Filter):
         check_module("transition", transition)
         check_module("observation", observation)
         check_module("initial", initial)
+        if noise is not None:
+            check_module("noise", noise)
         if resampling not in ("systematic", "soft", "transport", None):
             raise ValueError(f'resampling is "systematic", "soft", "transport" or None; got {resampling!r}.')
         if process_noise is not None:

@@ -101,17 +101,19 @@ def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -
     return vector.expand(size).clone()
 
 
-def check_dims(name: str, dims: Sequence[int], size: int | None = None) -> None:
+def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once: bool = False) -> None:
     """Raises unless these are indices of components, of ``size`` of them where that is known.
 
     Raises:
         TypeError: if one is no whole number.
-        ValueError: if one is negative or too large.
+        ValueError: if one is negative or too large, or there twice although each may be there ``once``.
     """
     for index in dims:
         if isinstance(index, bool) or not hasattr(index, "__index__"):
             raise TypeError(f"{name} holds indices of components, whole numbers; got {index!r} in {list(dims)}")
         check_number(name, int(index), least=0, below=size, cure=f"The indices are {list(dims)}")
+    if once and len(set(dims)) < len(dims):
+        raise ValueError(f"{name} names each component once; got {list(dims)}")
 
 
 def variance_and_floor(

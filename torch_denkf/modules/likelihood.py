@@ -67,6 +67,7 @@ class GaussianLikelihood(SubModel):
             nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
 
+        check_dims("angles", angles)
         self.angles = list(angles)
         self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
 

@@ -164,6 +164,7 @@ class LSTMUpdate(SubModel):
         memory_key: str = "belief",
         belief_key: str = "belief",
     ):
+        check_count("features", features, least=0)
         for key, size, name in (
             (encoding_key, features, "features"),
             (observation_key, observation_dim, "observation_dim"),
@@ -194,7 +195,6 @@ class LSTMUpdate(SubModel):
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
         self.reading_keys, self.observed_key = inputs, unravel_key(observed_key)
         self.reads_components = encoding_key is None
-        check_count("features", features, least=0)
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),

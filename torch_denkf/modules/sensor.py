@@ -180,8 +180,6 @@ class ImageSensor(_Sensor):
         trunk_dtype: torch.dtype | None = None,
         observed_key: NestedKey = "observed",
     ):
-        if trunk_memory is not None and trunk_memory <= 0:
-            raise ValueError(f"trunk_memory is in bytes and positive; got {trunk_memory}.")
         if trunk_memory is not None:
             check_count("trunk_memory", trunk_memory, cure="It is in bytes")
         check_count("observation_dim", observation_dim)
@@ -287,5 +285,6 @@ class VectorSensor(_Sensor):
         out_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
     ):
+        check_count("observation_dim", observation_dim)
         head = StochasticMLP(in_features, observation_dim, num_cells, layer=layer, rate=rate)
         super().__init__(nn.Identity(), head, ensemble_size, in_key, out_key, None, loc, scale, 1, observed_key)

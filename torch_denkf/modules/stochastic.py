@@ -143,6 +143,7 @@ class StochasticMLP(nn.Module):
         activation: Callable[[], nn.Module] = nn.ReLU,
         output_gain: float = 1.0,
     ):
+        check_number("posterior_std", posterior_std, above=0)
         super().__init__()
         if layer not in ("dropout", "flipout", "none"):
             raise ValueError(f'layer is "dropout", "flipout" or "none"; got {layer!r}.')

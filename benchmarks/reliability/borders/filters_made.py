@@ -170,7 +170,7 @@ def subjects() -> list[Subject]:
         ),
         Subject("DEnKF", DEnKF, _denkf, {**modules, "process_noise": STDS, "angles": angles(2), **same_for_all}, use),
         Subject("ParticleFilter", ParticleFilter, _particle, particle, use),
-        Subject("DPF", DPF, _dpf, {"noisy_dims": dims(2), "initial": MODULE}, use),
+        Subject("DPF", DPF, _dpf, {"noisy_dims": dims(2), "initial": MODULE}, use, also={"noisy_dims": ("dims",)}),
         Subject("MixtureParticleFilter", MixtureParticleFilter, _mixture, {"alpha": SHARE, "initial": MODULE}, use),
         Subject(
             "LSTMFilter",

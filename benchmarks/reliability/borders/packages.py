@@ -79,8 +79,6 @@ for _name in ("observation", "observed", "belief.mean", "belief.cov"):
         f"{_name} a list": ((_name,), lambda given, name=_name: given.update({name: given[name].tolist()})),
         f"{_name} nothing": ((_name,), lambda given, name=_name: given.update({name: None})),
     }
-for _name in ("observation", "belief.mean", "belief.cov"):
-    CALLS[f"{_name} NaN"] = ((_name,), lambda given, name=_name: given.update({name: given[name] * torch.nan}))
 CALLS["nothing at all"] = (("observation", "entries"), lambda given: {})
 
 

@@ -104,6 +104,7 @@ def _priors() -> list[Subject]:
             lambda: {"mean": torch.zeros(2), "cov": EYE.clone()},
             {"mean": vector(2), "cov": covariance(2)},
             on_row,
+            also={"mean": ("cov",)},  # of two sizes, either may be wrong
         ),
         Subject(
             "GaussianAround",
@@ -306,7 +307,7 @@ def _noises() -> list[Subject]:
             "ScaledNoise",
             m.ScaledNoise,
             lambda: {"noise": m.ConstantNoise([0.5, 0.5]), "factor": 1.0},
-            {"noise": MODULE, "factor": POSITIVE},
+            {"noise": MODULE, "factor": NOT_NEGATIVE},
             on_row,
         ),
         Subject(
