@@ -82,7 +82,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
     ):
         check_count("tile", tile)
         if isinstance(near, torch.Tensor) and near.ndim != 2:
-            raise ValueError(f"near is Neighbours, or a taper [S, O]; got a tensor of shape {list(near.shape)}")
+            raise ValueError(f"near is Neighbours, or a taper; a taper must be [S, O], got {list(near.shape)}")
         if not isinstance(near, (Neighbours, torch.Tensor)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
         super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
