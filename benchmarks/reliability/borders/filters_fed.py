@@ -181,6 +181,10 @@ def _first_unobserved(subject: Subject, frames: TensorDict) -> TensorDict:
     return frames
 
 
+#: By the width of readings: what may be hidden of one that is damaged. A sensor's is hidden as a whole.
+_HIDES = {2: (_unobserved, _first_unobserved), 4: (_unobserved,)}
+
+
 def _rounded(subject: Subject, frames: TensorDict) -> TensorDict:
     return frames.set(subject.reading, frames[subject.reading].round())
 
@@ -386,7 +390,7 @@ def _rejecting() -> Iterator[Case]:
 def _goes_on(subject: Subject, damage: Damage, result: TensorDict) -> bool:
     """Right where only the row that is damaged is as if it had not been observed, or computed right."""
     rows = [row for row in range(B) if row != AT[0]]
-    expected = [_reference(subject, "transform", hide) for hide in (_unobserved, _first_unobserved)]
+    expected = [_reference(subject, "transform", hide) for hide in _HIDES[subject.width]]
     others = _reference(subject, "transform", _sound)
     near = {"rtol": 1e-5, "atol": 1e-5}
     hidden = any(same(result[AT[0]], hidden[AT[0]], **near) for hidden in expected) or _large(

@@ -214,7 +214,7 @@ def _episodes() -> Iterator[Case]:
                 lines[f"{key} {what}"] = lambda line, key=key, value=value: line.update({key: value})
     lines["the same episode twice"] = lambda line: line.update(episode_index=0, length=LENGTHS[0])
     for what, change in lines.items():
-        words = ("episodes.jsonl", "episode_000001.parquet", "episode_000002.parquet")
+        words = ("episodes.jsonl", "episode_000001.parquet", "episode_000002.parquet", "episode_1000000000000.parquet")
         yield Case("lerobot", f"episodes.jsonl {what}", words, partial(_act, 2, _line(change)))
     columns = {"from_timestamp": (NAN, -5.0, 1e9, INF), "chunk_index": (-1, 10**9), "file_index": (-1, 10**9)}
     for name, values in columns.items():

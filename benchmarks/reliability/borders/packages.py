@@ -115,10 +115,6 @@ EXPORT: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "an example without a reading": (("observation",), {"example": TensorDict({})}),
     "an example of nothing": (("example",), {"example": None}),
     "no filter": (("filter",), {"filter": torch.nn.Linear(2, 2)}),
-    "a NaN in the example": (
-        ("observation", "example"),
-        {"example": TensorDict({"observation": torch.full((2,), torch.nan)})},
-    ),
 }
 
 

@@ -98,7 +98,7 @@ FIELDS: dict[str, dict[str, Any]] = {
 }
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "reacher": {
-        "ensemble_size": {"zero": 0, "negative": -3, "text": "x", "nothing": None, "a fraction": 1.5, "huge": 10**15},
+        "ensemble_size": {"zero": 0, "negative": -3, "text": "x", "nothing": None, "a fraction": 1.5},
         "encoder_std": {"zero": 0.0, "negative": -1.0, "nan": NAN, "text": "x", "nothing": None},
         "state_mean": {"too short": [0.0], "nan": [NAN] * 4, "text": "x", "nothing": None, "empty": []},
         "state_std": {"too short": [1.0], "nan": [NAN] * 4, "zero": [0.0] * 4, "negative": [-1.0] * 4, "text": "x"},

@@ -276,6 +276,8 @@ def _is_colour(files) -> bool:
 
 def _read_image(file: Path, size: tuple[int, int], colour: bool) -> tuple[np.ndarray | None, tuple[int, int]]:
     """Pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
+    if not file.is_file():  # a folder, or a link to nowhere
+        return None, (0, 0)
     pixels = _decode(file, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         return None, (0, 0)

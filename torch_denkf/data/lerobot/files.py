@@ -194,7 +194,7 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
             continue
         try:
             entry = json.loads(line)
-            number, length = int(entry["episode_index"]), int(entry["length"])
+            number, length = entry["episode_index"], entry["length"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{file} has a malformed line {line[:80]!r}, line {at} ({type(error).__name__}: {error}); download it "
@@ -303,7 +303,10 @@ def rows_of_episode(table, episode: EpisodeFiles):
     """
     import pyarrow.compute as compute
 
-    table = table.filter(compute.equal(table["episode_index"], episode.number))
+    try:
+        table = table.filter(compute.equal(table["episode_index"], episode.number))
+    except (NotImplementedError, ValueError) as error:  # pyarrow's are both
+        raise ValueError(f"{episode.data}: episode_index holds no whole numbers ({error}); download it anew") from error
     if table.num_rows != episode.length:
         raise ValueError(
             f"{episode.data} has {table.num_rows} rows of episode {episode.number}, but the metadata says "
