@@ -137,9 +137,7 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     strange += [name for name, value in weights.items() if value.is_floating_point() and value.isnan().any()]
     strange += [name for name in trained if name in weights and not weights[name].is_floating_point()]
     if strange:
-        raise ValueError(
-            f"{file} holds NaN, infinity or whole numbers in {strange[:3]}; restore it, or train anew"
-        )
+        raise ValueError(f"{file} holds NaN, infinity or whole numbers in {strange[:3]}; restore it, or train anew")
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:

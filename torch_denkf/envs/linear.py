@@ -62,6 +62,8 @@ class LinearGaussianEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str | None = None,
     ):
+        for count in batch_size:
+            check_count("batch_size, each number,", count, least=0)
         super().__init__(batch_size=torch.Size(batch_size), device=device)
         dtype = torch.get_default_dtype()
         self.F, self.H = _constant("transition", transition), _constant("observation", observation)

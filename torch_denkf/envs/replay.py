@@ -118,7 +118,7 @@ class ReplayEnv(RowsEnv):
     def _set_stretches(self, numbers: list[int], start: int | str, length: int | None) -> None:
         if isinstance(start, str) and start != "random":
             raise ValueError(f"start is a row of the episodes or 'random', got {start!r}")
-        for name, value, least in (("start", 0 if isinstance(start, str) else start, 0), ("length", length, 2)):
+        for name, value, least in (("start", 0 if isinstance(start, str) else start, 0), ("length", length, 0)):
             if value is not None:
                 check_count(name, value, least=least)
         self._random = start == "random"

@@ -15,7 +15,7 @@ from torchrl.objectives import LossModule
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
 from torch_denkf.functional import wrap_angles
-from torch_denkf.modules._tensors import check_dims
+from torch_denkf.modules._tensors import as_floating, check_dims
 from torch_denkf.objectives._options import Scale
 
 
@@ -102,8 +102,7 @@ class FilterLoss(LossModule):
 
     def register_scale(self, name: str, scale: Scale | float) -> None:
         """Keeps a scale as a buffer, or ``None``."""
-        scale = None if scale is None else torch.as_tensor(scale, dtype=torch.get_default_dtype())
-        self.register_buffer(name, scale)
+        self.register_buffer(name, None if scale is None else as_floating(scale, name))
 
     def choose_dimensions(self) -> None:
         """Finds which dimensions count. Done once: a boolean index in forward would wait for the device."""
