@@ -1,5 +1,6 @@
 # `make demo` (watch it work), `make test` (everything CI runs), `make docs` (the site, in docs/_build/html),
-# `make bench` (speed, beside its peers), `make test-nightly` (the tests beside the nightlies of torchrl and tensordict).
+# `make bench` (speed, beside its peers), `make fuzz` and `make soak` (reliability), `make test-nightly` (the tests beside
+# the nightlies of torchrl and tensordict).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +15,7 @@ endif
 NIGHTLY_VENV := .venv-nightly
 NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 
-.PHONY: demo test test-nightly lint layers unit smoke bench docs clean
+.PHONY: demo test test-nightly lint layers unit smoke bench fuzz soak docs clean
 
 demo: $(STAMP)
 	$(BIN)/denkf demo --out runs/demo
@@ -64,8 +65,16 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 
 # A tiny run of every study and example, two at a time; the long ones first.
 smoke: $(STAMP)
-	{ printf -- '-m benchmarks.%s\n' kitti ur5 lorenz96 smoothing arms odometry; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
+	{ printf -- '-m benchmarks.%s\n' kitti ur5 lorenz96 smoothing arms odometry reliability; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
 		sh -c 'echo "== {} --smoke" && $(BIN)/python {} --smoke || exit 255'
+
+# Damaged inputs at every border: about ten minutes. The tests run a sample.
+fuzz: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.reliability fuzz
+
+# Runs that last, with kills and full disks: an hour; the part "disks" needs root.
+soak: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.reliability soak
 
 # Ratios hold on a busy machine, absolute times do not.
 bench: $(VENV)/.bench

@@ -85,6 +85,7 @@ setup(
             "pyarrow>=15",
             "av>=14",
             "huggingface_hub>=1.0",
+            "hypothesis",
             "pytest",
             "pytest-xdist",
             "ruff",

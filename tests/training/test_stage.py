@@ -77,7 +77,7 @@ def test_only_trainable_restores_what_was():
     ("change", "message"),
     [
         ({"name": "a/b"}, "letters, digits"),
-        ({"updates": 0}, "at least one"),
+        ({"updates": 0}, "at least 1"),
         ({"schedule": "two_cycle"}, "two_cycle"),
         ({"lengths": {5: 3}}, "update 0"),
     ],

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -34,9 +34,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--drive", help="name of a drive below --root")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera of --root over the road, m")
     add("--frames", type=int, default=240, help="of the drive, at most")
-    add("--seed", type=int, default=2032, help="of the rendered drive; the training's was 0")
+    add("--seed", type=whole(0), default=2032, help="of the rendered drive; the training's was 0")
     add("--every", type=int, default=4, help="n-th frame that the animation shows")
-    add("--threads", type=int, default=1, help="of torch and OpenCV")
+    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
 
 
 def _run(args: argparse.Namespace) -> None:

@@ -38,6 +38,8 @@ def cache_folder(cache: str | Path | bool | None) -> Path | None:
     """The folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
     if cache is None or cache is False:
         return None
+    if cache is not True and not isinstance(cache, (str, Path)):
+        raise TypeError(f"cache is a folder, True, False or None; got {cache!r}")
     return usual_folder() if cache is True else Path(cache).expanduser()
 
 

@@ -70,8 +70,8 @@ def hashed_tests(share: float) -> Callable[[Episode], bool]:
     Raises:
         ValueError: if the share is out of range.
     """
-    if not 0 <= share < 1:
-        raise ValueError(f"test_share is a share of all episodes, in [0, 1), got {share}")
+    if not isinstance(share, (int, float)) or not 0 <= share < 1:
+        raise ValueError(f"test_share is a share of all episodes, in [0, 1), got {share!r}")
     return lambda episode: hashed_share(episode.split_name, "test") < share
 
 

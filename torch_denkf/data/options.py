@@ -10,6 +10,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
+from torch_denkf._checks import check_count
 from torch_denkf.data.episodes import Split
 from torch_denkf.data.slices import choose_sampler
 
@@ -50,8 +51,11 @@ def check_options(options: Mapping[str, Any]) -> None:
     split, share = options.get("split", "train"), options.get("validation_share", 0.0)
     if split not in ("train", "validation", "test", "all"):
         raise ValueError(f"split is 'train', 'validation', 'test' or 'all', got {split!r}")
-    if not 0 <= share < 1:
-        raise ValueError(f"validation_share is a share of the training episodes, in [0, 1), got {share}")
+    if not isinstance(share, (int, float)) or not 0 <= share < 1:
+        raise ValueError(f"validation_share is a share of the training episodes, in [0, 1), got {share!r}")
+    for name in ("batch_size", "num_slices", "slice_len"):
+        if options.get(name) is not None:
+            check_count(name, options[name], cure="It is a number of rows or slices, or None")
     if split == "validation" and not share:
         raise ValueError(
             "split='validation' is empty without a validation_share; pass validation_share=0.1, and the same to the "

@@ -38,9 +38,10 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
     Raises:
         ValueError: if they are not two, or one is not positive.
     """
-    sides = [int(side) for side in size] if isinstance(size, Sequence) else []
+    whole = isinstance(size, Sequence) and all(hasattr(side, "__index__") for side in size)
+    sides = [int(side) for side in size] if whole else []
     if len(sides) != 2 or min(sides) < 1:
-        raise ValueError(f"size is (height, width) in pixels and must be positive, got {size}")
+        raise ValueError(f"size is (height, width) in pixels, whole numbers, and must be positive, got {size!r}")
     return sides[0], sides[1]
 
 

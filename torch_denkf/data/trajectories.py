@@ -80,6 +80,8 @@ def write_trajectory(
 
 def _array(values: Tensor | np.ndarray) -> np.ndarray:
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+    if array.dtype.kind not in "iufb":
+        raise TypeError(f"trajectory and times are arrays of numbers; got {values!r}"[:200])
     return array.astype(np.float64)
 
 

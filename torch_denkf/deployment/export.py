@@ -84,6 +84,10 @@ def export_step(
         >>> step({"observation": torch.ones(1), "belief.mean": torch.zeros(1), "belief.cov": one})["belief.mean"]
         tensor([0.6667])
     """
+    if not isinstance(filter, Filter):
+        raise TypeError(f"filter must be a torch_denkf Filter; got {type(filter).__name__}")
+    if not isinstance(example, TensorDictBase):
+        raise TypeError(f"example must be a tensordict of one step; got {type(example).__name__}")
     path = Path(path)
     if path.suffix != ".pt2":
         raise ValueError(f"a package ends in .pt2, got {path}")

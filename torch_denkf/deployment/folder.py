@@ -59,7 +59,10 @@ def save_folder(
     versions = {"torch_denkf": torch_denkf.__version__, "torch": str(torch.__version__)}
     config = {"format": FORMAT, "builder": builder, "settings": dict(settings), "sha256": ""}
     config |= {"versions": versions, "training": dict(training or {})}
-    json.dumps(config)  # before anything is written
+    try:
+        json.dumps(config, allow_nan=False)  # before anything is written
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"settings and training are plain values, as JSON knows them: {error}") from error
     # Copies: safetensors refuses tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()
@@ -89,7 +92,7 @@ def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> di
         raise ValueError(f"{file} is not JSON ({error}); restore it from a copy, or train anew") from error
     if not isinstance(config, dict) or config.get("format") != FORMAT or not isinstance(config.get("settings"), dict):
         raise ValueError(f"{file} does not describe a filter (format {FORMAT!r}); pass a folder of `denkf train`")
-    if config.get("builder") not in builders:
+    if not isinstance(config.get("builder"), str) or config["builder"] not in builders:
         raise ValueError(
             f"{file} is of a filter that {config.get('builder')!r} builds; expected {', '.join(map(repr, builders))}"
         )
@@ -129,6 +132,12 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
         weights = load_file(file)
     except (SafetensorError, ValueError) as error:
         raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train anew") from error
+    trained = [name for name, _ in model.named_parameters()]  # a constant may be infinite, where nothing limits it
+    strange = [name for name in trained if name in weights and not weights[name].isfinite().all()]
+    strange += [name for name, value in weights.items() if value.is_floating_point() and value.isnan().any()]
+    strange += [name for name in trained if name in weights and not weights[name].is_floating_point()]
+    if strange:
+        raise ValueError(f"{file} holds NaN, infinity or whole numbers in {strange[:3]}; restore it, or train anew")
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:

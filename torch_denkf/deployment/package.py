@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 SIGNATURE = "torch_denkf"  # name of the description inside a package
+_MOST_UNPACKED = 50  # times its size, that a package may be; torch does not compress, and text shrinks to a tenth
 
 
 class PackagedStep:
@@ -52,6 +53,8 @@ class PackagedStep:
             if name not in entries:
                 raise KeyError(f"the step needs {name!r} {list(shape)}; it got {sorted(entries)}")
             value = entries[name]
+            if not isinstance(value, Tensor):
+                raise TypeError(f"{name!r} must be a tensor, {dtype} {list(shape)}, got a {type(value).__name__}")
             if tuple(value.shape) != shape or str(value.dtype) != dtype:
                 raise ValueError(
                     f"{name!r} must be {dtype} {list(shape)}, got {value.dtype} {list(value.shape)}; a package has "
@@ -77,48 +80,80 @@ def load_step(path: str | Path) -> PackagedStep:
         OSError: if there is no space to unpack it; names the folder and its free space.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; export_step(filter, example, path) writes it")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            compiled = any("aotinductor" in name for name in archive.namelist())
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{path} is no package of a step, or it was cut; export it again") from error
-    try:
-        run, signature = _load(path, compiled)
-    except OSError:
-        raise
-    except Exception as error:  # torch raises whatever it stumbles over in a file of another kind
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"{path} is a zip file, but torch cannot load a step from it ({type(error).__name__}: {reason}); pass what "
-            "export_step wrote, with this version of torch"
-        ) from error
-    if not signature:
-        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
-    try:
-        return PackagedStep(run, json.loads(signature))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path} has a damaged description in its entry {SIGNATURE!r} ({type(error).__name__}: {error}); export it "
-            "again"
-        ) from error
-
-
-def _load(path: Path, compiled: bool) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file; export_step(filter, example, path) writes it")
+    compiled = _is_compiled(path)
+    run: Callable[..., tuple[Tensor, ...]]
     if compiled:
         try:
             run = torch._inductor.aoti_load_package(str(path))
         except RuntimeError as error:
             # Where torch unpacks it; Python's tempfile passes over folders that are full.
-            names = ("TMPDIR", "TMP", "TEMP", "TEMPDIR")
-            folder = next((os.environ[name] for name in names if name in os.environ), "/tmp")
+            folder = next(
+                (os.environ[name] for name in ("TMPDIR", "TMP", "TEMP", "TEMPDIR") if name in os.environ), "/tmp"
+            )
             if shutil.disk_usage(folder).free > 4 * path.stat().st_size:
-                raise
+                reason = " ".join(str(error).split())
+                raise ValueError(f"{path} cannot be loaded ({reason}); export it again, on such a machine") from error
             raise OSError(
                 f"cannot unpack {path} in {folder}, which has {shutil.disk_usage(folder).free / 1e3:.0f} kB free: free "
                 "some space, or set TMPDIR to another folder"
             ) from error
-        return run, run.get_metadata().get(SIGNATURE, "")
-    files = {SIGNATURE: ""}
-    return torch.export.load(path, extra_files=files).module(), files[SIGNATURE]
+        signature = run.get_metadata().get(SIGNATURE, "")
+        counts = None
+    else:
+        files = {SIGNATURE: ""}
+        try:
+            program = torch.export.load(path, extra_files=files)
+        except Exception as error:  # torch, json and pickle have a dozen kinds for a file that is none of theirs
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ValueError(f"{path} cannot be loaded ({reason}); export it again") from error
+        run, signature = program.module(), files[SIGNATURE]
+        counts = len(program.graph_signature.user_inputs), len(program.graph_signature.user_outputs)
+    if not signature:
+        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
+    return PackagedStep(run, _described(path, signature, counts))
+
+
+def _is_compiled(path: Path) -> bool:
+    """Whether a package holds native code, where it is whole: code that was changed would end the process.
+
+    Raises:
+        ValueError: if it is no package, or one of its parts does not have its checksum.
+    """
+    again = "export it again"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+            size = sum(part.file_size for part in parts)
+            if size > _MOST_UNPACKED * path.stat().st_size:
+                raise ValueError(f"it would unpack to {size} bytes")
+            damaged = archive.testzip()
+    except Exception as error:  # zipfile has half a dozen kinds for a file that was cut or changed
+        raise ValueError(f"{path} is no package of a step, or it was cut ({error}); {again}") from error
+    if damaged is not None:
+        raise ValueError(f"{path} is damaged: the checksum of its part {damaged!r} is wrong; {again}")
+    return any("aotinductor" in part.filename for part in parts)
+
+
+def _described(path: Path, text: str, counts: tuple[int, int] | None) -> dict:
+    """The description in a package.
+
+    Args:
+        path: for the message.
+        text: the description.
+        counts: how many inputs and outputs the package has, where that is known.
+
+    Raises:
+        ValueError: if it is none of export_step, or does not fit the package.
+    """
+    try:
+        found = json.loads(text)
+        inputs = [(str(name), [int(n) for n in shape], str(dtype)) for name, shape, dtype in found["inputs"]]
+        outputs, carry = list(map(str, found["outputs"])), list(map(str, found["carry"]))
+        fits = counts is None or counts == (len(inputs), len(outputs))
+        if not fits or not set(carry) <= set(outputs):
+            raise ValueError(f"{len(inputs)} inputs, outputs {outputs}, of which {carry} are carried on")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} has a damaged description ({error}); export it again") from error
+    return {"inputs": inputs, "outputs": outputs, "carry": carry}

@@ -115,12 +115,18 @@ class KITTIReplayEnv(RowsEnv):
             raise ValueError(f"start is a row, one for each element of the batch, or 'random', got {start!r}")
         if self._random and length is None:
             raise ValueError("random starts need the number of frames of an episode: pass length")
+        for name, value in (("start", 0 if self._random else start), ("length", length)):
+            whole = isinstance(value, (int, Tensor)) or (
+                isinstance(value, Sequence) and all(isinstance(part, int) for part in value)
+            )
+            if (value is not None and not whole) or (isinstance(value, Tensor) and value.is_floating_point()):
+                raise TypeError(f"{name} is a whole number, or one for each element of the batch; got {value!r}")
         begin = torch.as_tensor(0 if self._random else start, device=where).expand(self.batch_size)
         frames = rows - begin if length is None else torch.as_tensor(length, device=where).expand(self.batch_size)
         if bool(((frames < 2) | (begin < 0) | (begin + frames > rows)).any()):
             raise ValueError(
-                f"episodes of {frames.tolist()} frames from row {begin.tolist()} do not fit in a drive of {rows} rows; "
-                "they need at least 2 frames and must end within the drive"
+                f"episodes of length={frames.tolist()} from start={begin.tolist()} do not fit in a drive of {rows} "
+                "rows; they need at least 2 frames and must end within the drive"
             )
         self._starts, self._lengths, self._rows = begin, frames, rows
 

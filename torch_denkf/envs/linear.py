@@ -9,7 +9,18 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_denkf._checks import check_count, check_number, check_shape, check_square, check_values
+
 __all__ = ["LinearGaussianEnv"]
+
+
+def _constant(name: str, value: torch.Tensor | Sequence) -> torch.Tensor:
+    try:
+        constant = torch.as_tensor(value, dtype=torch.get_default_dtype())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
+    check_values(name, constant)
+    return constant
 
 
 class LinearGaussianEnv(EnvBase):
@@ -51,10 +62,29 @@ class LinearGaussianEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str | None = None,
     ):
+        for count in batch_size:
+            check_count("batch_size, each number,", count, least=0)
         super().__init__(batch_size=torch.Size(batch_size), device=device)
         dtype = torch.get_default_dtype()
-        self.F, self.H = torch.as_tensor(transition, dtype=dtype), torch.as_tensor(observation, dtype=dtype)
-        state_dim, observation_dim = self.F.shape[0], self.H.shape[0]
+        self.F, self.H = _constant("transition", transition), _constant("observation", observation)
+        check_square("transition", self.F)
+        state_dim, observation_dim = len(self.F), len(self.H)
+        check_shape("observation", self.H, (observation_dim, state_dim), "[O, S]")
+        for name, std, size in (
+            ("transition_std", transition_std, state_dim),
+            ("observation_std", observation_std, observation_dim),
+            ("initial_std", initial_std, state_dim),
+        ):
+            if std is not None:
+                vector = _constant(name, std)
+                check_shape(name, vector, (size,), f"[{name[0].upper()}]")
+                check_values(name, vector, least=0)
+        if control is not None:
+            matrix = _constant("control", control)
+            check_shape("control", matrix, (state_dim, matrix.shape[-1] if matrix.ndim else 0), "[S, A]")
+        check_number("missing", missing, least=0, most=1)
+        for steps in [max_steps] if isinstance(max_steps, (int, float, str)) else list(max_steps):
+            check_count("max_steps", steps if isinstance(steps, (int, float, str)) else int(steps))
         self.B = torch.zeros(state_dim, 1) if control is None else torch.as_tensor(control, dtype=dtype)
         self.transition_std = torch.as_tensor(transition_std, dtype=dtype)
         self.observation_std = torch.as_tensor(observation_std, dtype=dtype)

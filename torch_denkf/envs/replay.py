@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torch_denkf._checks import check_count
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.envs.rows import RowsEnv
 
@@ -117,6 +118,9 @@ class ReplayEnv(RowsEnv):
     def _set_stretches(self, numbers: list[int], start: int | str, length: int | None) -> None:
         if isinstance(start, str) and start != "random":
             raise ValueError(f"start is a row of the episodes or 'random', got {start!r}")
+        for name, value, least in (("start", 0 if isinstance(start, str) else start, 0), ("length", length, 0)):
+            if value is not None:
+                check_count(name, value, least=least)
         self._random = start == "random"
         if self._random and length is None:
             raise ValueError("random starts need the number of rows of a replay: pass length")

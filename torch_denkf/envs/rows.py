@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_denkf._checks import check_count
+
 __all__ = ["RowsEnv"]
 
 _FLAGS = ("is_init", "done", "terminated", "truncated")
@@ -29,6 +31,8 @@ class RowsEnv(EnvBase):
     """
 
     def __init__(self, batch_size: Sequence[int], seed: int | None, device: torch.device | str | None):
+        for count in batch_size:
+            check_count("batch_size, each number,", count, least=0)
         super().__init__(batch_size=torch.Size(batch_size), device=device)
         self.rng = torch.Generator()
         self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "check_inputs",
+    "refuse_absurd_readings",
     "refuse_non_finite",
     "refuse_two_precisions",
     "refuse_unknown_noise",
@@ -78,7 +79,9 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
     """
     finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
-    if finite and not absurd:
+    # -inf is the log-weight of a particle that is out of the question.
+    lost = [key for key in structure.carry if key in entries and not bool(entries[key].amax() < torch.inf)]
+    if finite and not absurd and not lost:
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
@@ -92,6 +95,17 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
         "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
+
+
+def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:
+    """Raises a ``ValueError`` where readings of a sequence are not finite, or absurdly large, and no mask hides it."""
+    absurd = rejected_keys(structure.guards, entries)
+    if absurd:
+        raise ValueError(
+            f"There is NaN, infinity or more than {LARGEST_READING:g} in {absurd}, and no mask hides it. Give one "
+            f"({list(structure.optional)}), or pass reject=True to the filter, which counts such readings as missing; "
+            "check_finite=False switches this off."
+        )
 
 
 def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool) -> None:

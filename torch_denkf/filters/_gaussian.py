@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.modules._base import check_module
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -70,6 +71,8 @@ class GaussianFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("noise", noise)
+        check_module("initial", initial)
         refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         update = analysis(
             inflation=inflation,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters._ceiling import look_at_ceiling
-from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
+from torch_denkf.filters._checks import check_inputs, refuse_absurd_readings, refuse_missing_actions
 from torch_denkf.filters._entries import write
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._rejection import REJECTED
@@ -105,6 +105,8 @@ def filter_rows(
     structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
     entries, call = filter.entries_of(rows), Call(size, time=True)
     check_inputs(filter, entries, rows, carry=False)
+    if filter.check_finite and not filter.reject and not torch.compiler.is_compiling():
+        refuse_absurd_readings(structure, entries)
     say_ignored_mask(filter, rows)
     entries = filter.steps().usable(entries, call)
     with set_recurrent_mode(True):  # for modules that are not this package's

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters import _one_step
 from torch_denkf.filters._ceiling import say_ceiling
 from torch_denkf.filters._checks import refuse_two_precisions
@@ -35,7 +35,7 @@ from torch_denkf.filters._sequence import filter_sequence, stepped
 from torch_denkf.filters._steps import Steps
 from torch_denkf.filters._structure import Structure, all_modules
 from torch_denkf.filters._summaries import summarise
-from torch_denkf.modules._base import Call, Entries, named_modules_of, reads
+from torch_denkf.modules._base import Call, Entries, check_module, named_modules_of, reads
 
 __all__ = ["Filter"]
 
@@ -109,6 +109,9 @@ class Filter(TensorDictSequential):
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
             modules = (OrderedDict(modules[0]),)
+        for part in modules[0].values() if len(modules) == 1 and isinstance(modules[0], Mapping) else modules:
+            check_module("modules", part)
+        check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
         self.init_key = unravel_key(init_key)
@@ -212,6 +215,7 @@ class Filter(TensorDictSequential):
             RuntimeError: if there is no C++ compiler, which processors need.
             ValueError: if ``chunk`` is negative.
         """
+        check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")
         self.compiled = CompiledSteps(chunk, options) if chunk else None
         return self
 
@@ -300,6 +304,8 @@ class Filter(TensorDictSequential):
             ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
             KeyError: if an entry is missing.
         """
+        if detach_every is not None:
+            check_count("detach_every", detach_every)
         return filter_sequence(self, tensordict, detach_every, keep)
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:

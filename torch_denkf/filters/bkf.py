@@ -7,8 +7,11 @@ from typing import Any, Unpack
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
+from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
+from torch_denkf.modules._tensors import as_floating
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 
 __all__ = ["BackpropKF"]
@@ -65,6 +68,14 @@ class BackpropKF(GaussianFilter):
         trainable: bool = False,
         **options: Unpack[GaussianOptions],
     ):
+        a, c = as_floating(transition, "transition"), as_floating(observation, "observation")
+        check_square("transition", a)
+        check_shape("observation", c, (len(c) if c.ndim else 0, len(a)), "[O, S]")
+        check_one_dtype(transition=a, observation=c)
+        check_values("transition", a)
+        check_values("observation", c)
+        if not isinstance(process_noise, nn.Module):
+            check_covariance("process_noise", as_floating(process_noise, "process_noise"), len(a))
         action: dict[str, Any] = {}
         if control is not None:
             action = {"control": control, "action_key": options.get("control_keys", ("action",))[0]}

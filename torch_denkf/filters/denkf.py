@@ -11,6 +11,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
@@ -24,8 +25,14 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
+from torch_denkf.modules._base import check_module
 
 __all__ = ["DEnKF"]
+
+
+def _check_image_shape(shape: Sequence[int]) -> None:
+    if len(shape) != 3 or not all(isinstance(side, int) and side > 0 for side in shape):
+        raise ValueError(f"image_shape is (channels, height, width), positive; got {shape!r}")
 
 
 class DEnKF(Filter):
@@ -82,6 +89,10 @@ class DEnKF(Filter):
         observed_key: NestedKey | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_module("noise", noise)
+        check_module("initial", initial)
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
         if analysis is not None and (angles or observation_key is not None or observed_key is not None):
@@ -125,6 +136,10 @@ class DEnKF(Filter):
             initial: the initial belief; N(0, I) of the standardised state by default.
             **kwargs: passed on to the constructor.
         """
+        check_count("state_dim", state_dim)
+        check_count("observation_dim", observation_dim)
+        _check_image_shape(image_shape)
+        check_number("r", r, above=0)
         return cls(
             transition=LearnedTransition(StochasticMLP(state_dim, state_dim, (32, 32, 64, 64), rate=rate)),
             sensor=ImageSensor(

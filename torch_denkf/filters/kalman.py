@@ -9,7 +9,7 @@ from typing import Any, Unpack
 import torch
 from tensordict import NestedKey
 
-from torch_denkf._checks import check_covariance, check_shape, check_square, check_values
+from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
@@ -65,7 +65,11 @@ class KalmanFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
-        f, q, h, r, m, p = map(as_floating, (transition, transition_noise, observation, observation_noise, mean, cov))
+        given = {"transition": transition, "transition_noise": transition_noise, "observation": observation}
+        given |= {"observation_noise": observation_noise, "mean": mean, "cov": cov}
+        constants = {name: as_floating(value, name) for name, value in given.items()}
+        check_one_dtype(**constants)
+        f, q, h, r, m, p = constants.values()
         check_square("transition", f)
         size, readings = len(f), len(h) if h.ndim else 0
         check_shape("observation", h, (readings, size), "[O, S]")
@@ -80,7 +84,7 @@ class KalmanFilter(Filter):
             check_shape("observation_noise", r, (readings,), "[O]")
             check_values("observation_noise", r, least=0, cure="These are variances")
         if control is not None:
-            b = as_floating(control)
+            b = as_floating(control, "control")
             check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
             check_values("control", b)
         check_dims("angles", angles, readings)

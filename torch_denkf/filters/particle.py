@@ -20,6 +20,7 @@ from torch_denkf.modules import (
     WithWeights,
     as_process_noise,
 )
+from torch_denkf.modules._base import check_module
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -99,6 +100,13 @@ class ParticleFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_module("initial", initial)
+        if noise is not None:
+            check_module("noise", noise)
+        if resampling not in ("systematic", "soft", "transport", None):
+            raise ValueError(f'resampling is "systematic", "soft", "transport" or None; got {resampling!r}.')
         if process_noise is not None:
             if isinstance(transition, ResampledTransition):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")

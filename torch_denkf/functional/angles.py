@@ -9,6 +9,17 @@ import torch
 from torch import Tensor
 
 
+def check_angles(angles: Sequence[int], size: int) -> None:
+    """Raises unless all angles are components of ``size``.
+
+    Raises:
+        ValueError: if one is not.
+    """
+    strange = [index for index in angles if not -size <= index < size]
+    if strange:
+        raise ValueError(f"angles are components of {size}, 0 to {size - 1}; got {strange} in {list(angles)}")
+
+
 def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
     """Wraps some components of differences to [-pi, pi).
 
@@ -25,6 +36,7 @@ def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
     """
     if not angles:
         return difference
+    check_angles(angles, difference.shape[-1])
     wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
     is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
     is_angle[list(angles)] = True

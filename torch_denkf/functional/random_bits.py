@@ -30,8 +30,8 @@ def representable_rate(rate: float) -> float:
         >>> representable_rate(0.1)
         0.1015625
     """
-    if not 0.0 <= rate < 1.0:
-        raise ValueError(f"rate is the probability of dropping a unit and lies in [0, 1); got {rate}.")
+    if not isinstance(rate, (int, float)) or not 0.0 <= rate < 1.0:
+        raise ValueError(f"rate is the probability of dropping a unit and lies in [0, 1); got {rate!r}.")
     if 0 < rate < 1 / 512:
         raise ValueError(
             f"rate is rounded to a multiple of 1/256, so that {rate} would drop no unit at all; pass 0 for that, or at "

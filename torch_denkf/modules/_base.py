@@ -214,14 +214,26 @@ class SubModel(TensorDictModule):
 
         Raises:
             TypeError: if entries and parameters differ in precision, or a mask is not boolean.
+            ValueError: and other errors of what is computed, if shapes do not fit: with what was read, and constants.
         """
         if torch.compiler.is_compiling():
             return self.on_entries(entries, call)
         try:
             return self.on_entries(entries, call)
-        except (RuntimeError, TypeError, ValueError) as error:
+        except (RuntimeError, TypeError, ValueError, IndexError) as error:
             self._explain_dtypes(error, entries)
-            raise
+            if type(error) not in _EXPLAINED:  # it may not be made of a message alone
+                raise
+            raise type(error)(f"{error} {self._what_there_was(entries)}") from error
+
+    def _what_there_was(self, entries: Entries) -> str:
+        """What was read, and constants, with their shapes: for the message of an error."""
+        values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
+        read = [_shown(key, value) for key, value in values.items() if isinstance(value, Tensor)]
+        named = (*self.named_buffers(recurse=False), *self.named_parameters(recurse=False))
+        own = [f"{name} {list(value.shape)}" for name, value in named]
+        text = f"({type(self).__name__} read {', '.join(read) or 'nothing'}"
+        return f"{text}; its constants are {', '.join(own)})" if own else f"{text})"
 
     def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
         names = self.noise_names
@@ -271,7 +283,35 @@ class SubModel(TensorDictModule):
             ) from error
 
 
+#: Errors that can be raised again with more words.
+_EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
+
+
+def _shown(key: NestedKey, value: Tensor) -> str:
+    return f"{key!r} {list(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+
+
 # ------------------------------------------------------------------------------------------------------ any module
+
+
+def check_module(name: str, module: Any) -> None:
+    """Raises unless an argument is a TensorDict module.
+
+    Raises:
+        TypeError: if it is none; ``name`` is the argument's.
+    """
+    if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
+        raise TypeError(f"{name} must be a TensorDict module, such as those of torch_denkf.modules; got {module!r}")
+
+
+def check_network(name: str, network: Any) -> None:
+    """Raises unless an argument can be called, as networks and functions can.
+
+    Raises:
+        TypeError: if it cannot; ``name`` is the argument's.
+    """
+    if not callable(network):
+        raise TypeError(f"{name} must be a network or a function of tensors; got {network!r}")
 
 
 def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:

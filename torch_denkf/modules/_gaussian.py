@@ -12,7 +12,7 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional import GaussianUpdate, mean_observation
-from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
+from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
@@ -63,6 +63,8 @@ class GaussianTransition(SubModel):
         ensemble_key: NestedKey = ("belief", "ensemble"),
         forecast_ensemble_key: NestedKey = ("forecast", "ensemble"),
     ):
+        check_module("transition", transition)
+        check_module("process_noise", process_noise)
         refuse_random_layers(transition, type(self).__name__)
         in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_key, forecast_key))
         self_made = [unravel_key(ensemble_key), *out_keys]
@@ -172,6 +174,7 @@ class GaussianAnalysis(SubModel):
         ensemble_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
     ):
+        check_module("observation", observation)
         refuse_random_layers(observation, type(self).__name__)
         in_keys = [(forecast_key, "mean"), (forecast_key, "cov"), observation_key, noise_variance_key]
         further, optional = further_keys([observation], [*in_keys, ensemble_key])

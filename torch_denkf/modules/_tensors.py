@@ -13,6 +13,7 @@ from torch_denkf._checks import check_number, check_values
 __all__ = [
     "as_floating",
     "as_standard_deviations",
+    "as_vector",
     "check_dims",
     "mean_of_members",
     "register_constant",
@@ -22,8 +23,11 @@ __all__ = [
 ]
 
 
-def as_floating(value: Any) -> Tensor:
+def as_floating(value: Any, name: str = "the constant") -> Tensor:
     """A floating tensor: a tensor keeps its precision, everything else gets torch's default one.
+
+    Raises:
+        TypeError: if it is neither a tensor nor numbers; ``name`` is the argument's.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
@@ -31,14 +35,17 @@ def as_floating(value: Any) -> Tensor:
     """
     if isinstance(value, Tensor):
         return value if value.is_floating_point() else value.to(torch.get_default_dtype())
-    return torch.as_tensor(value, dtype=torch.get_default_dtype())
+    try:
+        return torch.as_tensor(value, dtype=torch.get_default_dtype())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
 
 
 def register_constant(
     module: nn.Module, name: str, value: Tensor | Sequence | float | None, *, trainable: bool = False
 ) -> None:
     """Keeps a constant in a module as a buffer, or as a parameter; ``None`` stays ``None``."""
-    tensor = None if value is None else as_floating(value)
+    tensor = None if value is None else as_floating(value, name)
     if trainable and tensor is not None:
         module.register_parameter(name, nn.Parameter(tensor.clone()))
     else:
@@ -73,24 +80,40 @@ def as_standard_deviations(name: str, value: Any) -> Tensor:
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.
     """
-    std = as_floating(value)
+    std = as_floating(value, name)
     if std.ndim != 1:
         raise ValueError(f"{name} must be [N], one standard deviation a dimension; got {list(std.shape)}")
     check_values(f"{name}, a standard deviation,", std, least=0)
     return std
 
 
-def check_dims(name: str, dims: Sequence[int], size: int | None = None) -> None:
+def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -> Tensor:
+    """Finite numbers ``[size]``, of one number for all or one for each.
+
+    Raises:
+        TypeError: if they are no numbers.
+        ValueError: if they are neither one nor ``size``, not finite, or not above a limit.
+    """
+    vector = as_floating(value, name)
+    if vector.ndim > 1 or vector.numel() not in (1, size):
+        raise ValueError(f"{name} is one number, or one for each of {size}; got {list(vector.shape)}")
+    check_values(name, vector, above=above)
+    return vector.expand(size).clone()
+
+
+def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once: bool = False) -> None:
     """Raises unless these are indices of components, of ``size`` of them where that is known.
 
     Raises:
         TypeError: if one is no whole number.
-        ValueError: if one is negative or too large.
+        ValueError: if one is negative or too large, or there twice although each may be there ``once``.
     """
     for index in dims:
         if isinstance(index, bool) or not hasattr(index, "__index__"):
             raise TypeError(f"{name} holds indices of components, whole numbers; got {index!r} in {list(dims)}")
         check_number(name, int(index), least=0, below=size, cure=f"The indices are {list(dims)}")
+    if once and len(set(dims)) < len(dims):
+        raise ValueError(f"{name} names each component once; got {list(dims)}")
 
 
 def variance_and_floor(
@@ -107,11 +130,14 @@ def variance_and_floor(
     Raises:
         ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
     """
-    std = as_floating(r)
+    std = as_floating(r, f"r of {owner}")
     check_values(f"r of {owner}, a standard deviation,", std, above=0)
+    for name, value in (("r", std), ("floor", None if floor is None else as_floating(floor, f"floor of {owner}"))):
+        if value is not None and (value.ndim > 1 or value.numel() not in (1, size)):
+            raise ValueError(f"{name} of {owner} is one number, or one for each of {size}; got {list(value.shape)}")
     variance = std.expand(size) ** 2
     check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that its variance is a number")
-    floor = 0.01 * variance if floor is None else as_floating(floor).expand(size)
+    floor = 0.01 * variance if floor is None else as_floating(floor, f"floor of {owner}").expand(size)
     check_values(f"floor of {owner}", floor, least=0)
     check_values(f"r^2 - floor of {owner}", variance - floor, above=0, cure="The floor is a variance below r^2")
     return variance - floor, floor.clone()

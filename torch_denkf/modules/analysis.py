@@ -68,6 +68,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         covariance: bool = False,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
+        pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
+        if taper is not None and not pair:
+            raise TypeError(f"taper is two tensors, [S, O] and [O, O], or None; got {type(taper).__name__}")
         if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
             raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
         if rotate and scheme != "etkf":

@@ -83,7 +83,7 @@ class GaussianPrior(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [], out_keys)
-        mean = as_floating(mean)
+        mean = as_floating(mean, "mean")
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
         check_values("mean", mean)
@@ -170,7 +170,7 @@ class FromSensor(_InitialEnsemble):
     ):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
         register_location(self, "mean", mean)
-        check_dims("dims", dims, self.state_dim)
+        check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
         self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)

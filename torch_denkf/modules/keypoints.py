@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from torch_denkf._checks import check_count
+
 __all__ = ["KeypointTrunk", "SpatialSoftArgmax"]
 
 
@@ -30,6 +32,7 @@ class SpatialSoftArgmax(nn.Module):
     """
 
     def __init__(self, channels: int):
+        check_count("channels", channels)
         super().__init__()
         self.log_sharpness = nn.Parameter(torch.zeros(channels, 1))
 
@@ -72,6 +75,11 @@ class KeypointTrunk(nn.Module):
         pooled: int = 4,
     ):
         super().__init__()
+        named = {"in_channels": in_channels, "keypoints": keypoints, "features": features, "pooled": pooled}
+        for name, value in named.items():
+            check_count(name, value)
+        for width in channels:
+            check_count("channels, each,", width, least=8, cure="They are normalised in groups of eight")
         widths = [in_channels + 2, *channels]
         blocks = [
             nn.Sequential(

@@ -10,10 +10,10 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count
 from torch_denkf.functional import mean_observation, wrap_angles
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, check_dims, mean_of_members
+from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
@@ -67,6 +67,7 @@ class GaussianLikelihood(SubModel):
             nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
 
+        check_dims("angles", angles)
         self.angles = list(angles)
         self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
 
@@ -83,6 +84,11 @@ class GaussianLikelihood(SubModel):
             )
         if reading.ndim > len(batch_size) + 1:
             reading = mean_observation(reading, self.angles)
+        if not reading.shape[-1] == predicted.shape[-1] == variance.shape[-1]:
+            widths = {
+                key: value.shape[-1] for key, value in zip(self.in_keys, (predicted, reading, variance), strict=True)
+            }
+            raise ValueError(f"GaussianLikelihood compares vectors of one width; their widths are {widths}.")
         reading, variance = reading.unsqueeze(-2), variance.unsqueeze(-2)
         if observed is not None:
             # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
@@ -183,9 +189,9 @@ class LearnedLikelihood(SubModel):
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
         self.observed_key = unravel_key(observed_key)
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
-            value = as_floating(default if value is None else value)
-            check_values(name, value, above=0 if name == "scale" else None)
-            self.register_buffer(name, value.expand(observation_dim).clone())
+            limit = 0 if name == "scale" else None
+            vector = as_vector(name, default if value is None else value, observation_dim, above=limit)
+            self.register_buffer(name, vector)
 
     def without_reading(self, encoding, predicted, *_):
         """The log-likelihoods where there is no reading: zero."""

@@ -8,7 +8,7 @@ from typing import Unpack
 
 import torch
 
-from torch_denkf._checks import check_values
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import (
     Neighbours,
     align_angles,
@@ -80,6 +80,11 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         angles: Sequence[int] = (),
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
+        check_count("tile", tile)
+        if isinstance(near, torch.Tensor) and near.ndim != 2:
+            raise ValueError(f"near is Neighbours, or a taper; a taper must be [S, O], got {list(near.shape)}")
+        if not isinstance(near, (Neighbours, torch.Tensor)):
+            raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
         super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)

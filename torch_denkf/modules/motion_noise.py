@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import semidefinite_root, weighted_mean
-from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
+from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module
 from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["NoisyTransition"]
@@ -68,6 +68,8 @@ class NoisyTransition(SubModel):
         forecast_mean_key: NestedKey = ("forecast", "mean"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
     ):
+        check_module("transition", transition)
+        check_module("noise", noise)
         self_made = {unravel_key(mean_key), unravel_key(forecast_mean_key)}
         needed, optional = reads(transition)
         of_noise, of_noise_optional = reads(noise)

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number, check_values
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel, check_module, reads, run_module
 from torch_denkf.modules._tensors import (
     as_standard_deviations,
     mean_of_members,
@@ -155,6 +155,7 @@ class ScaledNoise(SubModel):
     """
 
     def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
+        check_module("noise", noise)
         check_number("factor", factor, least=0)
         needed, optional = reads(noise)
         super().__init__(noise, needed, noise.out_keys, optional_keys=optional)

@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, check_network
 from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 
@@ -63,6 +63,7 @@ class LearnedObservation(MemberNetwork):
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
+        check_network("network", network)
         super().__init__(network, [in_key], [out_key])
         register_location(self, "loc", loc)
         register_scale(self, "scale", scale)

@@ -15,7 +15,9 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf._checks import check_count, check_values
+from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._tensors import register_constant
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "WithHistory"]
 
@@ -24,8 +26,8 @@ class _WithPast(SubModel):
     """An initial belief that also holds the last ``lags`` steps, under its own keys or under ``further_keys``."""
 
     def __init__(self, initial: TensorDictModuleBase, lags: int, *further_keys: NestedKey):
-        if lags < 1:
-            raise ValueError(f"lags counts the past steps that a reading may span, at least 1; got {lags}.")
+        check_module("initial", initial)
+        check_count("lags", lags)
         needed, optional = reads(initial)
         super().__init__(initial, needed, [*initial.out_keys, *further_keys], optional_keys=optional)
 
@@ -129,7 +131,8 @@ class PairObservation(SubModel):
             nn.Identity() if curve is None else curve, in_keys, out_keys, optional_keys=[steps_key, observed_key]
         )
         reach = [torch.inf, torch.inf] if reach is None else reach
-        self.register_buffer("reach", torch.as_tensor(reach, dtype=torch.get_default_dtype()))
+        register_constant(self, "reach", reach)
+        check_values("reach", self.reach, above=0, infinite=True)
         self.observation_dim = 2
 
     def compute(self, forecast, *rest):
@@ -204,6 +207,7 @@ class ClonedTransition(SubModel):
     """
 
     def __init__(self, transition: SubModel, *, history_key: NestedKey = ("belief", "history")):
+        check_module("transition", transition)
         self_made = unravel_key(history_key)
         needed, optional = reads(transition)
         in_keys = [key for key in needed if key != self_made]

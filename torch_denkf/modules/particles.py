@@ -31,7 +31,7 @@ from torch_denkf.functional import (
     weighted_mean,
     weighted_var,
 )
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel, check_module, reads, run_module
 from torch_denkf.modules.likelihood import GaussianLikelihood
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]
@@ -60,6 +60,7 @@ class WithWeights(SubModel):
         ensemble_key: NestedKey = ("belief", "ensemble"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
     ):
+        check_module("initial", initial)
         needed, optional = reads(initial)
         super().__init__(initial, needed, [*initial.out_keys, log_weight_key], optional_keys=optional)
         self.ensemble_key = unravel_key(ensemble_key)
@@ -133,6 +134,7 @@ class ResampledTransition(SubModel):
         past_key: NestedKey | None = None,
         out_past_key: NestedKey = ("forecast", "past"),
     ):
+        check_module("transition", transition)
         if scheme not in ("systematic", "soft", "transport", None):
             raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
         check_number("alpha", alpha, least=0, most=1)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import unicycle_jacobians
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel, check_module, reads, run_module
 from torch_denkf.modules._tensors import (
     as_floating,
     mean_of_members,
@@ -56,9 +56,12 @@ def as_process_noise(
     """
     if isinstance(noise, nn.Module):
         return noise
-    std = as_floating(noise)
+    std, size = as_floating(noise, "process_noise"), getattr(initial, "state_dim", None)
+    check_values("process_noise, a standard deviation,", std, least=0)
+    if std.ndim > 1 or (std.ndim == 1 and size is not None and len(std) != size):
+        known = f"[S] = [{size}]" if size is not None else "[S]"
+        raise ValueError(f"process_noise must be {known}, a standard deviation for each; got {list(std.shape)}")
     if std.ndim == 0:
-        size = getattr(initial, "state_dim", None)
         if size is None:
             raise ValueError("process_noise is one number, and the initial belief does not say for how many: give [S].")
         std = std.expand(size)
@@ -150,6 +153,7 @@ class _MappedNoise(SubModel):
     """Runs another noise module and writes G Q G^T in its place, in the same entry; a subclass gives G."""
 
     def __init__(self, noise: TensorDictModuleBase, in_keys: Sequence[NestedKey]):
+        check_module("noise", noise)
         needed, optional = reads(noise)
         keys = list(dict.fromkeys([*needed, *map(unravel_key, in_keys)]))
         super().__init__(noise, keys, [unravel_key(noise.out_keys[0])], optional_keys=optional)

@@ -15,10 +15,10 @@ from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
-from torch_denkf._checks import check_count, check_number, check_values
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import unicycle_jacobians, unicycle_move
-from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules._tensors import as_floating, mean_of_members
+from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._tensors import as_vector, mean_of_members
 from torch_denkf.modules.unicycle import check_dt, keys_of_dt
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
@@ -47,6 +47,7 @@ class WithMemory(SubModel):
     def __init__(
         self, initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_key: str = "belief"
     ):
+        check_module("initial", initial)
         check_count("hidden_size", hidden_size)
         check_count("num_layers", num_layers)
         out_keys = [(belief_key, name) for name in _MEMORY]
@@ -163,6 +164,7 @@ class LSTMUpdate(SubModel):
         memory_key: str = "belief",
         belief_key: str = "belief",
     ):
+        check_count("features", features, least=0)
         for key, size, name in (
             (encoding_key, features, "features"),
             (observation_key, observation_dim, "observation_dim"),
@@ -199,9 +201,8 @@ class LSTMUpdate(SubModel):
             ("observation_loc", observation_loc, observation_dim, 0.0),
             ("observation_scale", observation_scale, observation_dim, 1.0),
         ):
-            value = as_floating(default if value is None else value)
-            check_values(name, value, above=0 if name.endswith("scale") else None)
-            self.register_buffer(name, value.expand(size).clone())
+            limit = 0 if name.endswith("scale") else None
+            self.register_buffer(name, as_vector(name, default if value is None else value, size, above=limit))
         self.feature_sizes = [size for size in (features, observation_dim) if size]
 
     def without_reading(self, hidden, cell, *rest):
@@ -237,6 +238,11 @@ class LSTMUpdate(SubModel):
             parts.append(encoding if observed is None else torch.where(observed.any(-1, keepdim=True), encoding, 0.0))
         if self.observation_key is not None:
             reading, *inputs = inputs
+            if reading.shape[-1] != len(self.observation_loc):
+                raise ValueError(
+                    f"{self.observation_key!r} has {reading.shape[-1]} components; observation_dim is "
+                    f"{len(self.observation_loc)}."
+                )
             reading = (mean_of_members(reading, batch_size) - self.observation_loc) / self.observation_scale
             parts.append(reading if observed is None else torch.where(observed, reading, 0.0))
             flag = torch.ones_like(reading) if observed is None else observed.expand_as(reading)

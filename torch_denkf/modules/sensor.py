@@ -10,9 +10,9 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_count, check_values
+from torch_denkf._checks import check_count
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, register_location, register_scale
+from torch_denkf.modules._tensors import as_vector, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -180,8 +180,11 @@ class ImageSensor(_Sensor):
         trunk_dtype: torch.dtype | None = None,
         observed_key: NestedKey = "observed",
     ):
-        if trunk_memory is not None and trunk_memory <= 0:
-            raise ValueError(f"trunk_memory is in bytes and positive; got {trunk_memory}.")
+        if trunk_memory is not None:
+            check_count("trunk_memory", trunk_memory, cure="It is in bytes")
+        check_count("observation_dim", observation_dim)
+        if len(image_shape) != 3 or not all(isinstance(side, int) and side > 0 for side in image_shape):
+            raise ValueError(f"image_shape is (channels, height, width), positive; got {image_shape!r}")
         trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
         # Twice as fast on a CPU, and nothing else changes. torch lacks this keyword among the overloads of Module.to.
         trunk = trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -193,9 +196,9 @@ class ImageSensor(_Sensor):
         self.trunk_memory, self.recompute, self.trunk_dtype = trunk_memory, recompute, trunk_dtype
         self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
         for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
-            channels = as_floating(default if value is None else value)
-            check_values(name, channels, above=0 if name == "pixel_scale" else None)
-            self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
+            limit = 0 if name == "pixel_scale" else None
+            channels = as_vector(name, default if value is None else value, image_shape[0], above=limit)
+            self.register_buffer(name, channels[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
         self._looked = False
 
@@ -282,5 +285,6 @@ class VectorSensor(_Sensor):
         out_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
     ):
+        check_count("observation_dim", observation_dim)
         head = StochasticMLP(in_features, observation_dim, num_cells, layer=layer, rate=rate)
         super().__init__(nn.Identity(), head, ensemble_size, in_key, out_key, None, loc, scale, 1, observed_key)

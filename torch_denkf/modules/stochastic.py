@@ -56,6 +56,8 @@ class FlipoutLinear(nn.Module):
 
     def __init__(self, in_features: int, out_features: int, *, posterior_std=0.05, prior_std: float = 1.0):
         super().__init__()
+        check_count("in_features", in_features)
+        check_count("out_features", out_features)
         check_number("posterior_std", posterior_std, above=0)
         check_number("prior_std", prior_std, above=0)
         self.in_features, self.out_features = in_features, out_features
@@ -141,6 +143,7 @@ class StochasticMLP(nn.Module):
         activation: Callable[[], nn.Module] = nn.ReLU,
         output_gain: float = 1.0,
     ):
+        check_number("posterior_std", posterior_std, above=0)
         super().__init__()
         if layer not in ("dropout", "flipout", "none"):
             raise ValueError(f'layer is "dropout", "flipout" or "none"; got {layer!r}.')

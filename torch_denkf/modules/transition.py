@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -83,6 +83,7 @@ class LearnedTransition(MemberNetwork):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
+        check_network("network", network)
         in_keys = [in_key] if action_key is None else [in_key, action_key]
         super().__init__(network, in_keys, [out_key])
         self.residual, self.action_key = residual, action_key

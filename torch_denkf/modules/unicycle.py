@@ -10,7 +10,7 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import SubModel, check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.pairs import within_pair
 from torch_denkf.modules.transition import MemberNetwork
@@ -67,6 +67,7 @@ class UnicycleTransition(MemberNetwork):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
+        check_network("velocity", velocity)
         check_dt(dt)
         histories = [] if history_key is None else [history_key]
         super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])

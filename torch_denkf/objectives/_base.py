@@ -12,8 +12,10 @@ from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
 from torch_denkf.functional import wrap_angles
+from torch_denkf.modules._tensors import as_floating, check_dims
 from torch_denkf.objectives._options import Scale
 
 
@@ -74,6 +76,15 @@ class FilterLoss(LossModule):
         if score not in self.SCORES:
             *others, last = (f'"{name}"' for name in self.SCORES)
             raise ValueError(f"score is {', '.join(others)} or {last}; got {score!r}.")
+        if not isinstance(filter, Filter):
+            raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
+        for name, weight in weights.items():
+            if weight is not None:
+                check_number(name, weight, least=0, cure="It is a term's weight")
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f'reduction is "mean", "sum" or "none"; got {reduction!r}.')
+        check_dims("angles", angles)
+        check_dims("observation_angles", observation_angles)
         super().__init__()
         self.filter, self.score, self.reduction = filter, score, reduction
         self.angles, self.observation_angles = list(angles), list(observation_angles)
@@ -91,8 +102,7 @@ class FilterLoss(LossModule):
 
     def register_scale(self, name: str, scale: Scale | float) -> None:
         """Keeps a scale as a buffer, or ``None``."""
-        scale = None if scale is None else torch.as_tensor(scale, dtype=torch.get_default_dtype())
-        self.register_buffer(name, scale)
+        self.register_buffer(name, None if scale is None else as_floating(scale, name))
 
     def choose_dimensions(self) -> None:
         """Finds which dimensions count. Done once: a boolean index in forward would wait for the device."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from torch_denkf.filters import Filter
+from torch_denkf.modules._tensors import check_dims
 from torch_denkf.objectives._options import Scale
 from torch_denkf.objectives._sequence import SequenceLoss
 
@@ -48,6 +49,7 @@ class DimensionsLoss(SequenceLoss):
         **kwargs,
     ):
         if dims is not None:
+            check_dims("dims", dims, once=True)
             if state_scale is not None and len(state_scale) != len(dims):
                 raise ValueError(f"state_scale has one entry for each of dims={list(dims)}; got {len(state_scale)}.")
             # As everything else, angles are counted in the state; errors are of the chosen dimensions alone.

@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     AroundState,
@@ -22,6 +23,7 @@ from torch_denkf.modules import (
     UnicycleTransition,
     WithHistory,
 )
+from torch_denkf.modules._tensors import as_vector
 from torch_denkf.vision import KITTI_DT
 
 __all__ = ["CarFilter", "CarSettings", "VELOCITIES", "car_filter"]
@@ -65,6 +67,16 @@ class CarSettings:
     inflation: float = 1.0
 
     def __post_init__(self):
+        for name in ("dt", "reach", "inflation"):
+            check_number(name, getattr(self, name), above=0)
+        for name in ("lags", "longest", "features", "ensemble_size"):
+            check_count(name, getattr(self, name), least=2 if name == "ensemble_size" else 1)
+        as_vector("velocity_mean", self.velocity_mean, 2)
+        as_vector("velocity_std", self.velocity_std, 2, above=0)
+        if len(self.size) != 2 or not all(isinstance(side, int) and side > 0 for side in self.size):
+            raise ValueError(f"size is (height, width) in pixels, positive; got {self.size!r}.")
+        if self.focal is not None:
+            check_number("focal", self.focal, above=0, cure="It is in pixels")
         if min(self.dt, *self.velocity_std, self.reach, self.inflation) <= 0:
             raise ValueError(f"dt, velocity_std, reach and inflation must be positive; got {self}.")
         if not 1 <= self.longest <= self.lags + 1:

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._checks import check_number
 from torch_denkf.odometry.camera import CarCamera
 from torch_denkf.odometry.car import VELOCITIES, CarFilter
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
@@ -95,7 +96,13 @@ def track(
         >>> [belief.frame for belief in beliefs], beliefs[0].mean[:3].tolist()
         ([0, 1, 2, 3], [0.0, 0.0, 0.0])
     """
-    calibration = [float(value) for value in calibration]
+    try:
+        calibration = [float(value) for value in calibration]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"calibration is (fx, fy, cx, cy) in pixels, four numbers; got {calibration!r}") from error
+    for name, value in {"height": height, "pitch": pitch, "fps": fps, "black_level": black_level}.items():
+        if value is not None:
+            check_number(name, value)
     if len(calibration) != 4 or not all(np.isfinite(calibration)) or min(calibration[:2]) <= 0:
         raise ValueError(f"calibration is (fx, fy, cx, cy) in pixels, fx and fy positive; got {calibration}")
     if not 0.3 <= height <= 5:

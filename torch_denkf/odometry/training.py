@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf._progress import progress_bar
 from torch_denkf.odometry.batches import PairSampler, ReadingSampler
 from torch_denkf.odometry.car import VELOCITIES, CarFilter, CarSettings
@@ -49,6 +51,8 @@ class Updates:
     length: int = 24
 
     def __post_init__(self):
+        for name in ("sensor", "filter", "end_to_end", "length"):
+            check_count(f"{name} of Updates", getattr(self, name), least=-sys.maxsize)
         if min(self.sensor, self.filter, self.end_to_end) < 1 or self.length < 2:
             raise ValueError(f"each stage needs at least one update, and windows two steps; got {self}.")
 
@@ -115,6 +119,8 @@ def train_car_filter(
         >>> train_car_filter(tempfile.mkdtemp(), updates=few, **options).settings.dt
         0.103
     """
+    check_number("height", height, above=0, cure="It is that of the recording camera over the road, in m")
+    check_count("seed", seed, least=0)
     out, updates, longest = Path(out).expanduser(), updates or Updates(), CarSettings.longest
     common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache"}
     recorded = recorded_drives(root, drives, leave_out, height=height, **common) if root is not None else []

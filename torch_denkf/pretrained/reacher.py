@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch_denkf._checks import check_number
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
 
@@ -27,6 +28,9 @@ class ReacherSettings:
     state_std: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     num_cells: tuple[int, ...] = (64, 64)
     ensemble_size: int = 32
+
+    def __post_init__(self):
+        check_number("encoder_std", self.encoder_std, above=0)
 
 
 class ReacherFilter(DEnKF):

@@ -6,6 +6,7 @@ torchrl's own ``Checkpoint`` has neither checksums nor a sync with the disk, and
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,6 +70,58 @@ def read_checkpoint(file: Path | str) -> dict[str, Any]:
     if not isinstance(content, dict) or content.pop("format", None) != _FORMAT:
         raise ValueError(f"{file} is not a checkpoint of torch_denkf.training ({_FORMAT}); {cure}.")
     return content
+
+
+#: What a checkpoint of a training holds.
+_STATE = {
+    "settings": dict,
+    "stage": int,
+    "update": int,
+    "model": dict,
+    "updates": (dict, type(None)),
+    "results": dict,
+    "best": (dict, type(None)),
+    "last_metrics": dict,
+    "logs": dict,
+    "hooks": dict,
+}
+_BEST = {"stage": str, "update": int, "model": dict, "metrics": dict}
+
+
+def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
+    """Raises unless a checkpoint holds the state of a training, with finite parameters.
+
+    Args:
+        file: the checkpoint, for the message.
+        state: its content.
+
+    Raises:
+        ValueError: if an entry is missing, of another kind or out of range; the message names the file and the entry.
+    """
+
+    def refuse(what: str) -> None:
+        raise ValueError(f"{file} is not the state of a training: {what}; move it away to start anew.")
+
+    def check(part: Mapping[str, Any], kinds: Mapping[str, Any], where: str) -> None:
+        for name, kind in kinds.items():
+            if name not in part or not isinstance(part[name], kind) or isinstance(part[name], bool):
+                refuse(f"{where}{name!r} is {'missing' if name not in part else type(part[name]).__name__}")
+
+    check(state, _STATE, "")
+    check(state["settings"], {"seed": int, "processes": int, "stages": list}, "in its settings ")
+    stages = state["settings"]["stages"]
+    if not 0 <= state["stage"] <= len(stages) or state["update"] < 0:
+        refuse(f"stage {state['stage']}, update {state['update']} of {len(stages)} stages")
+    most = stages[state["stage"]].get("updates", state["update"]) if state["stage"] < len(stages) else 0
+    if state["update"] > most or (state["updates"] is None) != (state["stage"] == len(stages)):
+        refuse(f"update {state['update']} of {most} in stage {state['stage']}, with its optimiser's state or without")
+    if state["best"] is not None:
+        check(state["best"], _BEST, "in its best ")
+        if not re.fullmatch(r"[\w-]+", state["best"]["stage"]):
+            refuse(f"its best is of stage {state['best']['stage']!r}")
+    for name, value in state["model"].items():
+        if isinstance(value, torch.Tensor) and value.is_floating_point() and not bool(value.isfinite().all()):
+            refuse(f"{name!r} of its model is not finite")
 
 
 def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[str, Any], stage: int) -> None:

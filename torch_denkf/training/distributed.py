@@ -41,7 +41,11 @@ class Processes:
         local_rank = int(os.environ.get("LOCAL_RANK", 0))
         if device is None:
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        self.device = torch.device(device)
+        try:
+            self.device = torch.device(device)
+            torch.empty(0, device=self.device)
+        except (AssertionError, AttributeError, RuntimeError) as error:
+            raise ValueError(f"device {device!r} cannot be used here: {' '.join(str(error).split())}") from error
         if self.device.type == "cuda":
             index = local_rank if self.device.index is None else self.device.index
             self.device = torch.device("cuda", index)

@@ -13,6 +13,8 @@ from tensordict import TensorDictBase
 from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, OneCycleLR
 
+from torch_denkf._checks import check_count, check_number
+
 __all__ = ["Stage"]
 
 _SCHEDULES = ("one_cycle", "cosine", "constant")
@@ -69,12 +71,19 @@ class Stage:
     monitor: str | None = None
 
     def __post_init__(self):
-        if not re.fullmatch(r"[\w-]+", self.name):
+        if not isinstance(self.name, str) or not re.fullmatch(r"[\w-]+", self.name):
             raise ValueError(f"A stage's name names files: letters, digits, _ and - only; got {self.name!r}.")
-        if self.updates < 1:
-            raise ValueError(f"Stage {self.name!r} has updates={self.updates}; give at least one.")
+        check_count(f"updates of stage {self.name!r}", self.updates)
+        check_number(f"lr of stage {self.name!r}", self.lr, above=0)
+        check_number(f"weight_decay of stage {self.name!r}", self.weight_decay, least=0)
+        if self.clip is not None:
+            check_number(f"clip of stage {self.name!r}", self.clip, above=0, cure="None is for no limit")
         if not callable(self.schedule) and self.schedule not in _SCHEDULES:
             raise ValueError(f"Stage {self.name!r}: schedule is one of {_SCHEDULES} or a function; {self.schedule!r}.")
+        if self.lengths is not None and not isinstance(self.lengths, Mapping):
+            raise TypeError(f"Stage {self.name!r}: lengths map updates to lengths, {{0: 4}}; got {self.lengths!r}.")
+        for length in (self.lengths or {}).values():
+            check_count(f"one of the lengths of stage {self.name!r}", length)
         if self.lengths is not None and 0 not in self.lengths:
             raise ValueError(f"Stage {self.name!r}: lengths {dict(self.lengths)} lack the length from update 0 on.")
         if self.parameters is not None:  # often generators, which would be empty the second time

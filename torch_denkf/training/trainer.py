@@ -13,9 +13,10 @@ from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._checks import check_count
 from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
-from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import check_settings, check_state, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
@@ -43,8 +44,8 @@ class FilterTrainer(HookPoints):
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
     outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
-    logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an earlier run left is not overwritten: it
-    is moved to ``out/earlier-1``. One process at a time trains in ``out``.
+    logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an
+    earlier run left is not overwritten: it is moved to ``out/earlier-1``. One process at a time trains in ``out``.
 
     **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
     another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
@@ -116,8 +117,10 @@ class FilterTrainer(HookPoints):
         names = [stage.name for stage in stages]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"A training needs stages, each with a name of its own; got {names}.")
-        if min(validate_every, save_every, log_every) < 1:
-            raise ValueError("validate_every, save_every and log_every are numbers of updates, at least 1.")
+        for name, value in {"validate_every": validate_every, "save_every": save_every, "log_every": log_every}.items():
+            check_count(name, value, cure="It is a number of updates")
+        check_count("max_skipped", max_skipped, least=0, cure="It is a number of updates")
+        check_count("seed", seed, least=0)
         if keep not in ("best", "last"):
             raise ValueError(f'keep is "best" or "last"; got {keep!r}.')
         self.model, self.stages, self.out = model, list(stages), Path(out)
@@ -285,6 +288,7 @@ class FilterTrainer(HookPoints):
         self.out.mkdir(parents=True, exist_ok=True)
         if resume and self.last_checkpoint.exists():
             state = read_checkpoint(self.last_checkpoint)
+            check_state(self.last_checkpoint, state)
             check_settings(self.last_checkpoint, state["settings"], self._settings, state["stage"])
             if state["best"] is not None:  # the file may be from validations that are about to be repeated
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])

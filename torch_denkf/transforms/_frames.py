@@ -29,8 +29,8 @@ class FrameTransform(Transform):
     """
 
     def __init__(self, p: float, *, in_keys: Sequence[NestedKey], generator: torch.Generator | None):
-        if not 0.0 <= p <= 1.0:
-            raise ValueError(f"p is the probability that {type(self).__name__} hits a frame, in [0, 1]; got {p}.")
+        if not isinstance(p, (int, float)) or not 0.0 <= p <= 1.0:
+            raise ValueError(f"p is the probability that {type(self).__name__} hits a frame, in [0, 1]; got {p!r}.")
         super().__init__(in_keys=list(in_keys), out_keys=list(in_keys))
         self.p, self.generator = p, generator
 

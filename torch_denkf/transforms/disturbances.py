@@ -10,6 +10,9 @@ disturb the ``image``, whose difference images :func:`torch_denkf.data.drive_fra
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from tensordict import NestedKey
 from torch import Tensor
@@ -51,7 +54,7 @@ class SaltAndPepper(ImageDisturbance):
         in_keys: tuple[NestedKey, ...] = ("pixels",),
         generator: torch.Generator | None = None,
     ):
-        if not 0.0 <= fraction <= 0.5:
+        if not isinstance(fraction, (int, float)) or not 0.0 <= fraction <= 0.5:
             raise ValueError(f"fraction is the share of white pixels and that of black ones, <= 0.5; got {fraction}.")
         super().__init__(p, in_keys=in_keys, generator=generator)
         self.fraction = fraction
@@ -97,9 +100,10 @@ class Blur(ImageDisturbance):
         generator: torch.Generator | None = None,
     ):
         sides = (kernel, kernel) if isinstance(kernel, int) else kernel
-        if sides is not None and (len(sides) != 2 or any(side < 1 or side % 2 == 0 for side in sides)):
+        odd = isinstance(sides, Sequence) and all(isinstance(side, int) and side > 0 and side % 2 for side in sides)
+        if sides is not None and (not odd or len(sides) != 2):
             raise ValueError(
-                f"kernel is a positive odd number of pixels, or one each for height and width; got {kernel}."
+                f"kernel is a positive odd number of pixels, or one each for height and width; got {kernel!r}."
             )
         super().__init__(p, in_keys=in_keys, generator=generator)
         self.kernel = sides
@@ -147,7 +151,9 @@ class Brightness(ImageDisturbance):
         generator: torch.Generator | None = None,
     ):
         for name, bounds in (("gain", gain), ("offset", offset)):
-            if len(bounds) != 2 or bounds[0] > bounds[1]:
+            if len(bounds) != 2 or not all(isinstance(bound, (int, float)) for bound in bounds):
+                raise TypeError(f"{name} is (lowest, highest), two numbers; got {bounds!r}.")
+            if not -math.inf < bounds[0] <= bounds[1] < math.inf:
                 raise ValueError(f"{name} is (lowest, highest), equal for a constant; got {bounds}.")
         if gain[0] < 0:
             raise ValueError(f"a gain cannot be negative; got {gain}.")
@@ -225,7 +231,8 @@ class OccludingBox(ImageDisturbance):
         generator: torch.Generator | None = None,
     ):
         for name, shares in (("size", size), ("position", position)):
-            if shares is not None and (len(shares) != 2 or not all(0.0 <= share <= 1.0 for share in shares)):
+            good = isinstance(shares, Sequence) and all(isinstance(s, (int, float)) and 0 <= s <= 1 for s in shares)
+            if shares is not None and (not good or len(shares) != 2):
                 raise ValueError(f"{name} is a share of the height and one of the width, in [0, 1]; got {shares}.")
         super().__init__(p, in_keys=in_keys, generator=generator)
         self.size, self.position = tuple(size), position

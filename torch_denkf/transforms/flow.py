@@ -10,6 +10,8 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torch_denkf import vision
+from torch_denkf._checks import check_number
+from torch_denkf.modules._tensors import as_floating
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
 
 __all__ = ["OpticalFlow"]
@@ -50,7 +52,12 @@ class OpticalFlow(Transform):
         observed_key: NestedKey = "observed",
     ):
         super().__init__(in_keys=[in_key], out_keys=list(out_keys))
-        self.calibration = tuple(float(value) for value in calibration)
+        self.calibration = tuple(as_floating(calibration, "calibration").reshape(-1).tolist())
+        if len(self.calibration) != 4:
+            raise ValueError(f"calibration is (fx, fy, cx, cy) in pixels; got {calibration!r}.")
+        for name, value, above in zip(("fx", "fy", "cx", "cy"), self.calibration, (0, 0, None, None), strict=True):
+            check_number(f"calibration, {name},", value, above=above)
+        check_number("height", height, above=0, cure="It is that of the camera over the road, in m")
         self.height, self.observed_key = height, observed_key
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

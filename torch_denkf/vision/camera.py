@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torch_denkf._checks import check_number
+
 __all__ = ["CanonicalCamera", "KITTI_HEIGHT"]
 
 KITTI_HEIGHT = 1.65  # m, of KITTI's cameras over the road (Geiger et al. 2013, figure 3)
@@ -26,6 +28,9 @@ class CanonicalCamera:
     """
 
     focal: float
+
+    def __post_init__(self):
+        check_number("focal", self.focal, above=0, cure="It is in pixels")
 
     @classmethod
     def near(cls, calibration) -> CanonicalCamera:

@@ -51,6 +51,8 @@ def read_times(file: Path, rows: int) -> Times:
         ValueError: naming file and line, if the file has fewer rows, if a row is no finite number, if more than a
             tenth of its times do not increase, or if they cannot be in seconds.
     """
+    if file.exists() and not file.is_file():
+        raise ValueError(f"{file} is no file; expected a time in s for each frame, a row each")
     if not file.is_file():
         return Times(KITTI_DT * np.arange(rows), np.full(rows, KITTI_DT), np.ones(rows, bool), KITTI_DT)
     lines = read_lines(file)

@@ -129,6 +129,11 @@ def read_kitti_drive(
     """
     root = Path(root).expanduser().resolve()
     sequence = f"{sequence:02d}" if isinstance(sequence, int) else sequence
+    for name, value in (("sequence", sequence), ("camera", camera)):
+        if not isinstance(value, str) and (name == "sequence" or value is not None):
+            raise TypeError(f"{name} is a name, such as {'09' if name == 'sequence' else 'image_2'!r}; got {value!r}")
+    if colour is not None and not isinstance(colour, bool):
+        raise TypeError(f"colour is True, False or None; got {colour!r}")
     height, width = check_size(size)
     folder, poses = root / "sequences" / sequence, root / "poses" / f"{sequence}.txt"
     camera = choose_camera(folder, camera)
@@ -271,6 +276,8 @@ def _is_colour(files) -> bool:
 
 def _read_image(file: Path, size: tuple[int, int], colour: bool) -> tuple[np.ndarray | None, tuple[int, int]]:
     """Pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
+    if not file.is_file():  # a folder, or a link to nowhere
+        return None, (0, 0)
     pixels = _decode(file, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         return None, (0, 0)

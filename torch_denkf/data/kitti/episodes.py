@@ -141,6 +141,8 @@ def read_drives(
             frame holds.
     """
     counts = [len(_frame_files(root / "sequences" / drive / camera)) for drive, camera in sources]
+    if not isinstance(flow, bool) and not callable(flow):
+        raise TypeError(f"flow is True, False, or what adds 'flow' to a drive; got {flow!r}")
     add_flow = partial(with_motion, cache=cache) if flow is True else flow
     steps = 2 if add_flow else 1
     drives, ends = [], 0

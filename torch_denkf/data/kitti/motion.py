@@ -9,6 +9,7 @@ import cv2
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached
 from torch_denkf.data.kitti.gaps import after_gap, steps_at
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
@@ -60,6 +61,7 @@ def with_motion(
         >>> with_motion(drive, cache=None)["road"].shape
         torch.Size([5, 13, 69])
     """
+    check_number("height", height, above=0, cure="It is that of the camera over the road, in m")
     missing = {"image", "frame_valid", "calibration"} - set(drive.keys())
     if missing:
         raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")

@@ -82,7 +82,9 @@ class Layout:
         feature = self.features[key]
         if len(feature["shape"]) != 1 or feature["dtype"] in ("string", "image", "video"):
             raise ValueError(f"feature {key!r} of {self.root} is no vector: {feature['dtype']} {feature['shape']}")
-        return int(feature["shape"][0])
+        width = feature["shape"][0]
+        check_count(f"the width of feature {key!r} in {self.meta[0]}", width)
+        return int(width)
 
     def names(self, key: str) -> tuple[str, ...] | None:
         """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
@@ -114,7 +116,7 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
     check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
     _check_features(file, features)
-    if version not in VERSIONS:
+    if not isinstance(version, str) or version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
     stay_inside(root, f"images/{camera}", f"{file}, by the name of a camera,")
@@ -124,12 +126,12 @@ def read_layout(root: Path, camera: str | None) -> Layout:
         episodes, meta = _episodes_of_version_3(root, info, camera)
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
-        raise ValueError(f"{root} has no episodes; {COMPLETE}")
+        raise ValueError(f"{root} has no episodes: {meta[0]} lists none; {COMPLETE}")
     _check_episodes(meta, episodes)
     rows = sum(episode.length for episode in episodes)
     if rows > MOST_ROWS:
         raise ValueError(
-            f"{root} announces {rows} rows, more than the {MOST_ROWS} that are read; its metadata are wrong"
+            f"{meta[0]} announces {rows} rows, more than the {MOST_ROWS} that are read; its numbers are wrong"
         )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
@@ -155,29 +157,6 @@ def _check_episodes(meta: list[Path], episodes: list[EpisodeFiles]) -> None:
         seen.add(episode.number)
 
 
-def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
-    """A file that a template of ``info.json`` names.
-
-    Raises:
-        ValueError: if there is no such template, it asks for what there is not, or it leads out of the folder.
-    """
-    file, template = root / "meta" / "info.json", info.get(name)
-    if not isinstance(template, str):
-        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
-    try:
-        if any(len(spec) > 4 for _, _, spec, _ in Formatter().parse(template) if spec):
-            raise ValueError("a number of more than 99 digits")
-        path = root / template.format(**place)
-    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"{file} is malformed: {name!r}, {template!r}, is filled with {sorted(place)} ({type(error).__name__}: "
-            f"{error}); download it anew"
-        ) from error
-    if not path.is_relative_to(root) or ".." in path.relative_to(root).parts:
-        raise ValueError(f"{file}: {name!r}, {template!r}, leads out of {root}, to {path}; such a file is not read")
-    return path
-
-
 def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) -> str:
     cameras = [key for key, feature in features.items() if _is_camera(feature)]
     if camera is None and len(cameras) == 1:
@@ -186,7 +165,8 @@ def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) ->
         if camera is not None and camera in (name, name.removeprefix("observation.images.")):
             return name
     if not cameras:
-        raise ValueError(f"{root} has no camera: no feature of dtype video or image among {sorted(features)}")
+        file = root / "meta" / "info.json"
+        raise ValueError(f"{file} names no camera: no feature of dtype video or image among {sorted(features)}")
     raise ValueError(
         f"{root} has no camera {camera!r}; it has {cameras}"
         if camera is not None
@@ -213,7 +193,7 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
             continue
         try:
             entry = json.loads(line)
-            number, length = int(entry["episode_index"]), int(entry["length"])
+            number, length = entry["episode_index"], entry["length"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{file} has a malformed line {line[:80]!r}, line {at} ({type(error).__name__}: {error}); download it "
@@ -257,6 +237,50 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
     return episodes, files
 
 
+def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
+    """A file that a template of ``info.json`` names.
+
+    Raises:
+        ValueError: if there is no such template, it is none of LeRobot's, or it leads out of the folder.
+    """
+    file, template = root / "meta" / "info.json", info.get(name)
+    if not isinstance(template, str):
+        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
+    try:
+        parts = list(Formatter().parse(template))
+        fields = {field for _, field, _, _ in parts if field is not None}
+        widths = [spec for _, _, spec, _ in parts if spec]
+        strange = sorted(fields - set(place)) + [spec for spec in widths if not _WIDTH.fullmatch(spec)]
+        if strange:
+            raise ValueError(f"it has {strange[0]!r}, but may name {sorted(place)}, with widths such as 06d")
+        path = template.format(**place)
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{file} has a path {name!r}, {template!r}, that cannot be filled in: {error}; download it anew"
+        ) from error
+    return stay_inside(root, path, f"{file}, by {name!r},")
+
+
+def stay_inside(root: Path, path: str, source: str) -> Path:
+    """A path below a folder, as metadata name it.
+
+    Args:
+        root: the folder.
+        path: relative to it.
+        source: what names the path, for the message.
+
+    Raises:
+        ValueError: if it is absolute and elsewhere, or leads out of the folder.
+    """
+    file = root / path
+    if ".." in Path(path).parts or not file.is_relative_to(root) or "\0" in path:
+        raise ValueError(
+            f"{source} names a file outside of the data set, {path!r}; such a data set may read anything of yours: "
+            "download it from where you trust it, or correct the path"
+        )
+    return file
+
+
 def read_table(file: Path, columns: list[str] | None = None):
     """Columns of a parquet file, or all, as a pyarrow table.
 
@@ -278,7 +302,10 @@ def rows_of_episode(table, episode: EpisodeFiles):
     """
     import pyarrow.compute as compute
 
-    table = table.filter(compute.equal(table["episode_index"], episode.number))
+    try:
+        table = table.filter(compute.equal(table["episode_index"], episode.number))
+    except (NotImplementedError, ValueError) as error:  # pyarrow's are both
+        raise ValueError(f"{episode.data}: episode_index holds no whole numbers ({error}); download it anew") from error
     if table.num_rows != episode.length:
         raise ValueError(
             f"{episode.data} has {table.num_rows} rows of episode {episode.number}, but the metadata says "

@@ -100,7 +100,10 @@ def recording_from_rows(
     numbers: list[TensorDict] = []
     for at in stretches:
         part = rows[at]
-        entries = {"state": _numbers(part, state_key), "episode": _get(part, episode_key).reshape(-1).long()}
+        episode = _get(part, episode_key).reshape(-1)
+        if episode.is_floating_point() and not bool(episode.isfinite().all()):
+            raise ValueError(f"{episode_key!r} numbers the episodes; it has NaN or infinity in rows {at.start} on")
+        entries = {"state": _numbers(part, state_key), "episode": episode.long()}
         if action_key is not None and not (action_key == "action" and "action" not in part):
             entries["action"] = _numbers(part, action_key)
         numbers.append(TensorDict(entries, batch_size=[at.stop - at.start]))
@@ -146,6 +149,8 @@ def _numbers(rows: TensorDictBase, keys: NestedKey | list[NestedKey]) -> Tensor:
         if not isinstance(value, Tensor) or value.ndim > 2:
             found = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "several entries: pass a list"
             raise ValueError(f"{_text(key)} must be numbers [N, n], it has {found}")
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise ValueError(f"{_text(key)} has NaN or infinity; take these rows out, or repair them")
         parts.append(value.reshape(len(rows), -1).float())
     return torch.cat(parts, -1)
 

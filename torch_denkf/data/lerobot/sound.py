@@ -27,7 +27,10 @@ def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray,
     Raises:
         ValueError: if more than a tenth are not finite or do not increase.
     """
-    times = np.asarray(times, np.float64)
+    try:
+        times = np.asarray(times, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{source}: a timestamp is no number ({error}); download it anew") from error
     good = sound(times)
     wrong = np.flatnonzero(~good)
     if len(wrong) > MOST_WRONG * len(times):

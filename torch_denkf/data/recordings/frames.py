@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torch_denkf._checks import check_number
 from torch_denkf._files import clear_errors
 from torch_denkf._progress import progress_bar
 from torch_denkf.data.cache import cache_folder, cached, stamp
@@ -60,8 +61,7 @@ class Frames:
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest"), self.tolerance, self.unit)
-        if not np.isfinite(self.start):
-            raise ValueError(f"start is a time in s, got {self.start!r}")
+        check_number("start", self.start, cure="It is a time in s")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
         """All pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64 ``[F]``, s.
@@ -188,8 +188,7 @@ class Images(Frames):
             return
         if self.times is not None:
             raise ValueError("pass times or rate, not both")
-        if not 0 < self.rate < np.inf:
-            raise ValueError(f"rate is the number of pictures a second and must be positive, got {self.rate}")
+        check_number("rate", self.rate, above=0, cure="It is the number of pictures a second")
 
     def _files(self, source: Path) -> list[Path]:
         if not source.is_dir():

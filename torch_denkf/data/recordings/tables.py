@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from torch_denkf._checks import check_number
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.recordings.clock import Way
 
@@ -83,6 +84,8 @@ class Table:
             ValueError: for columns that are not there, values that are no finite numbers, and times that do not
                 ascend; names the file, the line and the column.
         """
+        if self.columns is not None and not isinstance(self.columns, Sequence):
+            raise TypeError(f"columns is a list of names, or None; got {self.columns!r}")
         columns = None if self.columns is None else list(self.columns)
         if isinstance(self.columns, str):
             raise ValueError(f"columns is a list of names, such as [{self.columns!r}]; got {self.columns!r}")
@@ -104,8 +107,8 @@ def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit
         raise ValueError(f"sample is one of {', '.join(map(repr, ways))}, got {sample!r}")
     if unit not in SECONDS:
         raise ValueError(f"unit is one of {', '.join(map(repr, SECONDS))}, got {unit!r}")
-    if tolerance is not None and not tolerance > 0:
-        raise ValueError(f"tolerance is a time in s, positive, or None; got {tolerance}")
+    if tolerance is not None:
+        check_number("tolerance", tolerance, above=0, cure="It is a time in s, or None")
 
 
 def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> None:

@@ -26,12 +26,16 @@ import numpy as np
 
 from torch_denkf._checks import check_count, read_lines
 from torch_denkf._files import clear_errors, write_bytes, write_text
-from torch_denkf.simulation.ur5.names import TASKS
+from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
 COMMAND = "denkf collect-ur5"
 MOST_BYTES = 1 << 32  # of one demo, unpacked: 350 pictures of 2,000 x 2,000
+_MOST_ROWS = 10**6  # of one demo
+_LARGEST = 1e6  # rad or m, of a state or an action
+#: Of the arrays in a demo's file.
+_KINDS = {"number": "iu", "task": "U", "domain": "U", "seed": "iu", "success": "b", "steps": "iu", "pixels": "u"}
 _HEADER = 1 << 14  # bytes in which an array's header is, at most
 AGAIN = f"the collecting command ({COMMAND}), repeated, makes it again"
 
@@ -101,19 +105,10 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
     """None for a file with the manifest's checksum, or else what is the matter, for a message."""
     try:
-        data = _place(root, entry).read_bytes()
+        data = (root / entry.file).read_bytes()
     except OSError as error:
         return f"{root / entry.file} cannot be read ({error.strerror})"
     return _compare(root, entry, data)
-
-
-def _place(root: Path, entry: Entry) -> Path:
-    if not isinstance(entry.file, str) or entry.file in ("", "..") or Path(entry.file).name != entry.file:
-        raise ValueError(
-            f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
-            "anything of yours: download it from where you trust it, or take the line out"
-        )
-    return root / entry.file
 
 
 def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
@@ -179,10 +174,11 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, does not hold what the line says, lies outside of the folder, or has numbers that
-            are not finite.
+        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
     """
-    file = _place(root, entry)
+    file = root / entry.file
+    if file.exists() and not file.is_file():
+        raise ValueError(f"{file} is no file; {AGAIN}")
     try:
         size = file.stat().st_size
         if size > MOST_BYTES:
@@ -200,6 +196,9 @@ def read_demo(root: Path, entry: Entry) -> Demo:
         raise ValueError(f"{file} {error}") from error
     except (TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} does not hold a demo ({error}); was it written by another version?") from error
+    for key, kind in _KINDS.items():
+        if getattr(demo, key).dtype.kind not in kind:
+            raise ValueError(f"{file} has {key!r} of {getattr(demo, key).dtype}, not of a demo's kind; {AGAIN}")
     demo.number, demo.seed = int(demo.number), int(demo.seed)
     demo.task, demo.domain = str(demo.task), str(demo.domain)
     expected = {"state": (entry.rows, 10), "action": (entry.rows, 7), "success": (entry.rows,)}
@@ -209,14 +208,16 @@ def read_demo(root: Path, entry: Entry) -> Demo:
             raise ValueError(f"{file} has {key!r} of shape {getattr(demo, key).shape}, {MANIFEST} says {shape}")
     for key in ("state", "action"):
         values = getattr(demo, key)
-        if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
-            row = 0 if values.dtype.kind != "f" else int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
+        if not np.issubdtype(values.dtype, np.floating) or not (np.abs(values) <= _LARGEST).all():
+            row = 0 if values.dtype.kind != "f" else int(np.flatnonzero(~(np.abs(values) <= _LARGEST).all(-1))[0])
             raise ValueError(
-                f"{file} has {key!r} {values[row].tolist()} in row {row}, expected finite numbers; {AGAIN}"
+                f"{file} has {key!r} {values[row].tolist()} in row {row}, expected finite numbers, rad and m; {AGAIN}"
             )
     steps = demo.steps
     if len(steps) and (steps.min() < 0 or steps.max() >= entry.rows or (np.diff(steps) <= 0).any()):
         raise ValueError(f"{file} has 'steps' {steps.tolist()[:9]}, expected ascending rows of {entry.rows}; {AGAIN}")
+    if demo.domain not in DOMAIN_NAMES:
+        raise ValueError(f"{file} is of the unknown domain {demo.domain!r}; there are {', '.join(DOMAIN_NAMES)}")
     if demo.task not in TASKS or demo.number != entry.demo:
         raise ValueError(f"{file} is demo {demo.number} of task {demo.task!r}, but is listed as demo {entry.demo}")
     return demo
@@ -247,6 +248,9 @@ def read_manifest(root: Path, *, skip_damaged: bool = False) -> dict[int, Entry]
                 raise ValueError(f"demo {entry.demo} is listed in another line, too")
         except (TypeError, ValueError) as error:
             if cut and number == len(lines):
+                warnings.warn(
+                    f"{file}:{number} was cut off, by a kill perhaps; its demo counts as not written", stacklevel=3
+                )
                 continue
             wrong = f"{file}:{number} is damaged ({error}): {line[:80]!r}"
             if not skip_damaged:
@@ -266,8 +270,12 @@ def _entry(line: str) -> Entry:
     entry = Entry(**fields)
     for name, least in (("demo", 0), ("rows", 1), ("frames", 0), ("failures", 0)):
         check_count(name, getattr(entry, name), least=least)
-    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file or not isinstance(entry.sha256, str):
-        raise ValueError(f"file is the name of a file in the folder, and sha256 its checksum; got {entry.file!r}")
+    if entry.rows > _MOST_ROWS or entry.frames > entry.rows:
+        raise ValueError(f"a demo has up to {_MOST_ROWS} rows, and no more frames; got {entry.rows} and {entry.frames}")
+    if not isinstance(entry.file, str) or not entry.file or Path(entry.file).name != entry.file:
+        raise ValueError(f"it names a file outside of its folder, {entry.file!r}; such a list may read all of yours")
+    if not isinstance(entry.sha256, str):
+        raise ValueError(f"sha256 is a checksum in hexadecimal; got {entry.sha256!r}")
     return entry
 
 

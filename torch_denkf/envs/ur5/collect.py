@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from torch_denkf._checks import check_count
 from torch_denkf._lock import locked
 from torch_denkf.data.ur5 import files
 from torch_denkf.data.ur5.files import COLLECTION, Entry
@@ -75,8 +76,8 @@ def collect_ur5_demos(
         >>> collect_ur5_demos(folder, 1, frames=None), collect_ur5_demos(folder, 2, frames=None)
         (1, 1)
     """
-    if demos < 1 or processes < 1:
-        raise ValueError(f"demos and processes must be positive, got {demos} and {processes}")
+    check_count("demos", demos)
+    check_count("processes", processes)
     options = Options(size, frames, domain, tuple(tasks), seed, max_steps, noise)
     root = Path(root).expanduser().resolve()
     with locked(root, LOCK, "is collecting into it"):

@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.data.pictures import check_size
 from torch_denkf.data.ur5.files import Demo, Entry, write_demo
 from torch_denkf.envs.ur5.expert import UR5Expert
 from torch_denkf.envs.ur5.table import STEPS, UR5TableEnv
@@ -42,13 +44,12 @@ class Options:
             raise ValueError(f"tasks are some of {', '.join(TASKS)}, each once; got {list(self.tasks)}")
         if self.domain not in DOMAIN_NAMES:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAIN_NAMES)}")
-        if len(self.size) != 2 or min(self.size) < 1:
-            raise ValueError(f"size is (height, width) in pixels and must be positive, got {self.size}")
-        if min(self.seed, self.frames or 0, self.noise) < 0 or self.max_steps < 1:
-            raise ValueError(
-                f"seed, frames and noise must not be negative, max_steps must be positive; got seed={self.seed}, "
-                f"frames={self.frames}, noise={self.noise}, max_steps={self.max_steps}"
-            )
+        check_size(self.size)
+        check_count("seed", self.seed, least=0)
+        check_count("max_steps", self.max_steps)
+        if self.frames is not None:
+            check_count("frames", self.frames, least=0)
+        check_number("noise", self.noise, least=0)
 
 
 def make_demos(root: Path, options: Options, numbers: list[int], processes: int) -> Iterator[Entry]:

@@ -1,0 +1,186 @@
+"""One damaged input, run in a process of its own, and the verdict on what came out."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import re
+import resource
+import select
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import torch_denkf
+
+__all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge", "workshop"]
+
+Kind = Literal["clear", "right", "unclear", "silent", "hang", "crash"]
+
+SECONDS = 20.0  # after which a case counts as a hang
+MEMORY = 6 << 30  # bytes of address space that a case may take beyond those of the process that starts it
+LIBRARY = str(Path(torch_denkf.__file__).parent)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A damaged input.
+
+    Args:
+        border: where it comes in.
+        name: what is damaged, and how; unique in its border.
+        words: arguments, keys or files that were damaged: a clear message has one of them as a word.
+        act: does what a user would do, in an empty folder that it is given.
+        right: whether a result is right, as the sound part of the input tells; ``None`` where the input must be
+            refused.
+        within: s in which it must be over.
+        needs: makes what several cases start from, in a process of its own; called once, before the first of them.
+        slow: whether ``needs`` takes so long that small samples leave the case out.
+    """
+
+    border: str
+    name: str
+    words: tuple[str, ...]
+    act: Callable[[Path], Any]
+    right: Callable[[Any], bool] | None = None
+    within: float = SECONDS
+    needs: Callable[[], Any] | None = None
+    slow: bool = False
+
+
+class Refused(Exception):
+    """A command ended with a message."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came out of a case.
+
+    Attributes:
+        kind: ``clear``: an error raised in this library that names what was damaged. ``right``: no error, and the
+            result of the sound part. ``silent``: no error, and no right result. ``unclear``: any other error.
+            ``hang``: not over in time. ``crash``: the process was ended by a signal.
+        text: the message, or what is known of it.
+    """
+
+    kind: Kind
+    text: str = ""
+
+
+def apart(work: Callable[[], Any]) -> None:
+    """Runs something in a forked process: what it imports, compiles or computes with threads stays there."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            work()
+            status = 0
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    _, status = os.waitpid(child, 0)
+    if status:
+        raise RuntimeError(f"{work} failed; see above")
+
+
+@cache
+def workshop() -> Path:
+    """A folder for what cases start from; it goes with the process that asked for it first."""
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)  # not in forked children, which leave by os._exit
+    return folder
+
+
+def judge(case: Case) -> Verdict:
+    """Runs a case in a forked process, so that neither a crash nor a hang nor what it changes reaches another one."""
+    if case.needs is not None:
+        case.needs()
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    read, write = os.pipe()
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        os.setsid()
+        _run(case, folder, write)
+    os.close(write)
+    try:
+        return _listen(case, child, read)
+    finally:
+        os.close(read)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _listen(case: Case, child: int, read: int) -> Verdict:
+    """The child's verdict, or what its end tells."""
+    heard, end, over = b"", time.monotonic() + case.within, False
+    while not over:
+        ready, _, _ = select.select([read], [], [], max(end - time.monotonic(), 0.0))
+        part = os.read(read, 1 << 16) if ready else b""
+        heard += part
+        over = not part
+    late = time.monotonic() >= end
+    with suppress(ProcessLookupError):  # its own children, too; it may be gone, or not as far as setsid
+        os.killpg(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    if heard:
+        return Verdict(**json.loads(heard))
+    if late:
+        return Verdict("hang", f"not over after {case.within:g} s")
+    number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+    return Verdict("crash", f"ended by {signal.Signals(number).name if number else f'exit status {status >> 8}'}")
+
+
+def _run(case: Case, folder: Path, write: int) -> None:
+    """In the child: the case, its verdict into the pipe, and the end of the process."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    warnings.simplefilter("ignore")
+    os.chdir(folder)
+    try:
+        verdict = _verdict(case, folder)
+        os.write(write, json.dumps(vars(verdict)).encode())
+    finally:
+        os._exit(0)
+
+
+def _verdict(case: Case, folder: Path) -> Verdict:
+    try:
+        result = case.act(folder)
+    except Exception as error:
+        return _of_error(case, error)
+    except SystemExit as left:
+        return Verdict("unclear", f"SystemExit: {left.code}")
+    if case.right is None:
+        return Verdict("silent", "accepted")
+    try:
+        right = bool(case.right(result))
+    except Exception as error:
+        return Verdict("silent", f"the result cannot be compared: {type(error).__name__}: {error}"[:500])
+    return Verdict("right") if right else Verdict("silent", "a result, and not that of the sound part")
+
+
+def _of_error(case: Case, error: Exception) -> Verdict:
+    """Clear, if raised in this library with a word of the case in it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    message = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    ours = last.filename.startswith(LIBRARY) or isinstance(error, Refused)
+    named = any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", message) for word in case.words)
+    place = f"{Path(last.filename).name}:{last.lineno}"
+    text = f"{type(error).__name__} at {place}: {' '.join(message.split())}"[:500]
+    return Verdict("clear" if ours and named else "unclear", text)

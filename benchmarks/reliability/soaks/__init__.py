@@ -1,0 +1,1 @@
+"""Runs that last: a module for each part, with a function ``rows`` that yields the rows of its table."""

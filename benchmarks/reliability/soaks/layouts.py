@@ -1,0 +1,164 @@
+"""A filter inside collectors and worker processes, every step of it compared with the same step taken by hand.
+
+The filter draws nothing at random, so that what an environment returns follows from what it was given: the belief of
+t+1 from that of t, the action and the frame; the belief after a reset is known; and what is handed on from step to
+step, and from batch to batch, must be what came out before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector, MultiCollector
+from torchrl.envs import EnvBase, InitTracker, ParallelEnv, SerialEnv, TransformedEnv
+
+from tests.filters.factories import linear_denkf
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.transforms import DEnKFTransform
+
+__all__ = ["LAYOUTS", "rows"]
+
+ROWS, FRAMES = 4, 2000  # environments, and steps of all of them in a batch
+WORKERS = 2
+LENGTHS = [3, 5, 17, 23]  # of the episodes in each row: resets are partial
+BELIEF = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
+CLOSE = 1e-4  # float32, another order of sums
+
+
+def filtered(base: EnvBase | None = None, *, seed: int = 0, rows: int | None = ROWS) -> EnvBase:
+    """An environment with the filter in it; half of its readings are missing."""
+    if base is None:
+        lengths = LENGTHS[:rows] if rows else LENGTHS[seed % len(LENGTHS)]
+        base = base_env(seed=seed, missing=0.5, max_steps=lengths, batch_size=[rows] if rows else [])
+    return TransformedEnv(TransformedEnv(base, DEnKFTransform(linear_denkf("etkf"))), InitTracker())
+
+
+def plain(seed: int) -> EnvBase:
+    """One row without a filter."""
+    return base_env(seed=seed, missing=0.5, max_steps=LENGTHS[seed % len(LENGTHS)])
+
+
+def _many(kind: type, inside: bool) -> EnvBase:
+    if inside:
+        return kind(ROWS, [partial(filtered, seed=k, rows=None) for k in range(ROWS)], serial_for_single=False)
+    return filtered(kind(ROWS, [partial(plain, seed=k) for k in range(ROWS)], serial_for_single=False))
+
+
+def _collected(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBase]:
+    collector = Collector(make, None, frames_per_batch=FRAMES, total_frames=total)
+    try:
+        yield from collector
+    finally:
+        collector.shutdown()
+
+
+def _collected_by_workers(makes: list[Callable[[], EnvBase]], total: int) -> Iterator[TensorDictBase]:
+    collector = MultiCollector(makes, None, frames_per_batch=FRAMES, total_frames=total, sync=True, cat_results=0)
+    try:
+        yield from collector
+    finally:
+        collector.shutdown()
+
+
+def _rollouts(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBase]:
+    env = make()
+    try:
+        carry, steps = env.reset(), FRAMES // ROWS
+        for _ in range(total // FRAMES):
+            out = env.rollout(
+                steps, auto_reset=False, tensordict=carry, break_when_any_done=False, return_contiguous=True
+            )
+            yield out
+            carry = env.maybe_reset(env._step_mdp(out[..., -1]))
+    finally:
+        with suppress(RuntimeError):
+            env.close()
+
+
+LAYOUTS: dict[str, Callable[[int], Iterator[TensorDictBase]]] = {
+    "Collector": lambda total: _collected(filtered, total),
+    "Collector over SerialEnv, filter inside": lambda total: _collected(partial(_many, SerialEnv, True), total),
+    "Collector over ParallelEnv, filter inside": lambda total: _collected(partial(_many, ParallelEnv, True), total),
+    "Collector over ParallelEnv, filter outside": lambda total: _collected(partial(_many, ParallelEnv, False), total),
+    "ParallelEnv by hand, filter inside": lambda total: _rollouts(partial(_many, ParallelEnv, True), total),
+    "MultiCollector, 2 workers": lambda total: _collected_by_workers(
+        [partial(filtered, seed=k) for k in range(WORKERS)], total
+    ),
+    "MultiCollector, 2 workers, each over ParallelEnv, filter inside": lambda total: _collected_by_workers(
+        [partial(_many, ParallelEnv, True)] * WORKERS, total
+    ),
+}
+
+
+class Reference:
+    """Compares batches with the filter's own steps, and each batch with the one before."""
+
+    def __init__(self):
+        self.filter = linear_denkf("etkf")
+        self.start = self.filter.initial.members
+        self.last: TensorDictBase | None = None
+        self.worst = {"step": 0.0, "reset": 0.0, "handed on": 0.0}
+        self.frames = self.resets = self.missing = 0
+
+    def look(self, batch: TensorDictBase) -> None:
+        """Compares a batch ``[rows, T]``."""
+        batch = batch.reshape(-1, batch.shape[-1]) if batch.ndim != 2 else batch
+        self.frames += batch.numel()
+        following = batch["next"]
+        self.missing += int((~following["observed"]).sum())
+        row = batch.select(*BELIEF, "action").clone()
+        row["observation"], row["observed"] = following["observation"], following["observed"]
+        by_hand = self.filter.step(row.reshape(-1))
+        for key in BELIEF:
+            self._at("step", by_hand[key], following[key].flatten(0, 1))
+        self._hands_on(batch[:, :-1]["next"], batch[:, 1:])
+        if self.last is not None and self.last.shape[0] == batch.shape[0]:
+            self._hands_on(self.last, batch[:, :1])
+        self.last = batch[:, -1:]["next"].clone()
+
+    def _hands_on(self, before: TensorDictBase, after: TensorDictBase) -> None:
+        done = before["done"].squeeze(-1)
+        self.resets += int(done.sum())
+        for key in (*BELIEF, "state", "step"):
+            self._at("handed on", before[key][~done].float(), after[key][~done].float())
+        self._at("reset", after["belief", "ensemble"][done], self.start.expand(int(done.sum()), *self.start.shape))
+        self._at("reset", after["step"][done].float(), torch.zeros(int(done.sum()), 1))
+        if not bool((after["is_init"].squeeze(-1) == done).all()):
+            self.worst["reset"] = float("inf")
+
+    def _at(self, what: str, one: torch.Tensor, other: torch.Tensor) -> None:
+        off = (one - other).abs()
+        largest = float(off.max()) if off.numel() else 0.0
+        self.worst[what] = float("nan") if largest != largest else max(self.worst[what], largest)
+
+
+def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
+    """A row a layout.
+
+    Args:
+        steps: of all environments together, in each layout.
+        done: whether a row of a name is there already.
+    """
+    for name, batches in LAYOUTS.items():
+        if done(name):
+            continue
+        torch.manual_seed(0)
+        reference, began = Reference(), time.time()
+        for batch in batches(steps):
+            reference.look(batch)
+        worst = {f"largest error, {what}": value for what, value in reference.worst.items()}
+        yield {
+            "name": name,
+            "steps": reference.frames,
+            "resets": reference.resets,
+            "missing readings": reference.missing,
+            **worst,
+            "right": reference.frames >= steps and all(value < CLOSE for value in worst.values()),
+            "seconds": round(time.time() - began, 1),
+        }

@@ -1,0 +1,189 @@
+"""A million steps of every filter's packaged step, with long stretches in which nothing is observed."""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from tests.filters.factories import linear_denkf, linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import linear_filter
+from tests.filters.particle_for_tests import bootstrap
+from torch_denkf.deployment import PackagedStep, export_step, load_step
+from torch_denkf.filters import Filter, LSTMFilter
+from torch_denkf.modules import GaussianPrior
+
+__all__ = ["FILTERS", "rows"]
+
+EVERY, STRETCH = 100_000, 10_000  # steps from one stretch without readings to the next, and its length
+CHUNK = 10_000
+SETTLE = 2_000  # steps after which a start is forgotten
+
+
+def _prior() -> GaussianPrior:
+    return GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=32)
+
+
+def _lstm() -> Filter:
+    return LSTMFilter(None, observation_dim=2, state_dim=2, observation_key="observation", hidden_size=16)
+
+
+#: By name: what makes the filter, and whether it draws nothing at random.
+FILTERS: dict[str, tuple[Callable[[], Filter], bool]] = {
+    "KalmanFilter": (linear_kalman, True),
+    "EKF": (lambda: linear_filter("EKF"), True),
+    "UKF": (lambda: linear_filter("UKF"), True),
+    "BackpropKF": (lambda: linear_filter("BackpropKF"), True),
+    "DEnKF, perturbed": (lambda: linear_denkf("perturbed", noisy=True, initial=_prior()), False),
+    "DEnKF, etkf": (lambda: linear_denkf("etkf", noisy=True, initial=_prior()), False),
+    "DEnKF, sakov": (lambda: linear_denkf("sakov", noisy=True, initial=_prior()), False),
+    "ParticleFilter, systematic": (lambda: bootstrap(32), False),
+    "ParticleFilter, soft": (lambda: bootstrap(32, resampling="soft"), False),
+    "ParticleFilter, transport": (lambda: bootstrap(32, resampling="transport"), False),
+    "LSTMFilter": (_lstm, True),
+}
+
+
+class System:
+    """The truth and its readings, chunk by chunk; a chunk follows from its number alone."""
+
+    def __init__(self):
+        self.F, Q, self.H, R = linear_system()
+        self.root, self.std = torch.linalg.cholesky(Q), R.sqrt()
+
+    def chunk(self, number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """States, readings, and whether they arrive: NaN where not."""
+        random = torch.Generator().manual_seed(number)
+        state, states = torch.zeros(2), []
+        noise = torch.randn(CHUNK, 2, generator=random) @ self.root.mT
+        for step in noise:  # each chunk starts at zero: the system forgets in some dozens of steps
+            state = self.F @ state + step
+            states.append(state)
+        truth = torch.stack(states)
+        reading = truth @ self.H.mT + self.std * torch.randn(CHUNK, 2, generator=random)
+        time_ = number * CHUNK + torch.arange(CHUNK)
+        observed = (time_ % EVERY >= STRETCH).unsqueeze(-1)
+        return truth, torch.where(observed, reading, torch.nan), observed
+
+
+def memory() -> int:
+    """The process's resident memory, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+class Run:
+    """Steps of a package, and what is looked at."""
+
+    def __init__(self, step: PackagedStep | Eager, start: dict[str, torch.Tensor]):
+        self.step, self.carry = step, start
+        self.not_finite = 0
+        self.taken = 0.0
+
+    def chunk(self, readings: torch.Tensor, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Means and variances, ``[CHUNK, 2]``."""
+        means, variances, carry, step = [], [], self.carry, self.step
+        began = time.perf_counter()
+        for reading, seen in zip(readings.unbind(0), observed.unbind(0), strict=True):
+            carry = step({**carry, "observation": reading, "observed": seen})
+            means.append(carry["belief.mean"])
+            variances.append(carry["belief.var"])
+        self.taken += time.perf_counter() - began
+        self.carry = {name: carry[name] for name in step.carry}
+        mean, variance = torch.stack(means), torch.stack(variances)
+        self.not_finite += int((~(mean.isfinite() & variance.isfinite() & (variance >= 0))).any(-1).sum())
+        return mean, variance
+
+
+def _start(step: PackagedStep | Eager, filter: Filter) -> dict[str, torch.Tensor]:
+    begun = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
+    return {name: begun[tuple(name.split("."))].clone() for name in step.carry}
+
+
+class Eager:
+    """A filter's own step, called as a package is."""
+
+    def __init__(self, filter: Filter):
+        self.filter, self.carry = filter, [".".join(key) for key in filter.carry_keys]
+
+    def __call__(self, entries: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Takes one step."""
+        row = TensorDict({tuple(name.split(".")): value for name, value in entries.items()})
+        out = self.filter.step(row)
+        return {name: out[tuple(name.split("."))] for name in (*self.carry, "belief.var")}
+
+
+def _packaged(filter: Filter, frame: TensorDict, folder: Path) -> tuple[PackagedStep | Eager, str]:
+    """A package, or the filter itself where torch.export cannot follow it: an EKF's Jacobians."""
+    try:
+        return load_step(export_step(filter, frame, folder / "step.pt2")), "compiled"
+    except (torch._inductor.exc.InductorError, NotImplementedError):
+        return Eager(filter), "eager"
+
+
+def soak(name: str, steps: int) -> dict[str, Any]:
+    """A row of the table."""
+    make, exact = FILTERS[name]
+    torch.manual_seed(0)
+    filter, system = make(), System()
+    frame = TensorDict({"observation": torch.zeros(2), "observed": torch.ones(1, dtype=torch.bool)})
+    chunks, began = steps // CHUNK, time.time()
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        step, kind = _packaged(filter, frame, Path(folder))
+        chunks = chunks if kind == "compiled" else max(chunks // 10, 2)
+        run, held = Run(step, _start(step, filter)), 0
+        errors, spreads, unobserved = [], [], 0
+        for number in range(chunks):
+            truth, readings, observed = system.chunk(number)
+            if number == chunks - 1:
+                torch.manual_seed(1)
+            mean, variance = run.chunk(readings, observed)
+            seen = observed.squeeze(-1)
+            unobserved += int((~seen).sum())
+            if seen.all():
+                errors.append(float((mean - truth)[SETTLE:].square().mean()))
+                spreads.append(float(variance[SETTLE:].mean()))
+            if number == max(chunks // 10, 1):
+                held = memory()
+        grown = memory() - held
+        # The last chunk again, by a filter that starts there, under the same random numbers.
+        torch.manual_seed(1)
+        fresh = Run(step, _start(step, filter))
+        again, _ = fresh.chunk(readings, observed)
+    off = float((again - mean)[SETTLE:].abs().max())
+    first, last = errors[0], errors[-1]
+    alike = off < 1e-4 if exact else abs(float((again - truth)[SETTLE:].square().mean()) / last - 1) < 0.1
+    right = run.not_finite == 0 and grown < 16 << 20 and alike and abs(last / first - 1) < 0.25
+    return {
+        "name": name,
+        "package": kind,
+        "steps": chunks * CHUNK,
+        "unobserved": unobserved,
+        "not finite": run.not_finite,
+        "mean squared error, first chunk": first,
+        "mean squared error, last chunk": last,
+        "mean variance, first chunk": spreads[0],
+        "mean variance, last chunk": spreads[-1],
+        "largest difference from a fresh run": off,
+        "memory grown, MB": round(grown / 1e6, 2),
+        "us a step": round(1e6 * run.taken / (chunks * CHUNK), 1),
+        "right": right,
+        "seconds": round(time.time() - began, 1),
+    }
+
+
+def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
+    """A row a filter.
+
+    Args:
+        steps: of each filter.
+        done: whether a row of a name is there already.
+    """
+    for name in FILTERS:
+        if not done(name):
+            yield soak(name, steps)

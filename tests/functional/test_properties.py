@@ -1,0 +1,289 @@
+"""What holds of the mathematics for any shape, precision, scale, order of members and unit."""
+
+import math
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.properties_for_tests import BATCHES, DIMS, DTYPES, FIXED, MEMBERS, SCALES, SCHEMES, SEEDS, Draw, close
+from torch_denkf.functional import (
+    analyse,
+    crps_ensemble,
+    crps_gaussian,
+    effective_sample_size,
+    energy_score,
+    ensemble_cov,
+    ensemble_mean,
+    ensemble_var,
+    gaussian_log_prob,
+    inflate,
+    kalman_predict,
+    kalman_update,
+    relax_to_prior_spread,
+    sigma_points,
+    soft_resample,
+    systematic_resample,
+    transport_resample,
+    unicycle_move,
+    unscented_moments,
+    unscented_weights,
+    weighted_mean,
+    weighted_var,
+    wrap_angles,
+)
+
+SPACES = st.sampled_from(["observation", "ensemble"])
+
+
+class Problem:
+    """An analysis of random numbers."""
+
+    def __init__(self, seed, batch, members, states, readings, dtype=torch.float64):
+        draw = Draw(seed, dtype)
+        self.draw = draw
+        self.forecast = 2 + draw.normal(*batch, members, states)
+        self.predicted = self.forecast @ draw.normal(*batch, readings, states).mT
+        self.samples = draw.normal(*batch, members, readings)
+        self.noise = 0.1 + draw.normal(*batch, readings).square()
+        self.perturbation = draw.normal(*batch, members, readings)
+
+    def analyse(self, scheme, **options):
+        if scheme == "perturbed":
+            options.setdefault("perturbation", self.perturbation)
+        given = [options.pop(name, getattr(self, name)) for name in ("forecast", "predicted", "samples", "noise")]
+        return analyse(*given, scheme=scheme, **options)
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, DIMS, SCHEMES, SPACES, DTYPES)
+def test_an_analysis_keeps_shapes_and_precision(seed, batch, members, states, readings, scheme, space, dtype):
+    result = Problem(seed, batch, members, states, readings, dtype).analyse(scheme, space=space)
+    shapes = [value.shape for value in result]
+    assert shapes == [(*batch, members, states), (*batch, readings), (*batch, 1), (*batch, 1)]
+    assert {value.dtype for value in result} == {dtype}
+    assert all(value.isfinite().all() for value in result)
+    assert (result.nis >= 0).all()
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, DIMS, SCHEMES, SPACES)
+def test_members_may_come_in_any_order(seed, batch, members, states, readings, scheme, space):
+    problem = Problem(seed, batch, members, states, readings)
+    order = problem.draw.order(members)
+    names = ("forecast", "predicted", "samples", *(["perturbation"] if scheme == "perturbed" else []))
+    shuffled = problem.analyse(scheme, space=space, **{name: getattr(problem, name)[..., order, :] for name in names})
+    plain = problem.analyse(scheme, space=space)
+    close(shuffled.ensemble, plain.ensemble[..., order, :])
+    close(shuffled.nis, plain.nis)
+    close(shuffled.log_likelihood, plain.log_likelihood)
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, DIMS, SCHEMES, SPACES, SCALES, SCALES)
+def test_an_analysis_in_other_units(seed, batch, members, states, readings, scheme, space, state_scale, scale):
+    """States in other units, readings in others: the same result in these units."""
+    problem = Problem(seed, batch, members, states, readings)
+    a, b = problem.draw.units(state_scale, states), problem.draw.units(scale, readings)
+    plain = problem.analyse(scheme, space=space)
+    other = problem.analyse(
+        scheme,
+        space=space,
+        forecast=problem.forecast * a,
+        predicted=problem.predicted * b,
+        samples=problem.samples * b,
+        noise=problem.noise * b.square(),
+    )
+    close(other.ensemble / a, plain.ensemble)
+    close(other.innovation / b, plain.innovation)
+    close(other.nis, plain.nis)
+    close(other.log_likelihood + b.log().sum(), plain.log_likelihood, atol=1e-7)
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, st.integers(2, 6), SCHEMES, SPACES, st.sampled_from([math.nan, math.inf, 1e300]))
+def test_what_is_not_observed_is_as_if_it_were_not_there(seed, batch, members, states, readings, scheme, space, junk):
+    problem = Problem(seed, batch, members, states, readings)
+    seen = problem.draw.mask(readings)
+    seen[0] = True
+    hidden = {
+        "samples": torch.where(seen, problem.samples, junk),
+        "noise": torch.where(seen, problem.noise, junk),
+        "observed": seen.expand(*batch, readings),
+    }
+    masked = problem.analyse(scheme, space=space, **hidden)
+    names = ("predicted", "samples", "perturbation") if scheme == "perturbed" else ("predicted", "samples")
+    less = {name: getattr(problem, name)[..., seen] for name in (*names, "noise")}
+    without = problem.analyse(scheme, space=space, **less)
+    close(masked.ensemble, without.ensemble)
+    close(masked.innovation[..., seen], without.innovation)
+    close(masked.log_likelihood, without.log_likelihood)
+    nothing = problem.analyse(scheme, space=space, observed=torch.zeros(*batch, 1, dtype=torch.bool))
+    assert torch.equal(nothing.ensemble, problem.forecast)
+
+
+@FIXED
+@given(SEEDS, BATCHES, DIMS, DIMS, SCALES, SCALES, DTYPES)
+def test_a_kalman_filter_in_other_units(seed, batch, states, readings, state_scale, scale, dtype):
+    draw = Draw(seed)
+    mean, cov = draw.normal(*batch, states), draw.covariance(*batch, states)
+    F, Q = draw.normal(states, states), draw.covariance(states)
+    H, R, reading = draw.normal(readings, states), draw.covariance(readings), draw.normal(*batch, readings)
+    a, b = draw.units(state_scale, states), draw.units(scale, readings)
+
+    def step(a, b, dtype):
+        outer, other = a.unsqueeze(-1) * a, b.unsqueeze(-1) * b
+        given = [mean * a, cov * outer, F * a.unsqueeze(-1) / a, Q * outer]
+        forecast = kalman_predict(*(value.to(dtype) for value in given))
+        given = [reading * b, H * b.unsqueeze(-1) / a, (R * other).expand(*batch, readings, readings)]
+        return kalman_update(*forecast, *(value.to(dtype) for value in given))
+
+    plain, scaled = step(torch.ones(states), torch.ones(readings), torch.float64), step(a, b, torch.float64)
+    outer = a.unsqueeze(-1) * a
+    close(scaled.mean / a, plain.mean, atol=1e-7)
+    close(scaled.cov / outer, plain.cov, atol=1e-7)
+    close(scaled.nis, plain.nis, rtol=1e-6, atol=1e-7)
+    assert torch.equal(scaled.cov, scaled.cov.mT)
+    assert (torch.linalg.eigvalsh(plain.cov) > -1e-9 * plain.cov.abs().max()).all()
+    single = step(torch.ones(states), torch.ones(readings), dtype)
+    assert {value.dtype for value in single} == {dtype}
+    assert [value.shape for value in single] == [value.shape for value in plain]
+
+
+@FIXED
+@given(SEEDS, BATCHES, DIMS, st.integers(2, 6))
+def test_a_kalman_filter_without_some_readings(seed, batch, states, readings):
+    draw = Draw(seed)
+    mean, cov, H = draw.normal(*batch, states), draw.covariance(*batch, states), draw.normal(readings, states)
+    R, reading, seen = draw.covariance(readings), draw.normal(*batch, readings), draw.mask(readings)
+    seen[-1] = True
+    count, hidden = int(seen.sum()), torch.where(seen, reading, math.nan)
+    every = R.expand(*batch, readings, readings)
+    masked = kalman_update(mean, cov, hidden, H, every, observed=seen.expand(*batch, readings))
+    some = R[seen][:, seen].expand(*batch, count, count)
+    without = kalman_update(mean, cov, reading[..., seen], H[seen], some)
+    close(masked.mean, without.mean)
+    close(masked.cov, without.cov)
+    close(masked.log_likelihood, without.log_likelihood)
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, SCALES)
+def test_moments_and_scores_scale_with_their_unit(seed, batch, members, states, scale):
+    draw = Draw(seed)
+    ensemble, truth, shift = draw.normal(*batch, members, states), draw.normal(*batch, states), draw.normal(states)
+    order = draw.order(members)
+    close(ensemble_cov(scale * ensemble), scale**2 * ensemble_cov(ensemble))
+    close(ensemble_cov(ensemble).diagonal(dim1=-2, dim2=-1), ensemble_var(ensemble))
+    for score in (crps_ensemble, energy_score):
+        plain = score(ensemble, truth)
+        close(score(scale * ensemble, scale * truth), scale * plain)
+        close(score(ensemble + shift, truth + shift), plain)
+        close(score(ensemble[..., order, :], truth), plain)
+        assert (score(ensemble, truth, fair=False) >= -1e-12).all()
+    mean, variance = ensemble_mean(ensemble), ensemble_var(ensemble)
+    close(crps_gaussian(scale * mean, scale**2 * variance, scale * truth), scale * crps_gaussian(mean, variance, truth))
+    cov = draw.covariance(*batch, states)
+    wider = gaussian_log_prob(scale * truth, scale * mean, scale**2 * cov) + states * math.log(scale)
+    close(wider, gaussian_log_prob(truth, mean, cov), atol=1e-7)
+
+
+@FIXED
+@given(SEEDS, BATCHES, MEMBERS, DIMS, SCALES, st.floats(1.0, 3.0), st.floats(0.0, 1.0))
+def test_inflation_keeps_the_mean(seed, batch, members, states, scale, factor, relaxation):
+    draw = Draw(seed)
+    ensemble, forecast = scale * draw.normal(*batch, members, states), scale * draw.normal(*batch, members, states)
+    inflated = inflate(ensemble, factor)
+    close(ensemble_mean(inflated), ensemble_mean(ensemble), atol=1e-7)
+    close(ensemble_var(inflated), factor**2 * ensemble_var(ensemble))
+    relaxed = relax_to_prior_spread(ensemble, forecast, relaxation)
+    wanted = (1 - relaxation) * ensemble_var(ensemble).sqrt() + relaxation * ensemble_var(forecast).sqrt()
+    close(ensemble_var(relaxed).sqrt(), wanted)
+
+
+@FIXED
+@given(SEEDS, BATCHES, DIMS, SCALES, SCALES, DTYPES)
+def test_sigma_points_have_the_moments(seed, batch, states, scale, spread, dtype):
+    draw = Draw(seed)
+    mean, units = scale * draw.normal(*batch, states), draw.units(spread, states)
+    cov = draw.covariance(*batch, states) * units * units.unsqueeze(-1)
+    weights = unscented_weights(states, dtype=torch.float64)
+    points = sigma_points(mean, cov)
+    found, found_cov = unscented_moments(points, weights)
+    near = max(scale, spread)
+    torch.testing.assert_close(found / near, mean / near, rtol=1e-9, atol=1e-9)
+    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small beside the mean
+    outer = units * units.unsqueeze(-1)
+    torch.testing.assert_close(found_cov / outer, cov / outer, rtol=limit, atol=limit)
+    assert sigma_points(mean.to(dtype), cov.to(dtype)).dtype == dtype
+
+
+@FIXED
+@given(SEEDS, BATCHES, st.integers(2, 20), DIMS, SCALES, st.floats(0.0, 30.0))
+def test_resampled_particles_are_some_of_the_old_ones(seed, batch, size, states, scale, sharpness):
+    draw = Draw(seed)
+    particles = scale * draw.normal(*batch, size, states)
+    log_weights = torch.log_softmax(sharpness * draw.normal(*batch, size), -1)
+    count = effective_sample_size(log_weights)
+    assert (count > 1 - 1e-9).all()
+    assert (count < size + 1e-9).all()
+    uniform = draw.uniform(*batch, 1)
+    for chosen, weights in (
+        systematic_resample(particles, log_weights, uniform),
+        soft_resample(particles, log_weights, uniform, alpha=0.3),
+    ):
+        assert chosen.shape == particles.shape
+        same = (chosen.unsqueeze(-2) == particles.unsqueeze(-3)).all(-1).any(-1)
+        assert same.all()
+        torch.testing.assert_close(weights.logsumexp(-1), torch.zeros(batch, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+@FIXED
+@given(SEEDS, BATCHES, st.integers(2, 20), DIMS, SCALES, st.floats(0.0, 30.0))
+def test_transported_particles_keep_the_mean(seed, batch, size, states, scale, sharpness):
+    draw = Draw(seed)
+    particles, units, order = draw.normal(*batch, size, states), draw.units(scale, states), draw.order(size)
+    log_weights = torch.log_softmax(sharpness * draw.normal(*batch, size), -1)
+    moved, weights = transport_resample(particles, log_weights)
+    close(moved.mean(-2), weighted_mean(particles, log_weights))
+    torch.testing.assert_close(weights.logsumexp(-1), torch.zeros(batch, dtype=torch.float64), rtol=0, atol=1e-9)
+    close(transport_resample(particles * units, log_weights)[0] / units, moved, atol=1e-6)
+    close(transport_resample(particles[..., order, :], log_weights[..., order])[0], moved[..., order, :], atol=1e-6)
+
+
+@FIXED
+@given(SEEDS, BATCHES, st.integers(2, 20), DIMS, SCALES, st.floats(-300.0, 300.0))
+def test_weighted_moments(seed, batch, size, states, scale, shift):
+    draw = Draw(seed)
+    particles, raw = draw.normal(*batch, size, states), draw.normal(*batch, size)
+    log_weights, order = torch.log_softmax(raw, -1), draw.order(size)
+    mean, variance = weighted_mean(particles, log_weights), weighted_var(particles, log_weights)
+    close(weighted_mean(particles[..., order, :], log_weights[..., order]), mean)
+    close(weighted_mean(scale * particles, log_weights), scale * mean)
+    close(weighted_var(scale * particles, log_weights), scale**2 * variance)
+    close(weighted_mean(particles, torch.log_softmax(raw + shift, -1)), mean)
+    assert (variance >= 0).all()
+
+
+@FIXED
+@given(SEEDS, BATCHES, SCALES, st.floats(1e-3, 10.0))
+def test_a_vehicle_in_other_units(seed, batch, scale, dt):
+    draw = Draw(seed)
+    pose, velocity = draw.normal(*batch, 3), draw.normal(*batch, 2)
+    lengths, speeds = torch.tensor([scale, scale, 1.0]), torch.tensor([scale, 1.0])
+    plain, other = unicycle_move(pose, velocity, dt), unicycle_move(pose * lengths, velocity * speeds, dt)
+    torch.testing.assert_close(other / lengths, plain, rtol=1e-9, atol=1e-9)
+    there = unicycle_move(unicycle_move(pose, velocity, dt / 2), velocity, dt / 2)
+    torch.testing.assert_close(there[..., 2], plain[..., 2], rtol=1e-9, atol=1e-9)
+
+
+@FIXED
+@given(SEEDS, BATCHES, st.integers(1, 6), st.integers(-1000, 1000))
+def test_wrapped_angles(seed, batch, size, turns):
+    draw = Draw(seed)
+    angles = math.pi * (2 * draw.uniform(*batch, size) - 1)
+    wrapped = wrap_angles(angles + 2 * math.pi * turns, list(range(size)))
+    assert (wrapped >= -math.pi - 1e-9).all()
+    assert (wrapped <= math.pi + 1e-9).all()
+    off = torch.remainder(wrapped - angles + math.pi, 2 * math.pi) - math.pi
+    torch.testing.assert_close(off, torch.zeros_like(off), rtol=0, atol=1e-9)
