@@ -15,6 +15,7 @@ Source: github.com/huggingface/lerobot, ``lerobot.datasets``.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
@@ -30,6 +31,7 @@ from torch_denkf.data.pictures import decode_picture
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
 MOST_ROWS = 10**8  # of a data set: 38 days at 30 a second
 COMPLETE = "download the data set completely"
+_WIDTH = re.compile(r"0?\d{0,2}d?")
 
 
 @dataclass(frozen=True)
@@ -259,26 +261,6 @@ def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
             f"{file} has a path {name!r}, {template!r}, that cannot be filled in: {error}; download it anew"
         ) from error
     return stay_inside(root, path, f"{file}, by {name!r},")
-
-
-def stay_inside(root: Path, path: str, source: str) -> Path:
-    """A path below a folder, as metadata name it.
-
-    Args:
-        root: the folder.
-        path: relative to it.
-        source: what names the path, for the message.
-
-    Raises:
-        ValueError: if it is absolute and elsewhere, or leads out of the folder.
-    """
-    file = root / path
-    if ".." in Path(path).parts or not file.is_relative_to(root) or "\0" in path:
-        raise ValueError(
-            f"{source} names a file outside of the data set, {path!r}; such a data set may read anything of yours: "
-            "download it from where you trust it, or correct the path"
-        )
-    return file
 
 
 def read_table(file: Path, columns: list[str] | None = None):
