@@ -158,8 +158,9 @@ class Baselines:
         if name == "held":
             first = self.var.expand_as(truth[:, 0])
             return hold_last(read, seen, self.start.expand_as(truth[:, 0])), hold_last(var, seen, first)
-        if name == "sensor":  # it knows nothing where it sees nothing
-            return torch.where(seen, read, self.mean), torch.where(seen, var, self.var)
+        if name == "sensor":  # it knows nothing where no picture arrives
+            there = readings["arrived"]
+            return torch.where(there, read, self.mean), torch.where(there, var, self.var)
         raise ValueError(f"there is no baseline {name!r}; there are {self.names}")
 
 

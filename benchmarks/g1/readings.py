@@ -132,6 +132,7 @@ def with_readings(
     ``motion``              [N,T,2D]        with rates
     ``action``              [N,T,2D]        commands, see :func:`benchmarks.g1.motion.delayed`
     ``encoders``            [N,T,E,K]       noisy readings of the joints that have an encoder
+    ``arrived``             [N,T,1]         False where there is no picture, not even a repeat
     ``start``               [N,T,D]         where episodes begin on average
     ======================= =============== ===========================================================================
     """
@@ -143,6 +144,7 @@ def with_readings(
         ensembles.append(samples[..., dims].clone())
         encodings.append(encoding)
     out = codes.select("observed", "valid")
+    out["arrived"] = out["valid"].clone()
     truth, command = codes["truth"][..., dims], codes["command"][..., dims]
     out["sensor"] = TensorDict(
         {"ensemble": torch.cat(ensembles), "encoding": torch.cat(encodings)}, batch_size=out.batch_size
@@ -174,16 +176,26 @@ def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
 def fail(readings: TensorDict, condition: str, black: TensorDict, seed: int = 0) -> TensorDict:
     """A copy of clean readings ``[N, T]`` whose camera fails: frames do not arrive, or are black."""
     count, steps = readings.shape
-    out, seen = readings.copy(), readings["observed"].clone()
     if condition == "missing":
         lost = torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING
-        return out.set("observed", seen & ~lost)
+        return without(readings, lost)
     begin = blackouts(readings["valid"].sum((1, 2)), seed).unsqueeze(-1)
     step = torch.arange(steps)
     dark = ((step >= begin) & (step < begin + BLACK)).unsqueeze(-1)
     if condition == "black20":
-        return out.set("observed", seen & ~dark)
-    return with_black(out, dark, black)
+        return without(readings, dark)
+    return with_black(readings, dark, black)
+
+
+def without(readings: TensorDict, lost: Tensor) -> TensorDict:
+    """Readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
+    out = readings.copy()
+    for key in ("observed", "arrived"):
+        out[key] = out[key] & ~lost
+    sensor = readings["sensor"].copy()
+    sensor["ensemble"] = torch.where(lost.unsqueeze(-1), 0.0, sensor["ensemble"])
+    sensor["encoding"] = torch.where(lost, 0.0, sensor["encoding"])
+    return out.set("sensor", sensor)
 
 
 def with_black(readings: TensorDict, dark: Tensor, black: TensorDict) -> TensorDict:
@@ -246,7 +258,7 @@ class Windows:
         begin = 1 + (draw(1) * (length - 1)).long()
         kind, step = draw(1, 1), torch.arange(length)
         stretch = ((step >= begin) & (step < begin + (draw(1) * (BLACK + 1)).long())).unsqueeze(-1)
-        windows["observed"] = windows["observed"] & ~lost & ~(stretch & (kind < 0.17))
+        windows = without(windows, lost | (stretch & (kind < 0.17)))
         windows = with_black(windows, stretch & (kind > 0.83), self.black)
         windows["padded"] = pad(windows["motion"], (0, padding))
         size = self.target.size

@@ -174,7 +174,7 @@ def run_all(study: Study) -> None:
                     run_jobs(study, sorted(chosen), sensor, TARGETS[state])
 
 
-SHORT = {"arm": {"denkf"}, "hand": {"denkf", "denkfactions", "dekf", "lstm"}}  # what the other tables show
+SHORT = {"arm": {"denkf"}, "hand": {"denkf", "denkfactions"}}  # what the other tables show
 
 
 def run_jobs(study: Study, filters: Sequence[str], sensor: TrainedSensor, target: Target) -> None:

@@ -17,7 +17,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.training import Stage
 
-INFLATIONS = (0.6, 0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.1)
+INFLATIONS = (0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def run_filter(model: Filter, readings: TensorDict) -> tuple[Tensor, Tensor]:
     """Means and variances ``[N, T, S]`` of a filter, from where episodes begin on average."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        out = model.sequence(readings.exclude("motion", "valid", "state"))
+        out = model.sequence(readings.exclude("motion", "valid", "state", "arrived"))
     return out["belief", "mean"], out["belief", "var"]
 
 
@@ -103,7 +103,7 @@ def train_filter(
         seed=seed,
         device="cpu",
         monitor="crps",
-        validate_every=max(budget.filter // 4, 1),
+        validate_every=max(budget.filter // 2, 1),
         save_every=100,
     )
     return model

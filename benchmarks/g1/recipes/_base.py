@@ -7,7 +7,7 @@ from copy import deepcopy
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from benchmarks.common.recipes import Recipe, Registry
 from benchmarks.g1.motion import FADING, AtRest, BiasedReading, Motion, transition
@@ -21,6 +21,26 @@ MEMBERS = 64  # of the ensemble filters, which read as many samples of the senso
 
 FILTERS = Registry()
 register = FILTERS.register
+
+
+class RatesAndBias(SubModel):
+    """Q of the rates from the belief's mean, and of the biases from what the sensor sees.
+
+    A box over the hand makes a sensor wrong for as long as it is there: then the bias is large, not only R.
+
+    Args:
+        rates: reads the belief's mean.
+        bias: reads the sensor's encoding.
+    """
+
+    def __init__(self, rates: DiagonalNoise, bias: DiagonalNoise):
+        parts = nn.ModuleDict({"rates": rates, "bias": bias})
+        super().__init__(parts, [*rates.in_keys, *bias.in_keys], rates.out_keys)
+
+    def compute(self, mean, encoding, *, batch_size):
+        """Variances ``[*B, 2D]``."""
+        rates = self.module["rates"].compute(mean, batch_size=batch_size)
+        return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 
 
 class G1Recipe(Recipe):
@@ -83,16 +103,28 @@ class G1Recipe(Recipe):
         return ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> SubModel:
-        motion, blind = self.motion, self.size - 2 * self.target.size
-        return DiagonalNoise(
-            len(self.noisy),
-            r=self.process_std,
+        motion, size = self.motion, self.target.size
+        blind = self.size - 2 * size
+        rates = DiagonalNoise(
+            size,
+            r=self.process_std[:size],
             in_features=self.size,
-            loc=torch.cat([motion.loc, torch.zeros(self.target.size + blind)]),
+            loc=torch.cat([motion.loc, torch.zeros(size + blind)]),
             scale=torch.cat([motion.scale, motion.rate, torch.full((blind,), torch.inf)]),
             in_key=("belief", "mean"),
             out_key=("forecast", "noise"),
         )
+        if not self.bias:
+            return rates
+        slow = DiagonalNoise(
+            size,
+            r=self.process_std[size:],
+            num_cells=(32, 32),
+            in_features=self.encoding,
+            in_key=("sensor", "encoding"),
+            out_key=("forecast", "noise"),
+        )
+        return RatesAndBias(rates, slow)
 
     @property
     def state_scale(self) -> Tensor:
