@@ -169,9 +169,10 @@ def run_all(study: Study) -> None:
         for kind in study.sensors:
             sensor = TrainedSensor(study, kind, seed, study.sensor_budget)
             for state in study.states:
-                chosen = study.filters if (kind, state) == (FIRST, "arm") else set(study.filters) & SHORT[state]
+                every = (kind, state) == (FIRST, "arm")
                 if kind == FIRST or state == "arm":
-                    run_jobs(study, sorted(chosen), sensor, TARGETS[state])
+                    chosen = [name for name in study.filters if every or name in SHORT[state]]
+                    run_jobs(study, chosen, sensor, TARGETS[state])
 
 
 SHORT = {"arm": {"denkf"}, "hand": {"denkf", "denkfactions"}}  # what the other tables show
