@@ -43,11 +43,11 @@ FIRST = "glimpse"  # the sensor that all filters read
 class Study(Recordings):
     """A real arm that its head camera watches: seven joints and a hand, with every filter that is registered.
 
-    table: estimate the lag, train sensors and filters, test. pictures: plots and videos of what a table left in --out.
-    What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
+    and videos of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
     """
 
-    command: Positional[Literal["table", "pictures"]] = "table"
+    command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
     sensors: some_of(sorted(SENSORS)) = (FIRST, "paper")
     states: some_of(sorted(TARGETS)) = ("arm", "hand")
