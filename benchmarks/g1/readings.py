@@ -216,23 +216,22 @@ def with_black(readings: TensorDict, dark: Tensor, black: TensorDict) -> TensorD
 
 
 class Windows:
-    """Draws windows of readings, with failing cameras, that begin from a wrong state.
+    """Draws windows of readings, with failing cameras, that begin where the sensor says.
 
     Args:
         readings: of the tuning episodes ``[N, T]``, by condition.
         black: of a black frame.
         length: of the windows.
-        target: what is estimated.
     """
 
-    def __init__(self, readings: dict[str, TensorDict], black: TensorDict, length: int, target: Target):
+    def __init__(self, readings: dict[str, TensorDict], black: TensorDict, length: int):
         self.all = torch.stack([readings[name] for name in PICTURES])
-        self.black, self.length, self.target = black, length, target
+        self.black, self.length = black, length
         self.lengths = readings["clean"]["valid"].sum((1, 2))
         if length > int(self.lengths.min()):
             raise ValueError(f"windows of {length} rows do not fit in an episode of {int(self.lengths.min())}")
 
-    def sample(self, generator: torch.Generator, batch: int, error: Tensor, padding: int) -> TensorDict:
+    def sample(self, generator: torch.Generator, batch: int, padding: int) -> TensorDict:
         """Windows ``[batch, length]``.
 
         Half are clean. In half of them up to half of the frames are missing; in a sixth each a stretch is missing, or
@@ -241,7 +240,6 @@ class Windows:
         Args:
             generator: of all random numbers.
             batch: how many.
-            error: how wrong they begin, ``[D]``.
             padding: numbers of the filters' state beyond place and rates.
         """
         length = self.length
@@ -254,6 +252,9 @@ class Windows:
         first = (draw() * (self.lengths[episode] - length + 1)).long()
         rows = first.unsqueeze(-1) + torch.arange(length)
         windows = self.all[which.unsqueeze(-1), episode.unsqueeze(-1), rows]
+        # A belief in the middle of an episode is as wrong as its sensor has been for a while. A start that errs by
+        # itself would teach a filter to hold on to it.
+        start = windows["sensor", "ensemble"][:, 0].mean(-2)
         lost = draw(length, 1) < draw(1, 1) - 0.5
         begin = 1 + (draw(1) * (length - 1)).long()
         kind, step = draw(1, 1), torch.arange(length)
@@ -261,7 +262,5 @@ class Windows:
         windows = without(windows, lost | (stretch & (kind < 0.17)))
         windows = with_black(windows, stretch & (kind > 0.83), self.black)
         windows["padded"] = pad(windows["motion"], (0, padding))
-        size = self.target.size
-        noise = torch.randn(batch, 1, size, generator=generator)
-        windows["start"] = windows["motion"][..., :size] + error * noise
+        windows["start"] = start.unsqueeze(1).expand_as(windows["state"])
         return windows

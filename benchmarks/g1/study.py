@@ -150,7 +150,7 @@ class Base:
         recipe = kind(
             self.target, facts, self.motion(kind.actions), self.error, self.start.std(0).clamp_min(1e-3), encoding
         )
-        windows = Windows(self.tune, self.black, self.study.budget.length, self.target)
+        windows = Windows(self.tune, self.black, self.study.budget.length)
         out = self.study.out / "filters" / f"{name}-{self.name}"
         model = train_filter(
             recipe, windows, joined(self.validation), out=out, seed=self.trained.seed, budget=self.study.budget

@@ -25,9 +25,9 @@ class FilterBudget:
     """Updates of each stage; the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
-    filter: int = 120  # updates of a filter on readings
-    length: int = 24  # rows of the filter's windows
-    batch: int = 16  # windows an update
+    filter: int = 80  # updates of a filter on readings
+    length: int = 40  # rows of the filter's windows
+    batch: int = 12  # windows an update
 
 
 @torch.no_grad()
@@ -86,9 +86,9 @@ def train_filter(
             Stage(
                 "filter",
                 recipe.loss(recipe.for_training(model)),
-                lambda generator, _: windows.sample(generator, budget.batch, 1.5 * recipe.error, padding),
+                lambda generator, _: windows.sample(generator, budget.batch, padding),
                 budget.filter,
-                lr=5e-3,
+                lr=3e-3,
                 validate=lambda: filter_error(recipe, model, validation),
             )
         ]
@@ -103,7 +103,7 @@ def train_filter(
         seed=seed,
         device="cpu",
         monitor="crps",
-        validate_every=max(budget.filter // 2, 1),
+        validate_every=max(budget.filter // 4, 1),
         save_every=100,
     )
     return model

@@ -16,7 +16,8 @@ from benchmarks.g1.targets import Target
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, LearnedObservation, ScaledNoise, SubModel
 
-WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
+# Of the sensor's errors little is new in each frame: on validation episodes neighbours correlate by 0.97 to 0.98.
+WHITE, SLOW = 0.2, 0.98  # 0.2^2 + 0.98^2 = 1
 MEMBERS = 64  # of the ensemble filters, which read as many samples of the sensor
 
 FILTERS = Registry()
@@ -72,7 +73,12 @@ class G1Recipe(Recipe):
 
     def noise(self):
         keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding")}
-        return ScaledNoise(DiagonalNoise(self.target.size, r=WHITE * self.error, num_cells=(32, 32), **keys))
+        return ScaledNoise(DiagonalNoise(self.target.size, r=self.white * self.error, num_cells=(16,), **keys))
+
+    @property
+    def white(self) -> float:
+        """What R holds of the sensor's errors before training: all, where the state holds no bias."""
+        return WHITE if self.bias else 1.0
 
     @property
     def size(self) -> int:
@@ -95,7 +101,7 @@ class G1Recipe(Recipe):
     @property
     def process_std(self) -> Tensor:
         """What motion and bias do not know before training: usual accelerations; biases stay as large."""
-        slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
+        slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
         return torch.cat([self.motion.acceleration, slow])[: len(self.noisy)]
 
     def process_noise(self) -> SubModel:
@@ -119,7 +125,7 @@ class G1Recipe(Recipe):
         slow = DiagonalNoise(
             size,
             r=self.process_std[size:],
-            num_cells=(32, 32),
+            num_cells=(16,),
             in_features=self.encoding,
             in_key=("sensor", "encoding"),
             out_key=("forecast", "noise"),
@@ -132,7 +138,7 @@ class G1Recipe(Recipe):
         return torch.cat([self.unit, torch.full((self.size - self.target.size,), torch.inf)])
 
     def _initial(self, std: Tensor, rates: float) -> TensorDictModuleBase:
-        whole = torch.cat([std, rates * self.motion.rate, WHITE * self.error])[: self.size]
+        whole = torch.cat([std, rates * self.motion.rate, SLOW * self.error])[: self.size]
         return AtRest(self.belief(whole), self.size)
 
     def build(self) -> Filter:
@@ -140,6 +146,6 @@ class G1Recipe(Recipe):
         return Filter(self.modules(), initial=self._initial(self.start, 0.3))
 
     def for_training(self, model: Filter) -> Filter:
-        """The same filter, sharing all parameters, for windows that begin at a wrong state."""
+        """The same filter, sharing all parameters, for windows that begin where the sensor says."""
         parts = OrderedDict((name, model[name]) for name in model.module)
-        return Filter(parts, initial=self._initial(1.5 * self.error, 1.0))
+        return Filter(parts, initial=self._initial(self.error, 1.0))
