@@ -30,7 +30,8 @@ def diagnose(sensor: TrainedSensor) -> list[str]:
     for role in ("tune", "validation"):
         file = sensor.recordings.out / "codes" / f"{sensor.name}-{role}-clean.pt"
         numbers = getattr(sensor.roles, role)
-        unseen = read_codes(model, data, sensor.hand, numbers, condition="clean", exact=False, file=file)
+        hand = None if file.exists() else sensor.hand
+        unseen = read_codes(model, data, hand, numbers, condition="clean", exact=False, file=file)
         for one in unseen:
             at = one["valid"].squeeze(-1)
             read = read_code(model, one["code"][at], SAMPLES, generator)[0].mean(-2)[:, : len(ARM)]

@@ -61,14 +61,14 @@ def failing(pixels: Tensor, place: Tensor, condition: str, draw: Tensor, exact: 
 def read_codes(
     sensor: ImageSensor,
     data: LeRobotReplay,
-    hand: HandPlace,
+    hand: HandPlace | None,
     numbers: Sequence[int],
     *,
     condition: str,
     exact: bool,
     file: Path,
 ) -> TensorDict:
-    """Features of all frames of some episodes ``[N, T]``, the shorter ones filled up; kept in ``file``.
+    """Features of all frames of some episodes ``[N, T]``, the shorter ones filled up; kept in ``file``; where that is there, the place of the hand is not needed.
 
     ================ ============= ====================================================================================
     ``code``         [N,T,F]       of the sensor's trunk
@@ -81,6 +81,8 @@ def read_codes(
     if file.exists():
         saved = read_checkpoint(file)
         return TensorDict(saved, batch_size=saved["code"].shape[:2])
+    if hand is None:
+        raise ValueError(f"there is no {file}; pass the place of the hand, to read the pictures")
     by_number, parts = {episode.number: episode for episode in data.episodes}, []
     longest = max(by_number[number].length for number in numbers)
     for number in numbers:
@@ -216,7 +218,7 @@ def with_black(readings: TensorDict, dark: Tensor, black: TensorDict) -> TensorD
 
 
 class Windows:
-    """Draws windows of readings, with failing cameras, that begin where the sensor says.
+    """Draws windows of readings, with failing cameras, that begin near what the sensor says.
 
     Args:
         readings: of the tuning episodes ``[N, T]``, by condition.
@@ -231,7 +233,7 @@ class Windows:
         if length > int(self.lengths.min()):
             raise ValueError(f"windows of {length} rows do not fit in an episode of {int(self.lengths.min())}")
 
-    def sample(self, generator: torch.Generator, batch: int, padding: int) -> TensorDict:
+    def sample(self, generator: torch.Generator, batch: int, error: Tensor, padding: int) -> TensorDict:
         """Windows ``[batch, length]``.
 
         Half are clean. In half of them up to half of the frames are missing; in a sixth each a stretch is missing, or
@@ -240,6 +242,7 @@ class Windows:
         Args:
             generator: of all random numbers.
             batch: how many.
+            error: how far they begin from what the sensor says, ``[D]``.
             padding: numbers of the filters' state beyond place and rates.
         """
         length = self.length
@@ -252,9 +255,9 @@ class Windows:
         first = (draw() * (self.lengths[episode] - length + 1)).long()
         rows = first.unsqueeze(-1) + torch.arange(length)
         windows = self.all[which.unsqueeze(-1), episode.unsqueeze(-1), rows]
-        # A belief in the middle of an episode is as wrong as its sensor has been for a while. A start that errs by
-        # itself would teach a filter to hold on to it.
+        # The start must say less than the sensor, or a filter learns to hold on to it, which fails in whole episodes.
         start = windows["sensor", "ensemble"][:, 0].mean(-2)
+        start = start + error * torch.randn(start.shape, generator=generator)
         lost = draw(length, 1) < draw(1, 1) - 0.5
         begin = 1 + (draw(1) * (length - 1)).long()
         kind, step = draw(1, 1), torch.arange(length)

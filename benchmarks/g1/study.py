@@ -92,7 +92,8 @@ class Base:
         for condition in PICTURES:
             file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
             exact = role == "test"
-            codes = read_codes(sensor, study.data, trained.hand, numbers, condition=condition, exact=exact, file=file)
+            hand = None if file.exists() else trained.hand
+            codes = read_codes(sensor, study.data, hand, numbers, condition=condition, exact=exact, file=file)
             out[condition] = with_readings(sensor, codes, self.target, MEMBERS, self.start.mean(0))
         for condition in set(CONDITIONS) - set(PICTURES):
             out[condition] = fail(out["clean"], condition, self.black)

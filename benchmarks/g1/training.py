@@ -25,9 +25,9 @@ class FilterBudget:
     """Updates of each stage; the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
-    filter: int = 80  # updates of a filter on readings
-    length: int = 40  # rows of the filter's windows
-    batch: int = 12  # windows an update
+    filter: int = 60  # updates of a filter on readings
+    length: int = 64  # rows of the filter's windows
+    batch: int = 8  # windows an update
 
 
 @torch.no_grad()
@@ -86,9 +86,9 @@ def train_filter(
             Stage(
                 "filter",
                 recipe.loss(recipe.for_training(model)),
-                lambda generator, _: windows.sample(generator, budget.batch, padding),
+                lambda generator, _: windows.sample(generator, budget.batch, recipe.error, padding),
                 budget.filter,
-                lr=3e-3,
+                lr=2e-3,
                 validate=lambda: filter_error(recipe, model, validation),
             )
         ]

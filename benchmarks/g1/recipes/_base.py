@@ -18,7 +18,7 @@ from torch_denkf.modules import DiagonalNoise, LearnedObservation, ScaledNoise, 
 
 # Of the sensor's errors little is new in each frame: on validation episodes neighbours correlate by 0.97 to 0.98.
 WHITE, SLOW = 0.2, 0.98  # 0.2^2 + 0.98^2 = 1
-MEMBERS = 64  # of the ensemble filters, which read as many samples of the sensor
+MEMBERS = 128  # of the ensemble filters, which read as many samples of the sensor
 
 FILTERS = Registry()
 register = FILTERS.register
@@ -146,6 +146,6 @@ class G1Recipe(Recipe):
         return Filter(self.modules(), initial=self._initial(self.start, 0.3))
 
     def for_training(self, model: Filter) -> Filter:
-        """The same filter, sharing all parameters, for windows that begin where the sensor says."""
+        """The same filter, sharing all parameters, for windows that begin near what the sensor says."""
         parts = OrderedDict((name, model[name]) for name in model.module)
-        return Filter(parts, initial=self._initial(self.error, 1.0))
+        return Filter(parts, initial=self._initial(2**0.5 * self.error, 1.0))
