@@ -25,7 +25,7 @@ class FilterBudget:
     """Updates of each stage; the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
-    filter: int = 60  # updates of a filter on readings
+    filter: int = 45  # updates of a filter on readings
     length: int = 64  # rows of the filter's windows
     batch: int = 8  # windows an update
 
@@ -79,7 +79,7 @@ def train_filter(
     """
     torch.manual_seed(seed)
     model = recipe.build()
-    padding = recipe.size - 2 * recipe.target.size
+    padding, updates = recipe.size - 2 * recipe.target.size, budget.filter * recipe.longer
 
     def stages() -> list[Stage]:
         return [
@@ -87,7 +87,7 @@ def train_filter(
                 "filter",
                 recipe.loss(recipe.for_training(model)),
                 lambda generator, _: windows.sample(generator, budget.batch, recipe.error, padding),
-                budget.filter,
+                updates,
                 lr=2e-3,
                 validate=lambda: filter_error(recipe, model, validation),
             )
@@ -103,7 +103,7 @@ def train_filter(
         seed=seed,
         device="cpu",
         monitor="crps",
-        validate_every=max(budget.filter // 4, 1),
+        validate_every=max(updates // 3, 1),
         save_every=100,
     )
     return model

@@ -17,7 +17,8 @@ from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, LearnedObservation, ScaledNoise, SubModel
 
 # Of the sensor's errors little is new in each frame: on validation episodes neighbours correlate by 0.97 to 0.98.
-WHITE, SLOW = 0.2, 0.98  # 0.2^2 + 0.98^2 = 1
+WHITE, SLOW = 0.4, 0.92  # 0.4^2 + 0.92^2 = 1
+SURPRISE = 3.0  # changes of a rate, of those in the training episodes: what comes next is not white. See the README.
 MEMBERS = 128  # of the ensemble filters, which read as many samples of the sensor
 
 FILTERS = Registry()
@@ -61,6 +62,7 @@ class G1Recipe(Recipe):
     encoders = False  # whether some joints have noisy encoders
     bias = True  # whether the state holds the sensor's slow errors
     members = MEMBERS
+    longer = 1  # times as many updates as others
 
     def __init__(self, target: Target, facts: Statistics, motion: Motion, error: Tensor, start: Tensor, encoding: int):
         self.target, self.facts, self.motion = target, facts, deepcopy(motion)
@@ -100,9 +102,9 @@ class G1Recipe(Recipe):
 
     @property
     def process_std(self) -> Tensor:
-        """What motion and bias do not know before training: usual accelerations; biases stay as large."""
+        """What motion and bias do not know before training: accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
-        return torch.cat([self.motion.acceleration, slow])[: len(self.noisy)]
+        return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
 
     def process_noise(self) -> SubModel:
         """Q of rates and bias, from the belief's mean."""
