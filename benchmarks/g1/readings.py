@@ -68,7 +68,9 @@ def read_codes(
     exact: bool,
     file: Path,
 ) -> TensorDict:
-    """Features of all frames of some episodes ``[N, T]``, the shorter ones filled up; kept in ``file``; where that is there, the place of the hand is not needed.
+    """Features of all frames of some episodes ``[N, T]``, the shorter ones filled up; kept in ``file``.
+
+    Where that is there, the place of the hand is not needed.
 
     ================ ============= ====================================================================================
     ``code``         [N,T,F]       of the sensor's trunk

@@ -27,9 +27,10 @@ COLUMNS = Columns(
 )
 FAIRNESS = (
     "All filters of a seed read the same sensor, begin with the same learned motion, and learn from the same windows "
-    "with as many updates (the LSTM, which knows no motion, with six times as many). Each has one number (a factor on the noise, or tempering of weights) chosen from the same "
-    "seven values for the coverage on the same validation episodes, over all conditions. `sensor` reads every picture, "
-    "repeats too, and knows the mean pose alone where none arrives; `held` holds its last reading there."
+    "with as many updates (the LSTM, which knows no motion, with six times as many). Each has one number (a factor on "
+    "the noise, or tempering of weights) chosen from the same seven values for the coverage on the same validation "
+    "episodes, over all conditions. `sensor` reads every picture, repeats too, and knows the mean pose alone where "
+    "none arrives; `held` holds its last reading there."
 )
 
 
