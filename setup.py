@@ -57,6 +57,8 @@ setup(
         # torch_denkf.plots.log_rollout alone: 500 MB.
         "viewer": ["rerun-sdk>=0.23"],
         "examples": ["matplotlib", "tensorboard"],
+        # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
+        "hub": ["huggingface_hub>=1.0"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
@@ -83,6 +85,7 @@ setup(
             "tyro",
             "pyarrow>=15",
             "av>=14",
+            "huggingface_hub>=1.0",
             "pytest",
             "pytest-xdist",
             "ruff",

@@ -11,6 +11,7 @@ from . import (
     plots,
     pretrained,
     simulation,
+    smoothers,
     training,
     transforms,
     vision,
@@ -42,6 +43,7 @@ from .filters import (
 )
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
+from .smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
 from .training import FilterTrainer, Stage
 from .transforms import (
     BlackFrames,
@@ -70,6 +72,7 @@ __all__ = [
     "plots",
     "pretrained",
     "simulation",
+    "smoothers",
     "training",
     "transforms",
     "vision",
@@ -82,9 +85,13 @@ __all__ = [
     "DEnKFTransform",
     "DPF",
     "EKF",
+    "EnKS",
+    "EnRTS",
     "Filter",
     "FilterTrainer",
+    "FixedLag",
     "GaussianLoss",
+    "IEnKS",
     "Images",
     "KITTIOdometryExperienceReplay",
     "KITTIReplayEnv",
@@ -102,6 +109,8 @@ __all__ = [
     "PFM",
     "PackagedStep",
     "ParticleFilter",
+    "ParticleSmoother",
+    "RTSSmoother",
     "Recording",
     "RecordingReplay",
     "ReplayEnv",

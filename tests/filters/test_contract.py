@@ -6,6 +6,7 @@ shown in each filter's own file, against a Kalman filter.
 
 import pickle
 from copy import deepcopy
+from functools import partial
 
 import pytest
 import torch
@@ -19,10 +20,11 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.filters import LSTMFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation
+from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms import DEnKFTransform
 
 
-def particles(scheme):
+def particles(scheme, **kwargs):
     F, Q, H, R = linear_system()
     return ParticleFilter(
         NoisyLinear(F, torch.linalg.cholesky(Q)),
@@ -32,6 +34,7 @@ def particles(scheme):
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=16),
         resampling=scheme,
+        **kwargs,
     )
 
 
@@ -49,11 +52,15 @@ FILTERS = {
     "UKF": lambda: linear_filter("UKF"),
     "Backprop KF": lambda: linear_filter("BackpropKF"),
     "particles, systematic": lambda: particles("systematic"),
+    "particles, jitter": lambda: particles("systematic", jitter=0.7, ess_threshold=0.5),
     "particles, soft": lambda: particles("soft"),
     "particles, transport": lambda: particles("transport"),
     "LSTM": lambda: lstm(),
 }
+LAGGED = ("DEnKF etkf", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
+FILTERS |= {f"{name}, lag": partial(lambda inner: FixedLag(inner(), 3), FILTERS[name]) for name in LAGGED}
 FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}  # of their own
+FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)
 
 
@@ -152,7 +159,7 @@ def test_unobserved_doubt_grows_and_a_reading_shrinks_it(float64, name):
     spread = filter.sequence(frames)["belief", "var"].sum(-1).mean(0)
     if name == "LSTM":  # that it must learn
         return
-    if name == "DEnKF etkf":  # without process noise its members come together
+    if name.startswith("DEnKF etkf"):  # without process noise its members come together
         assert spread[5] < spread[4]
         return
     assert spread[2] < spread[3] < spread[4] > spread[5]

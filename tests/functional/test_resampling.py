@@ -13,6 +13,7 @@ from torch_denkf.functional import (
     effective_sample_size,
     ensemble_mean,
     ensemble_var,
+    jitter_copies,
     soft_resample,
     systematic_resample,
     transport_resample,
@@ -281,3 +282,52 @@ def test_compiled_equals_eager():
     inputs = *problem((3,)), torch.rand(3, 1)
     compiled = torch.compile(everything, fullgraph=True, backend="aot_eager")(*inputs)
     torch.testing.assert_close(compiled, everything(*inputs))
+
+
+def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
+    generator = torch.Generator().manual_seed(0)
+    size = 200_000
+    root = torch.tensor([[2.0, 0.5], [0.0, 1.0]], dtype=torch.float64)
+    particles = torch.randn(size, 2, generator=generator, dtype=torch.float64) @ root
+    log_weights = torch.zeros(size, dtype=torch.float64).log_softmax(-1)
+    picked = particles[:1].expand(size, 2)
+    normal = torch.randn(size, 2, generator=generator, dtype=torch.float64)
+    moved = jitter_copies(picked, particles, log_weights, normal, factor=0.7)
+    assert moved[0].equal(particles[0]), "one of each particle stays"
+    width = 0.7 * size ** (-1 / 6)
+    expected = width**2 * torch.cov(particles.T)
+    torch.testing.assert_close(torch.cov((moved[1:] - particles[0]).T), expected, rtol=0.02, atol=1e-5)
+
+
+def test_jitter_of_few_effective_particles_is_wide_and_unbiased():
+    """Two of four particles have all the weight: their distance is the spread, and N is two."""
+    particles = torch.tensor([[0.0], [2.0], [50.0], [-70.0]], dtype=torch.float64)
+    log_weights = torch.tensor([0.5, 0.5, 1e-300, 1e-300], dtype=torch.float64).log()
+    picked = particles[[0, 0, 1, 1]]
+    moved = jitter_copies(picked, particles, log_weights, torch.ones(4, 1, dtype=torch.float64), factor=1.0)
+    shift = 2**0.5 * 2 ** (-1 / 5)  # the standard deviation of {0, 2} with n - 1, times the kernel's width
+    torch.testing.assert_close(moved - picked, torch.tensor([[0.0], [shift], [0.0], [shift]], dtype=torch.float64))
+    alone = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).log()
+    moved = jitter_copies(particles[[0, 0, 0, 0]], particles, alone, torch.ones(4, 1, dtype=torch.float64))
+    torch.testing.assert_close(moved[1:], particles.std().expand(3, 1))
+
+
+def test_jitter_is_zero_without_copies_or_factor():
+    particles, log_weights = torch.randn(5, 4, 2), torch.randn(5, 4).log_softmax(-1)
+    normal = torch.randn(5, 4, 2)
+    assert jitter_copies(particles, particles, log_weights, normal).equal(particles)
+    copies = particles[:, :1].expand_as(particles)
+    assert jitter_copies(copies, particles, log_weights, normal, factor=0.0).equal(copies)
+    with pytest.raises(ValueError, match="0 or more"):
+        jitter_copies(copies, particles, log_weights, normal, factor=-1.0)
+
+
+def test_gradient_of_jitter_is_that_of_finite_differences():
+    particles = torch.randn(3, 5, 2, dtype=torch.float64, requires_grad=True)
+    log_weights = torch.randn(3, 5, dtype=torch.float64, requires_grad=True)
+    normal = torch.randn(3, 5, 2, dtype=torch.float64)
+
+    def jitter(particles, raw):
+        return jitter_copies(particles[:, [0, 0, 1, 1, 3]], particles, raw.log_softmax(-1), normal, factor=0.8)
+
+    assert torch.autograd.gradcheck(jitter, (particles, log_weights))

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
+from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters.inductor import need_compiler
 from torch_denkf.modules._base import flat_noise
 
@@ -41,6 +42,9 @@ def export_step(
 
     Everything random is drawn inside, from torch's generator, unless ``example`` holds the noise (see
     :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs.
+
+    A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
+    returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
 
     Args:
         filter: trained; its device is the package's.
@@ -82,7 +86,8 @@ def export_step(
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
     written = list(filter.out_keys)
-    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys)]))
+    counted = [key for key in written if filter.reject and key == REJECTED]
+    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys), *counted]))
     unknown = [key for key in out_keys if key not in written]
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {written}")

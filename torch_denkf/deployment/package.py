@@ -67,7 +67,7 @@ def load_step(path: str | Path) -> PackagedStep:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is not a packaged step.
+        ValueError: if it is not a packaged step, or one that is damaged.
     """
     path = Path(path)
     if not path.exists():
@@ -77,14 +77,28 @@ def load_step(path: str | Path) -> PackagedStep:
             compiled = any("aotinductor" in name for name in archive.namelist())
     except zipfile.BadZipFile as error:
         raise ValueError(f"{path} is no package of a step, or it was cut; export it again") from error
-    run: Callable[..., tuple[Tensor, ...]]
-    if compiled:
-        run = torch._inductor.aoti_load_package(str(path))
-        signature = run.get_metadata().get(SIGNATURE, "")
-    else:
-        files = {SIGNATURE: ""}
-        run = torch.export.load(path, extra_files=files).module()
-        signature = files[SIGNATURE]
+    try:
+        run, signature = _load(path, compiled)
+    except Exception as error:  # torch raises whatever it stumbles over in a file of another kind
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(
+            f"{path} is a zip file, but torch cannot load a step from it ({type(error).__name__}: {reason}); pass what "
+            "export_step wrote, with this version of torch"
+        ) from error
     if not signature:
         raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
-    return PackagedStep(run, json.loads(signature))
+    try:
+        return PackagedStep(run, json.loads(signature))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} has a damaged description in its entry {SIGNATURE!r} ({type(error).__name__}: {error}); export it "
+            "again"
+        ) from error
+
+
+def _load(path: Path, compiled: bool) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
+    if compiled:
+        run = torch._inductor.aoti_load_package(str(path))
+        return run, run.get_metadata().get(SIGNATURE, "")
+    files = {SIGNATURE: ""}
+    return torch.export.load(path, extra_files=files).module(), files[SIGNATURE]

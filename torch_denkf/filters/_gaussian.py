@@ -6,19 +6,20 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Unpack
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 
-__all__ = ["GaussianFilter", "GaussianOptions"]
+__all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
 
 class GaussianOptions(FilterOptions, total=False):
     """What the filters with a mean, a covariance and a learned sensor take beside their models.
 
-    They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-    ``check_finite`` of :class:`Filter`.
+    They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+    ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never
@@ -50,6 +51,9 @@ class GaussianFilter(Filter):
         observation_key: likewise.
         observed_key: likewise.
         **kwargs: of :class:`Filter`.
+
+    Raises:
+        ValueError: if ``initial`` writes no mean and covariance.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class GaussianFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         update = analysis(
             inflation=inflation,
             angles=angles,
@@ -76,3 +81,14 @@ class GaussianFilter(Filter):
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, analysis=update)
         super().__init__(modules, initial=initial, **kwargs)
+
+
+def refuse_other_beliefs(owner: str, initial: TensorDictModuleBase, carry: Sequence[NestedKey]) -> None:
+    """Raises a ``ValueError`` where an initial belief lacks the mean or the covariance that a filter carries."""
+    written = [unravel_key(key) for key in initial.out_keys]
+    if not set(map(unravel_key, carry)).issubset(written):
+        raise ValueError(
+            f"{owner} carries {list(carry)}, and its initial belief, {type(initial).__name__}, writes {written}. Use "
+            "MomentPrior(mean, cov), or GaussianAround(std) around a known state; GaussianPrior, AroundState and "
+            "FromSensor are for ensembles and particles."
+        )

@@ -9,7 +9,8 @@ from typing import Literal, Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
     GaussianLikelihood,
     NoisyTransition,
@@ -37,20 +38,24 @@ class ParticleFilter(Filter):
         sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where ``likelihood`` reads the tensordict.
         observation: writes the predicted observations ``("forecast", "observation")``.
         likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
-        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default.
+        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default. With a Gaussian likelihood that
+            writes ``("info", "innovation")`` and ``("info", "nis")``, too.
         noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
         resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
             :class:`~torch_denkf.modules.ResampledTransition`; a transition that is one already is left as it is.
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
+        jitter: regularised particle filter: the copies that resampling makes are moved apart by a Gaussian kernel of
+            this many times the usual width, see :func:`~torch_denkf.functional.jitter_copies`. For motions with little
+            noise of their own, or none.
         initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         angles: components of the observation that are angles in radians, for the default likelihood.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: on an unknown ``resampling``.
@@ -88,6 +93,7 @@ class ParticleFilter(Filter):
         alpha: float = 0.05,
         epsilon: float = 0.05,
         ess_threshold: float | None = None,
+        jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
         observed_key: NestedKey = "observed",
@@ -102,6 +108,8 @@ class ParticleFilter(Filter):
             likelihood = GaussianLikelihood(angles=angles, observed_key=observed_key, **keys)
         elif angles:
             raise ValueError("angles are for the default likelihood; give them to yours instead.")
+        if analysis is None:
+            analysis = ParticleAnalysis(likelihood if isinstance(likelihood, GaussianLikelihood) else None)
         if not isinstance(transition, ResampledTransition):
             transition = ResampledTransition(
                 transition,
@@ -109,6 +117,7 @@ class ParticleFilter(Filter):
                 alpha=alpha,
                 epsilon=epsilon,
                 ess_threshold=ess_threshold,
+                jitter=jitter,
                 observed_key=observed_key,
             )
         if unravel_key(transition.in_keys[1]) not in map(unravel_key, initial.out_keys):
@@ -119,7 +128,7 @@ class ParticleFilter(Filter):
             transition=transition,
             observation=observation,
             likelihood=likelihood,
-            analysis=ParticleAnalysis() if analysis is None else analysis,
+            analysis=analysis,
         )
         super().__init__(
             OrderedDict((name, module) for name, module in modules.items() if module is not None),

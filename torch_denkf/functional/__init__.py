@@ -10,6 +10,7 @@ from torch_denkf.functional.linalg import (
     inverse_square_root,
     inverse_square_root_difference,
     semidefinite_root,
+    semidefinite_solve,
 )
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, letkf, neighbours, neighbours_of_taper
 from torch_denkf.functional.moments import (
@@ -25,18 +26,23 @@ from torch_denkf.functional.random_bits import (
     random_signs,
     representable_rate,
 )
-from torch_denkf.functional.resampling import effective_sample_size, soft_resample, systematic_resample
+from torch_denkf.functional.resampling import effective_sample_size, jitter_copies, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
+from torch_denkf.functional.smoothing import rts_smooth, rts_step, smoothing_gain
+from torch_denkf.functional.smoothing_ensemble import enrts_smooth, enrts_step
+from torch_denkf.functional.smoothing_iterated import iterated_smoothing
+from torch_denkf.functional.smoothing_particles import backward_smooth, backward_weights
 from torch_denkf.functional.transport import transport_resample
 from torch_denkf.functional.unicycle import unicycle_jacobians, unicycle_move
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
+    unscented_cross,
     unscented_moments,
     unscented_update,
     unscented_weights,
 )
-from torch_denkf.functional.weighted import crps_weighted, weighted_mean, weighted_var
+from torch_denkf.functional.weighted import crps_weighted, weighted_innovation, weighted_mean, weighted_var
 
 __all__ = [
     "Analysis",
@@ -58,6 +64,7 @@ __all__ = [
     "unscented_weights",
     "sigma_points",
     "unscented_moments",
+    "unscented_cross",
     "unscented_update",
     "wrap_angles",
     "align_angles",
@@ -75,7 +82,17 @@ __all__ = [
     "inverse_square_root",
     "inverse_square_root_difference",
     "semidefinite_root",
+    "semidefinite_solve",
+    "smoothing_gain",
+    "rts_step",
+    "rts_smooth",
+    "enrts_step",
+    "enrts_smooth",
+    "iterated_smoothing",
+    "backward_weights",
+    "backward_smooth",
     "effective_sample_size",
+    "jitter_copies",
     "soft_resample",
     "systematic_resample",
     "transport_resample",
@@ -88,5 +105,6 @@ __all__ = [
     "unicycle_jacobians",
     "weighted_mean",
     "weighted_var",
+    "weighted_innovation",
     "crps_weighted",
 ]

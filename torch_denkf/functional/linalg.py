@@ -54,13 +54,46 @@ def semidefinite_root(cov: Tensor) -> Tensor:
         tensor([[2., 0.],
                 [0., 0.]])
     """
+    correlation, std, _ = _correlation(cov)
+    return std.unsqueeze(-1) * cholesky(correlation)
+
+
+def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
+    """Solve P X = Y for a covariance P, also a singular one; X then is one of the solutions.
+
+    It is solved in correlations with a relative ridge, see :func:`semidefinite_root`. Components without any variance
+    get zero, and their row of ``right`` should be zero.
+
+    Args:
+        cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
+        right: Y, ``[*B, N, M]``.
+
+    Returns:
+        X, ``[*B, N, M]``; NaN where P is not positive semi-definite.
+
+    Examples:
+        >>> import torch
+        >>> semidefinite_solve(torch.tensor([[4.0, 0.0], [0.0, 0.0]]), torch.tensor([[2.0], [0.0]]))
+        tensor([[0.5000],
+                [0.0000]])
+    """
+    correlation, _, inverse = _correlation(cov)
+    return inverse.unsqueeze(-1) * torch.cholesky_solve(inverse.unsqueeze(-1) * right, cholesky(correlation))
+
+
+def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
     dim = cov.shape[-1]
-    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
+    variance = cov.diagonal(dim1=-2, dim2=-1).detach()
+    std = variance.clamp(min=0).sqrt()
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
     diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
+    # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
+    negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
+    std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)
     correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
-    return std.unsqueeze(-1) * cholesky(correlation)
+    return correlation, std, inverse
 
 
 def inverse_square_root(matrix: Tensor) -> Tensor:

@@ -13,6 +13,8 @@ import math
 import torch
 from torch import Tensor
 
+from torch_denkf._checks import check_shape
+from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.weighted import check_particles
 
 
@@ -45,7 +47,8 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
         uniform: numbers in [0, 1): ``[*B, 1]`` for systematic, ``[*B, E]`` for stratified resampling.
 
     Returns:
-        The particles that were picked, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``.
+        The particles that were picked, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``. These are NaN
+        where a weight was, so that it is not lost.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -57,8 +60,10 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
         tensor([2., 2.])
     """
     check_particles(particles, log_weights)
-    index = _pick(log_weights.detach().exp(), uniform)
-    return _take(particles.detach(), index), torch.full_like(log_weights, -math.log(log_weights.shape[-1])).detach()
+    probability = log_weights.detach().exp()
+    index = _pick(probability, uniform)
+    equal = torch.full_like(probability, -math.log(log_weights.shape[-1]))
+    return _take(particles.detach(), index), torch.where(probability.sum(-1, keepdim=True) > 0, equal, torch.nan)
 
 
 def soft_resample(
@@ -96,7 +101,57 @@ def soft_resample(
     index = _pick(proposal.detach(), uniform)
     # Picked first, then their logarithm: a particle that was picked has a positive probability.
     ratio = log_weights.gather(-1, index) - proposal.gather(-1, index).log()
-    return _take(particles, index), ratio.log_softmax(-1)
+    known = proposal.detach().sum(-1, keepdim=True) > 0
+    return _take(particles, index), torch.where(known, ratio.log_softmax(-1), torch.nan)
+
+
+def jitter_copies(
+    resampled: Tensor, particles: Tensor, log_weights: Tensor, normal: Tensor, *, factor: float = 1.0
+) -> Tensor:
+    r"""Moves the copies that resampling made apart; one of each particle stays where it is.
+
+    Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
+    the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
+    rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
+    widens the distribution, less so with more particles. N is the *effective* number of particles, and the covariance
+    is unbiased for it: where a few particles have all the weight, they say little about the spread, and the kernel is
+    wide. Where one alone has it, the covariance of all particles is taken, as if their weights were equal.
+
+    Args:
+        resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
+            neighbours there.
+        particles: the particles before, ``[*B, E, S]``.
+        log_weights: their log-weights before, normalised, ``[*B, E]``.
+        normal: standard-normal numbers ``[*B, E, S]``.
+        factor: on the width; 0 for no jitter.
+
+    Returns:
+        The particles, ``[*B, E, S]``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or ``factor`` is negative.
+
+    Examples:
+        >>> import torch
+        >>> particles, picked = torch.tensor([[0.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [2.0]])
+        >>> even, normal = torch.full((3,), 1 / 3).log(), torch.ones(3, 1)
+        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()  # 3^(-1/5) / 2 = 0.4014
+        tensor([1.0000, 1.4014, 2.0000])
+    """
+    check_particles(particles, log_weights)
+    check_shape("resampled", resampled, particles.shape, "[*B, E, S]")
+    check_shape("normal", normal, particles.shape, "[*B, E, S]")
+    if factor < 0:
+        raise ValueError(f"factor scales the jitter's width, 0 or more; got {factor}.")
+    size, dim = particles.shape[-2:]
+    alone = log_weights.max(-1, keepdim=True).values > -1e-6
+    weights = torch.where(alone, 1 / size, log_weights.exp()).unsqueeze(-1)
+    anomalies = particles - (weights * particles).sum(-2, keepdim=True)
+    cov = anomalies.mT @ (weights * anomalies) / (1 - weights.square().sum(-2, keepdim=True))
+    width = factor * effective_sample_size(log_weights).clamp(min=1)[..., None, None] ** (-1 / (dim + 4))
+    same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
+    copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
+    return resampled + torch.where(copies, width * (normal @ semidefinite_root(cov).mT), 0)
 
 
 def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
@@ -113,7 +168,8 @@ def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
     cumulative = cumulative / cumulative[..., -1:]
     below_one = 1 - torch.finfo(probability.dtype).eps / 2
     position = ((rank + uniform.to(probability.dtype)) / size).clamp(max=below_one)
-    return torch.searchsorted(cumulative, position.contiguous(), right=True)
+    # Where a weight is NaN, no position is found: the index stays inside, and the weights tell.
+    return torch.searchsorted(cumulative, position.contiguous(), right=True).clamp(max=size - 1)
 
 
 def _take(particles: Tensor, index: Tensor) -> Tensor:

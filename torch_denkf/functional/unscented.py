@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
 from torch_denkf.functional.linalg import semidefinite_root
@@ -92,6 +92,7 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
         tensor([ 0.,  2., -2.])
     """
     _check_moments(mean, cov)
+    check_one_dtype(mean=mean, cov=cov)
     columns = math.sqrt(_spread(mean.shape[-1], alpha, kappa)) * semidefinite_root(cov).mT
     center = mean.unsqueeze(-2)
     return torch.cat([center, center + columns, center - columns], -2)
@@ -121,6 +122,30 @@ def unscented_moments(
     """
     mean, deviations = _deviations(points, weights, angles)
     return mean, _weighted_gram(deviations, weights.cov, deviations)
+
+
+def unscented_cross(points: Tensor, images: Tensor, weights: UnscentedWeights) -> Tensor:
+    """Covariance of a state and a function of it, from sigma points (Särkkä 2013, eq. 5.75).
+
+    Args:
+        points: of the state, ``[*B, 2 S + 1, S]``.
+        images: the function's values there, ``[*B, 2 S + 1, N]``.
+        weights: see :func:`unscented_weights`.
+
+    Returns:
+        The covariances, ``[*B, S, N]``.
+
+    Raises:
+        ValueError: if there are not as many points as weights.
+
+    Examples:
+        >>> points = sigma_points(torch.zeros(1), torch.eye(1))
+        >>> unscented_cross(points, 3 * points, unscented_weights(1)).round(decimals=4)
+        tensor([[3.]])
+    """
+    # The points lie evenly around their mean, so that the mean of the images need not be taken off, but for digits.
+    deviations = _deviations(images, weights, ())[1]
+    return (points - points[..., :1, :]).mT @ (weights.cov.unsqueeze(-1) * deviations)
 
 
 def unscented_update(
@@ -160,6 +185,8 @@ def unscented_update(
         >>> update.mean, update.cov
         (tensor([1.0000]), tensor([[0.5000]]))
     """
+    check_one_dtype(points=points, predicted=predicted, observation=observation, noise=noise)
+    check_mask("observed", observed)
     expected, deviations = _deviations(predicted, weights, angles)
     check_ensemble("points", points)
     batch, dim = expected.shape[:-1], expected.shape[-1]

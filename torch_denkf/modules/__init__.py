@@ -8,8 +8,10 @@ from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.check import check_analysis
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
+from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
@@ -19,6 +21,8 @@ from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, MemberGain, 
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
 from torch_denkf.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, WithHistory
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, WithWeights
+from torch_denkf.modules.past import EnsemblePast, LaggedAnalysis, LaggedBelief, WithEnsemblePast
+from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, MomentsPast, WithMomentsPast
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise, as_process_noise
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
@@ -30,6 +34,7 @@ from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
 __all__ = [
     "SubModel",
     "Call",
+    "check_analysis",
     "reads",
     "run_module",
     "StochasticMLP",
@@ -78,6 +83,16 @@ __all__ = [
     "NoisyTransition",
     "ResampledTransition",
     "ParticleAnalysis",
+    "IteratedAnalysis",
+    "WithSmoothed",
+    "WithEnsemblePast",
+    "EnsemblePast",
+    "LaggedAnalysis",
+    "LaggedBelief",
+    "WithMomentsPast",
+    "CrossTransition",
+    "MomentsPast",
+    "LaggedMoments",
     "WithMemory",
     "LSTMTransition",
     "LSTMUpdate",

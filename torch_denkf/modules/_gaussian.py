@@ -10,8 +10,10 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_number
 from torch_denkf.functional import GaussianUpdate, mean_observation
 from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
+from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
@@ -75,15 +77,21 @@ class GaussianTransition(SubModel):
 
     def on_entries(self, entries, call):
         """The forecast."""
+        return self.with_cross(entries, call)[0]
+
+    def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
+        """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
-        mean, cov = self._forecast(entries, mean, cov, call._replace(sample=False))
+        mean, cov, cross = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
         work = {**entries, self.out_keys[0]: mean}
         noise = run_module(self.process_noise, work, call.part("process_noise"))
         cov = cov + as_covariance(noise[unravel_key(self.process_noise.out_keys[0])], mean)
-        return {self.out_keys[0]: mean, self.out_keys[1]: cov}
+        return {self.out_keys[0]: mean, self.out_keys[1]: cov}, cross
 
-    def _forecast(self, entries: Entries, mean, cov, call: Call) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and covariance before the process noise is added."""
+    def _forecast(
+        self, entries: Entries, mean, cov, call: Call, wanted: bool
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Mean and covariance before the process noise is added, and where wanted the cross-covariance."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
@@ -147,6 +155,8 @@ class GaussianAnalysis(SubModel):
         KeyError: if an entry is missing.
     """
 
+    reads_components = True
+
     def __init__(
         self,
         observation: TensorDictModuleBase,
@@ -168,6 +178,8 @@ class GaussianAnalysis(SubModel):
         out_keys = [(belief_key, name) for name in ("mean", "cov", "var")]
         out_keys += [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(observation, in_keys + further, out_keys, optional_keys=[observed_key, *optional])
+        check_number("inflation", inflation, above=0)
+        check_dims("angles", angles)
         self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
         self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)

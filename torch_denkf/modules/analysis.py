@@ -8,7 +8,9 @@ from typing import Literal, Unpack
 import torch
 from tensordict import unravel_key
 
+from torch_denkf._checks import check_values
 from torch_denkf.functional import (
+    Analysis,
     align_angles,
     analyse,
     ensemble_cov,
@@ -40,7 +42,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         **keys: see :class:`EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned observations, not one reading.
 
     Raises:
-        ValueError: on an unknown scheme.
+        ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and
+            factors of ``taper`` that are not finite.
         KeyError: if an entry is missing.
 
     Example:
@@ -74,6 +77,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         )
         self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
+            if factors is not None:
+                check_values(name.replace("_", "'s "), factors)
             self.register_buffer(name, factors, persistent=False)
 
     @property
@@ -110,20 +115,10 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        scheme = self.scheme
-        if scheme == "perturbed" and noise is None:
-            raise ValueError('the scheme "perturbed" has no deterministic forward; use "etkf" or "sakov".')
         predicted, observation = align_angles(predicted, observation, self.angles, observed)
-        ensemble, innovation, nis, log_likelihood = analyse(
-            forecast,
-            predicted,
-            observation,
-            variance,
-            scheme=scheme,
-            observed=observed,
-            perturbation=noise if scheme == "perturbed" else None,
-            rotation=noise if self.rotate else None,
-            taper=None if self.state_taper is None else (self.state_taper, self.observation_taper),
+        taper = self.state_taper
+        ensemble, innovation, nis, log_likelihood = self._analyse(
+            forecast, predicted, observation, variance, observed, noise, taper
         )
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
@@ -135,3 +130,37 @@ class EnsembleAnalysis(EnsembleUpdate):
         mean = ensemble_mean(ensemble)
         cov = (ensemble_cov(ensemble),) if self.covariance else ()
         return ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood, *cov
+
+    def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
+        """What the reading says of earlier states of the same members; neither inflation nor relaxation touches them.
+
+        Args:
+            past: ``[*B, E, L, S]``.
+            predicted: as in :meth:`compute`, like what follows.
+            observation: likewise.
+            variance: likewise.
+            observed: likewise.
+            noise: likewise: the same draws.
+
+        Returns:
+            The updated past, ``[*B, E, L, S]``.
+        """
+        predicted, observation = align_angles(predicted, observation, self.angles, observed)
+        taper = None if self.state_taper is None else self.state_taper.repeat(past.shape[-2], 1)
+        moved = self._analyse(past.flatten(-2), predicted, observation, variance, observed, noise, taper)
+        return moved.ensemble.unflatten(-1, past.shape[-2:])
+
+    def _analyse(self, ensemble, predicted, observation, variance, observed, noise, taper) -> Analysis:
+        if self.scheme == "perturbed" and noise is None:
+            raise ValueError('the scheme "perturbed" has no deterministic forward; use "etkf" or "sakov".')
+        return analyse(
+            ensemble,
+            predicted,
+            observation,
+            variance,
+            scheme=self.scheme,
+            observed=observed,
+            perturbation=noise if self.scheme == "perturbed" else None,
+            rotation=noise if self.rotate else None,
+            taper=None if taper is None else (taper, self.observation_taper),
+        )

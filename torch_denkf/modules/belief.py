@@ -3,14 +3,22 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules._tensors import (
+    as_floating,
+    as_standard_deviations,
+    check_dims,
+    mean_of_members,
+    register_location,
+)
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
@@ -27,9 +35,8 @@ class _InitialEnsemble(SubModel):
         optional_keys: Sequence[NestedKey] = (),
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
-        std = as_floating(std)
-        if std.ndim != 1 or not (std >= 0).all():
-            raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
+        std = as_standard_deviations("std", std)
+        check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 
@@ -79,6 +86,7 @@ class GaussianPrior(_InitialEnsemble):
         mean = as_floating(mean)
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
+        check_values("mean", mean)
         self.register_buffer("mean", mean)
 
     def compute(self, *, noise, batch_size):
@@ -123,7 +131,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -146,6 +154,8 @@ class FromSensor(_InitialEnsemble):
         tensor([5., 0.])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         dims: Sequence[int],
@@ -159,9 +169,19 @@ class FromSensor(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
-        register_constant(self, "mean", mean)
+        register_location(self, "mean", mean)
+        check_dims("dims", dims, self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
+        self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
+
+    def on_entries(self, entries, call):
+        """The belief; without its reading the prior."""
+        if call.missing.isdisjoint(self.in_keys):
+            return super().on_entries(entries, call)
+        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
+        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
+        return self.by_key(self._members(mean, std, noise, call.batch_size))
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

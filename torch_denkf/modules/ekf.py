@@ -54,7 +54,7 @@ class EKFTransition(GaussianTransition):
         super().__init__(transition, process_noise, **keys)
         self.stop_jacobian_gradient = stop_jacobian_gradient
 
-    def _forecast(self, entries, mean, cov, call):
+    def _forecast(self, entries, mean, cov, call, wanted):
         def move(rows, states, call):
             return self._move(rows, states, call), None
 
@@ -62,8 +62,9 @@ class EKFTransition(GaussianTransition):
         forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
-        cov = jacobian @ cov @ jacobian.mT
-        return forecast, (cov + cov.mT) / 2
+        moved = jacobian @ cov
+        cov = moved @ jacobian.mT
+        return forecast, (cov + cov.mT) / 2, moved.mT
 
 
 class EKFAnalysis(GaussianAnalysis):

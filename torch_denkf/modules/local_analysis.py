@@ -8,6 +8,7 @@ from typing import Unpack
 
 import torch
 
+from torch_denkf._checks import check_values
 from torch_denkf.functional import (
     Neighbours,
     align_angles,
@@ -82,6 +83,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
+        check_values("near's taper", near.taper, least=0)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile
@@ -134,14 +136,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        predicted, observation = align_angles(predicted, observation, self.angles, observed)
-        if observation.ndim == forecast.ndim:
-            observation = observation.mean(-2)
-        near = Neighbours(self.index, self.taper)
-        ensemble = letkf(forecast, predicted, observation, variance, near, observed=observed, tile=self.tile)
-        if noise is not None:
-            mean = ensemble.mean(-2, keepdim=True)
-            ensemble = mean + noise @ (ensemble - mean)
+        predicted, observation = self._aligned(predicted, observation, observed)
+        ensemble = self._analyse(forecast, predicted, observation, variance, observed, noise, 1)
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
@@ -152,6 +148,35 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             ensemble = torch.where(observed.any(-1)[..., None, None], ensemble, forecast)
         diagnostics = _diagnostics(predicted, observation, variance, observed)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics
+
+    def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
+        """What the readings say of earlier states ``[*B, E, L, S]``: see :meth:`EnsembleAnalysis.move_past`.
+
+        Each component learns from the observations near it now. What moves far in L steps needs a larger radius.
+        """
+        predicted, observation = self._aligned(predicted, observation, observed)
+        lag, flat = past.shape[-2], past.flatten(-2)
+        moved = self._analyse(flat, predicted, observation, variance, observed, noise, lag)
+        if observed is not None:
+            moved = torch.where(observed.any(-1)[..., None, None], moved, flat)
+        return moved.unflatten(-1, past.shape[-2:])
+
+    def _aligned(self, predicted, observation, observed) -> tuple[torch.Tensor, torch.Tensor]:
+        """The predicted observations, and one observation on their side of the circle."""
+        predicted, observation = align_angles(predicted, observation, self.angles, observed)
+        return predicted, observation.mean(-2) if observation.ndim == predicted.ndim else observation
+
+    def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
+        """The analysis of ``copies`` states side by side, rotated."""
+        index, taper = self.index, self.taper
+        if copies > 1:
+            index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
+        near = Neighbours(index, taper)
+        ensemble = letkf(ensemble, predicted, observation, variance, near, observed=observed, tile=self.tile)
+        if noise is None:
+            return ensemble
+        mean = ensemble.mean(-2, keepdim=True)
+        return mean + noise @ (ensemble - mean)
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
         """Whether anything is observed near each component, ``[S]`` or ``[*B, S]``."""

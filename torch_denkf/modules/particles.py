@@ -19,15 +19,20 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import (
+    align_angles,
     effective_sample_size,
+    jitter_copies,
     soft_resample,
     systematic_resample,
     transport_resample,
+    weighted_innovation,
     weighted_mean,
     weighted_var,
 )
 from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules.likelihood import GaussianLikelihood
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]
 
@@ -90,12 +95,17 @@ class ResampledTransition(SubModel):
         epsilon: regularisation of transport.
         iterations: of Sinkhorn in transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
+        jitter: moves copies apart by a Gaussian kernel of this many times the usual width; 0 for none. For
+            ``"systematic"`` and ``"soft"``; see :func:`~torch_denkf.functional.jitter_copies`.
         log_weight_key: log-weights of the belief ``[*B, E]``.
         out_log_weight_key: log-weights of the forecast ``[*B, E]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.
+        past_key: earlier states of the particles, ``[*B, E, L, S]``, the latest first, which are picked with them; the
+            present one becomes the latest. ``None`` for none. Not for ``"transport"``, which picks no particle.
+        out_past_key: the new past ``[*B, E, L, S]``.
 
     Raises:
-        ValueError: on an unknown ``scheme``.
+        ValueError: on an unknown ``scheme``, one without use for ``jitter`` or ``past_key``, or numbers out of range.
         KeyError: if an entry is missing.
 
     Example:
@@ -116,34 +126,64 @@ class ResampledTransition(SubModel):
         epsilon: float = 0.05,
         iterations: int = 20,
         ess_threshold: float | None = None,
+        jitter: float = 0.0,
         log_weight_key: NestedKey = ("belief", "log_weight"),
         out_log_weight_key: NestedKey = ("forecast", "log_weight"),
         observed_key: NestedKey = "observed",
+        past_key: NestedKey | None = None,
+        out_past_key: NestedKey = ("forecast", "past"),
     ):
         if scheme not in ("systematic", "soft", "transport", None):
             raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
+        check_number("alpha", alpha, least=0, most=1)
+        check_number("epsilon", epsilon, above=0)
+        check_count("iterations", iterations)
+        if ess_threshold is not None:
+            check_number("ess_threshold", ess_threshold, least=0, most=1, cure="It is a share of E")
+        check_number("jitter", jitter, least=0)
+        if jitter and (scheme not in ("systematic", "soft") or jitter < 0):
+            raise ValueError(
+                f'jitter moves the copies apart that "systematic" and "soft" resampling make, 0 or more; got {jitter} '
+                f"with {scheme!r}."
+            )
+        if past_key is not None and scheme == "transport":
+            raise ValueError('"transport" moves particles and picks none, so that they have no past of their own.')
         (ensemble_key, *others), optional = reads(transition)
         others = [key for key in others if key != unravel_key(log_weight_key)]
+        past = [] if past_key is None else [past_key]
         super().__init__(
             transition,
-            [ensemble_key, log_weight_key, *others],
-            [transition.out_keys[0], out_log_weight_key, *transition.out_keys[1:]],
+            [ensemble_key, log_weight_key, *past, *others],
+            [transition.out_keys[0], out_log_weight_key, *transition.out_keys[1:], *([out_past_key] if past else [])],
             optional_keys=[observed_key, *optional],
         )
+        self.jitter, self.has_past = jitter, bool(past)
         self.scheme, self.alpha, self.ess_threshold = scheme, alpha, ess_threshold
         self.mask_key = unravel_key(observed_key)
         self.epsilon, self.iterations = epsilon, iterations
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """One uniform number, where the scheme needs it."""
-        return ("",) if self.scheme in ("systematic", "soft") else ()
+        """One uniform number, where the scheme needs it; for a jitter normal ones, too."""
+        if self.scheme not in ("systematic", "soft"):
+            return ()
+        return ("uniform", "normal") if self.jitter else ("",)
 
-    def draw_noise(self, batch_size, *, device=None, dtype=None, generator=None, **_):
-        """Draws uniform numbers ``[*batch_size, 1]``; ``None`` where the scheme needs none."""
+    def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
+        """Draws uniform numbers ``[*batch_size, 1]``, and for a jitter normal ones ``[*batch_size, E, S]``."""
         if not self.noise_names:
             return None
-        return torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
+        uniform = torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
+        if not self.jitter:
+            return uniform
+        if members is None or state_dim is None:
+            return None
+        shape = (*batch_size, members, state_dim)
+        return {"uniform": uniform, "normal": torch.randn(shape, device=device, dtype=dtype, generator=generator)}
+
+    def noise_sizes(self, particles, *_):
+        """E and S, from the particles."""
+        return {"members": particles.shape[-2], "state_dim": particles.shape[-1]}
 
     def parts(self):
         """The transition."""
@@ -153,13 +193,36 @@ class ResampledTransition(SubModel):
         """The forecast ensemble and its weights."""
         (key, weight_key), out_weight_key = map(unravel_key, self.in_keys[:2]), unravel_key(self.out_keys[1])
         particles, log_weights = self.required(entries, key), self.required(entries, weight_key)
+        past = self.required(entries, unravel_key(self.in_keys[2])) if self.has_past else None
         wanted = self._wanted(log_weights, entries.get(self.mask_key))
-        moved, weights = self._resample(particles, log_weights, self._noise(entries, [log_weights], call))
+        noise = self._noise(entries, [particles, log_weights], call)
+        if past is not None:  # particles and their pasts are picked as one
+            past = torch.cat([particles.unsqueeze(-2), past[..., :-1, :]], -2)
+        moved, weights, picked = self._resample(particles, log_weights, past, noise)
         if wanted is not None:
             moved = torch.where(wanted.unsqueeze(-1), moved, particles)
             weights = torch.where(wanted, weights, log_weights)
+            picked = None if past is None else torch.where(wanted[..., None, None], picked, past)
         written = run_module(self.module, {**entries, key: moved, weight_key: weights}, call.part("transition"))
-        return {**written, out_weight_key: weights}
+        written = {**written, out_weight_key: weights}
+        return written if past is None else {**written, unravel_key(self.out_keys[-1]): picked}
+
+    def with_past(self, past_key: NestedKey, out_past_key: NestedKey) -> ResampledTransition:
+        """The same resampling and motion, for particles with a past; the motion is shared, not copied."""
+        return ResampledTransition(
+            self.module,
+            self.scheme,
+            alpha=self.alpha,
+            epsilon=self.epsilon,
+            iterations=self.iterations,
+            ess_threshold=self.ess_threshold,
+            jitter=self.jitter,
+            log_weight_key=self.in_keys[1],
+            out_log_weight_key=self.out_keys[1],
+            observed_key=self.mask_key,
+            past_key=past_key,
+            out_past_key=out_past_key,
+        )
 
     def _wanted(self, log_weights: torch.Tensor, observed: torch.Tensor | None) -> torch.Tensor | None:
         """Which rows to resample, ``[*B, 1]``; ``None`` for all."""
@@ -169,25 +232,38 @@ class ResampledTransition(SubModel):
             wanted = few.unsqueeze(-1) if wanted is None else wanted & few.unsqueeze(-1)
         return wanted
 
-    def _resample(self, particles, log_weights, uniform) -> tuple[torch.Tensor, torch.Tensor]:
+    def _resample(self, particles, log_weights, past, noise):
+        """The particles, their weights, and the picked past."""
         if self.scheme is None:
-            return particles, log_weights
+            return particles, log_weights, past
         if self.scheme == "transport":
-            return transport_resample(particles, log_weights, epsilon=self.epsilon, iterations=self.iterations)
-        if uniform is None:
+            return *transport_resample(particles, log_weights, epsilon=self.epsilon, iterations=self.iterations), None
+        if noise is None:
             raise ValueError(f'resampling "{self.scheme}" has no deterministic forward; use "transport" or None.')
+        uniform = noise["uniform"] if self.jitter else noise
+        whole = particles if past is None else past.flatten(-2)
         if self.scheme == "systematic":
-            return systematic_resample(particles, log_weights, uniform)
-        return soft_resample(particles, log_weights, uniform, self.alpha)
+            picked, weights = systematic_resample(whole, log_weights, uniform)
+        else:
+            picked, weights = soft_resample(whole, log_weights, uniform, self.alpha)
+        if past is not None:
+            past = picked.unflatten(-1, past.shape[-2:])
+            picked = past[..., 0, :]
+        if self.jitter:
+            picked = jitter_copies(picked, particles, log_weights, noise["normal"], factor=self.jitter)
+        return picked, weights, past
 
 
 class ParticleAnalysis(SubModel):
     r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
 
     Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
-    errors. Where nothing is observed the weights stay, exactly.
+    errors. Where nothing is observed the weights stay, exactly, and so they do where no particle can explain the
+    reading: the log-likelihood is then minus infinity.
 
     Args:
+        likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
+            ``None`` for neither.
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
@@ -195,7 +271,9 @@ class ParticleAnalysis(SubModel):
         belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
             ``var`` ``[*B, S]``.
         info_key: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
-            and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`.
+            and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`; with a ``likelihood``
+            also ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``, see
+            :func:`~torch_denkf.functional.weighted_innovation`.
 
     Raises:
         KeyError: if an entry is missing.
@@ -213,6 +291,7 @@ class ParticleAnalysis(SubModel):
 
     def __init__(
         self,
+        likelihood: GaussianLikelihood | None = None,
         *,
         tempering: float = 1.0,
         forecast_key: NestedKey = ("forecast", "ensemble"),
@@ -221,20 +300,32 @@ class ParticleAnalysis(SubModel):
         belief_key: str = "belief",
         info_key: str = "info",
     ):
+        of_reading = [] if likelihood is None else likelihood.in_keys
+        diagnostics = ["ess", "log_likelihood", *["innovation", "nis"] * bool(of_reading)]
         super().__init__(
             nn.Identity(),
-            [forecast_key, log_weight_key, log_likelihood_key],
+            [forecast_key, log_weight_key, log_likelihood_key, *of_reading],
             [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
-            + [(info_key, name) for name in ("ess", "log_likelihood")],
+            + [(info_key, name) for name in diagnostics],
+            optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
+        check_number("tempering", tempering, above=0)
         self.tempering, self.info_key = tempering, info_key
+        self.angles: list[int] = [] if likelihood is None else likelihood.angles
+        self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
 
-    def compute(self, particles, prior, log_likelihood):
+    def without_reading(self, particles, prior, log_likelihood, predicted, *_):
+        """What is written where there is no reading: the likelihood says what the belief is, the innovation is zero."""
+        ones = torch.ones_like(predicted[..., 0, :])
+        return self.compute(particles, prior, log_likelihood, predicted, ones, ones, torch.zeros_like(ones).bool())
+
+    def compute(self, particles, prior, log_likelihood, *of_reading):
         """The belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
-        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
-        seen = (log_likelihood != 0).any(-1, keepdim=True)
+        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed. Where no
+        # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
+        seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
         return (
             particles,
@@ -242,5 +333,12 @@ class ParticleAnalysis(SubModel):
             weighted_mean(particles, log_weights),
             weighted_var(particles, log_weights),
             effective_sample_size(log_weights).unsqueeze(-1),
-            torch.where(seen, total, torch.zeros_like(total)),
+            torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
+            *(self._innovation(prior, *of_reading) if of_reading else ()),
         )
+
+    def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
+        predicted, reading = align_angles(predicted, reading, self.angles, observed)
+        if reading.ndim == predicted.ndim:
+            reading = reading.mean(-2)
+        return weighted_innovation(predicted, prior, reading, variance, observed=observed)

@@ -7,9 +7,11 @@ from typing import Unpack
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf._checks import check_number
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
+    unscented_cross,
     unscented_moments,
     unscented_update,
     unscented_weights,
@@ -76,11 +78,15 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         **keys: Unpack[GaussianTransitionKeys],
     ):
         super().__init__(transition, process_noise, **keys)
+        for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+            check_number(name, value, above=0 if name == "alpha" else None)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
-    def _forecast(self, entries, mean, cov, call):
+    def _forecast(self, entries, mean, cov, call, wanted):
         points, weights = self._points(mean, cov)
-        return unscented_moments(self._move(entries, points, call), weights)
+        moved = self._move(entries, points, call)
+        cross = unscented_cross(points, moved, weights) if wanted else None
+        return *unscented_moments(moved, weights), cross
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
@@ -117,6 +123,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         **options: Unpack[GaussianAnalysisOptions],
     ):
         super().__init__(observation, **options)
+        for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+            check_number(name, value, above=0 if name == "alpha" else None)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _update(self, entries, mean, cov, observation, noise, call):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Unpack
 
@@ -9,10 +10,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
+from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules import StochasticMLP
 from torch_denkf.objectives._options import SequenceOptions
 from torch_denkf.objectives._scores import MEMBER_SCORES, score_members
 from torch_denkf.objectives._sequence import SequenceLoss
+from torch_denkf.smoothers import Smoother
 
 __all__ = ["DEnKFLoss"]
 
@@ -31,12 +34,13 @@ class DEnKFLoss(SequenceLoss):
     ``loss_sensor``           score of the sensor's samples against the true observation (:math:`L_{s_\xi}`)
     ``loss_observation``      squared error of :math:`h_\psi(x_t)` against the true observation
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
+    ``loss_smoothed``         score of the smoothed belief of each time, given what came later, against :math:`x_t`
     ``loss_kl``               KL divergence of flipout weights from their prior, nats
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
-    that their sum is the objective. Only elements that were stepped to count for state, transition and nll: the first
-    of a sequence and those with ``is_init`` hold an initial belief. The sensor counts where it observed.
+    that their sum is the objective. Only elements that were stepped to count for state, transition, smoothed and nll:
+    the first of a sequence and those with ``is_init`` hold an initial belief. The sensor counts where it observed.
 
     Args:
         filter: the filter to train; its parameters are the loss's.
@@ -49,6 +53,9 @@ class DEnKFLoss(SequenceLoss):
         observation: weight of ``loss_observation``.
         nll: weight of ``loss_nll``.
         kl: weight of ``loss_kl``.
+        smoothed: weight of ``loss_smoothed``.
+        smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
+            :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
         **options: scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`.
 
     Raises:
@@ -74,15 +81,17 @@ class DEnKFLoss(SequenceLoss):
         Attributes:
             belief: ensemble of the belief.
             forecast: ensemble of the forecast.
+            smoothed: ensemble of the smoothed belief.
         """
 
         belief: NestedKey = ("belief", "ensemble")
         forecast: NestedKey = ("forecast", "ensemble")
+        smoothed: NestedKey = ("smoothed", "ensemble")
 
     default_keys = _AcceptedKeys
-    SUPERVISED = ("state", "transition", "sensor", "observation")
+    SUPERVISED = ("state", "transition", "sensor", "observation", "smoothed")
     SCORES = MEMBER_SCORES
-    TERMS = ("state", "transition", "sensor", "observation", "nll", "kl")
+    TERMS = ("state", "transition", "sensor", "observation", "nll", "kl", "smoothed")
 
     def __init__(
         self,
@@ -95,10 +104,16 @@ class DEnKFLoss(SequenceLoss):
         observation: float = 0.0,
         nll: float = 0.0,
         kl: float = 0.0,
+        smoothed: float = 0.0,
+        smoother: Callable[[Filter], Smoother] | None = None,
         **options: Unpack[SequenceOptions],
     ):
-        weights = dict(zip(self.TERMS, (state, transition, sensor, observation, nll, kl), strict=True))
-        super().__init__(filter, weights, score=score, **options)
+        if smoothed and smoother is None:
+            raise ValueError("loss_smoothed needs to know how: smoother=EnRTS, or partial(EnKS, lag=5), for example.")
+        values = (state, transition, sensor, observation, nll, kl, smoothed)
+        super().__init__(filter, dict(zip(self.TERMS, values, strict=True)), score=score, **options)
+        # In a tuple: its parameters are the filter's, and are the loss's already.
+        self._smoother: tuple[Smoother, ...] = (smoother(filter),) if smoother is not None else ()
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
@@ -135,6 +150,12 @@ class DEnKFLoss(SequenceLoss):
         weights = {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0}
         return cls(filter, detach_every=detach_every, **{**weights, **kwargs})
 
+    def _run(self, tensordict):
+        if "smoothed" not in self.weights:
+            return super()._run(tensordict)
+        refuse_unmarked_slices(tensordict, self.filter.init_key)
+        return self._smoother[0].sequence(tensordict.copy(), detach_every=self.detach_every)
+
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):
@@ -142,6 +163,9 @@ class DEnKFLoss(SequenceLoss):
 
     def _transition(self, tensordict, out):
         return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
+
+    def _smoothed(self, tensordict, out):
+        return self._score(out, self.tensor_keys.smoothed, self._true_state(tensordict)), None
 
     def _kl(self, tensordict, out):
         return sum(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -57,8 +58,12 @@ class LeRobotReplay(EpisodeReplay):
     ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros where the frame is missing
     ``state``             [n,S]        float32, such as the joints' positions, in the recording's units
     ``action``            [n,A]        float32, where there are any
-    ``observed``          [n,1]        bool: the frame is there
+    ``observed``          [n,1]        bool: the frame is there, and its row is sound
     ===================== ============ ===========================================================================
+
+    Rows whose state or action is not finite, or whose time does not increase, keep their place and are not observed; a
+    warning counts them. Where numbers are not finite, the row holds the last ones that are, is False in
+    ``state_observed`` or ``action_observed``, and is left out of losses by ``("collector", "mask")``.
 
     Frames are kept as uint8 at the size asked for, memory-mapped: 37 kB a frame of 96 x 128. All splits share an entry
     of the cache.
@@ -87,6 +92,8 @@ class LeRobotReplay(EpisodeReplay):
         state_key: feature of the state.
         action_key: feature of the action; None for none, as are data sets without an ``"action"``.
         size: (H, W) to scale the images to, whatever their aspect.
+        dims: numbers of the state to keep, in this order, by place or by name: an arm of a whole robot. None for all.
+        action_dims: numbers of the action to keep, by place. Commands to other joints are noise to a learned motion.
         repeats: ``"keep"`` or ``"mask"`` repeated pictures.
         lag: rows by which the states are later than the pictures.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
@@ -94,7 +101,7 @@ class LeRobotReplay(EpisodeReplay):
     Attributes:
         episodes: of this split, with the recording's own ``number``.
         fps: rows a second.
-        names: of the state's numbers, such as the joints; None where the recording names none.
+        names: of the state's numbers that are kept, such as the joints; None where the recording names none.
         lag: as it was passed.
         repeats_masked: rows of this split that are not observed because their picture is a repeat.
 
@@ -102,8 +109,8 @@ class LeRobotReplay(EpisodeReplay):
         ImportError: without pyarrow.
         FileNotFoundError: without the folder, a parquet file or a video.
         ValueError: for versions of the format that are not read, cameras and features that are not there, files that
-            are damaged or contradict the metadata, splits without episodes, episodes that are shorter than a slice or
-            the lag, and other words for ``repeats``.
+            are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes, episodes
+            that are shorter than a slice or the lag, and other words for ``repeats``.
 
     Examples:
         >>> data = LeRobotReplay("aloha_static_coffee", camera="cam_high", slice_len=16, batch_size=64)
@@ -139,6 +146,8 @@ class LeRobotReplay(EpisodeReplay):
         state_key: str = "observation.state",
         action_key: str | None = "action",
         size: tuple[int, int] = (96, 128),
+        dims: Sequence[int | str] | None = None,
+        action_dims: Sequence[int] | None = None,
         repeats: Literal["keep", "mask"] = "keep",
         lag: int = 0,
         **options: Unpack[ReplayOptions],
@@ -161,6 +170,12 @@ class LeRobotReplay(EpisodeReplay):
         self.fps, self.names, self.lag = recording.fps, recording.names, lag
         self._images = JoinedPictures([recording.rows["image"]])
         rows, self._shown = _paired(recording.rows.exclude("image"), lag)
+        if dims is not None:
+            kept = _places("dims", dims, recording.names, rows["state"].shape[-1])
+            rows["state"] = rows["state"][:, kept]
+            self.names = recording.names and tuple(recording.names[place] for place in kept)
+        if action_dims is not None and "action" in rows:
+            rows["action"] = rows["action"][:, _places("action_dims", action_dims, None, rows["action"].shape[-1])]
         numbers, lengths = torch.unique_consecutive(rows.pop("episode"), return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
         repeated = torch.zeros(len(rows), dtype=torch.bool)
@@ -207,6 +222,16 @@ def _paired(rows: TensorDict, lag: int) -> tuple[TensorDict, Tensor]:
 
 def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dict[str, Tensor]:
     return float_pictures(images, shown[row])
+
+
+def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
+    """Places of the numbers that are asked for by place or name."""
+    places = {name: place for place, name in enumerate(names or ())}
+    chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
+    if not chosen or not all(0 <= place < width for place in chosen):
+        known = f", {', '.join(names)}" if names else ""
+        raise ValueError(f"{argument}={list(dims)} names none or others than the {width} numbers there are{known}")
+    return chosen
 
 
 def __getattr__(name: str):

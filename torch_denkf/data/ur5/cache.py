@@ -30,6 +30,7 @@ def read_entries(root: Path) -> list[Entry]:
 
     Raises:
         FileNotFoundError: without the folder, or without a demo in it.
+        ValueError: naming the line, for a manifest that is damaged.
     """
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}; collect demos into it: {COMMAND} --out {root}")

@@ -15,6 +15,7 @@ import json
 import os
 import threading
 import uuid
+import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -23,11 +24,13 @@ from typing import Any
 
 import numpy as np
 
+from torch_denkf._checks import check_count, read_lines
 from torch_denkf.simulation.ur5.names import TASKS
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
 COMMAND = "denkf collect-ur5"
+AGAIN = f"the collecting command ({COMMAND}), repeated, makes it again"
 
 
 @dataclass
@@ -137,17 +140,16 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, or does not hold what the line says.
+        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
     """
     file = root / entry.file
-    again = f"the collecting command ({COMMAND}), repeated, makes it again"
     try:
         data = file.read_bytes()
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{file} is missing, but {MANIFEST} lists it; {again}") from error
+        raise FileNotFoundError(f"{file} is missing, but {MANIFEST} lists it; {AGAIN}") from error
     wrong = _compare(root, entry, data)
     if wrong is not None:
-        raise ValueError(f"{wrong}; {again}")
+        raise ValueError(f"{wrong}; {AGAIN}")
     try:
         fields: dict[str, Any] = _read_arrays(data)  # numbers and names are arrays without dimensions yet
         demo = Demo(**fields)
@@ -160,29 +162,68 @@ def read_demo(root: Path, entry: Entry) -> Demo:
     for key, shape in expected.items():
         if getattr(demo, key).shape != shape:
             raise ValueError(f"{file} has {key!r} of shape {getattr(demo, key).shape}, {MANIFEST} says {shape}")
+    for key in ("state", "action"):
+        values = getattr(demo, key)
+        if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
+            row = 0 if values.dtype.kind != "f" else int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
+            raise ValueError(
+                f"{file} has {key!r} {values[row].tolist()} in row {row}, expected finite numbers; {AGAIN}"
+            )
+    steps = demo.steps
+    if len(steps) and (steps.min() < 0 or steps.max() >= entry.rows or (np.diff(steps) <= 0).any()):
+        raise ValueError(f"{file} has 'steps' {steps.tolist()[:9]}, expected ascending rows of {entry.rows}; {AGAIN}")
     if demo.task not in TASKS or demo.number != entry.demo:
         raise ValueError(f"{file} is demo {demo.number} of task {demo.task!r}, but is listed as demo {entry.demo}")
     return demo
 
 
-def read_manifest(root: Path) -> dict[int, Entry]:
-    """Entries by demo number, ascending; empty without a manifest. A line that a kill cut off counts as not written.
+def read_manifest(root: Path, *, skip_damaged: bool = False) -> dict[int, Entry]:
+    """Entries by demo number, ascending; empty without a manifest. A last line that a kill cut off is not written yet.
+
+    Args:
+        root: folder of the demos.
+        skip_damaged: True leaves lines out that are damaged, each with a warning, for a caller that makes their demos
+            again.
 
     Raises:
         OSError: if the manifest is there and cannot be read.
+        ValueError: naming the line, for one that is damaged or lists a demo again.
     """
-    try:
-        lines = (root / MANIFEST).read_text().splitlines()
-    except FileNotFoundError:
+    file = root / MANIFEST
+    if not file.exists():
         return {}
-    entries = {}
-    for line in lines:
+    lines = read_lines(file)
+    cut = bool(lines) and not file.read_bytes().endswith(b"\n")
+    entries: dict[int, Entry] = {}
+    for number, line in enumerate(lines, start=1):
         try:
-            entry = Entry(**json.loads(line))
-        except (TypeError, ValueError):
+            entry = _entry(line)
+            if entries.get(entry.demo, entry) != entry:
+                raise ValueError(f"demo {entry.demo} is listed in another line, too")
+        except (TypeError, ValueError) as error:
+            if cut and number == len(lines):
+                continue
+            wrong = f"{file}:{number} is damaged ({error}): {line[:80]!r}"
+            if not skip_damaged:
+                raise ValueError(
+                    f"{wrong}; the collecting command ({COMMAND}), repeated, makes its demo again"
+                ) from error
+            warnings.warn(f"{wrong}; its demo is made again", stacklevel=3)
             continue
         entries[entry.demo] = entry
     return dict(sorted(entries.items()))
+
+
+def _entry(line: str) -> Entry:
+    fields = json.loads(line)
+    if not isinstance(fields, dict):
+        raise ValueError("no entry of a demo")
+    entry = Entry(**fields)
+    for name, least in (("demo", 0), ("rows", 1), ("frames", 0), ("failures", 0)):
+        check_count(name, getattr(entry, name), least=least)
+    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file or not isinstance(entry.sha256, str):
+        raise ValueError(f"file is the name of a file in the folder, and sha256 its checksum; got {entry.file!r}")
+    return entry
 
 
 def write_manifest(root: Path, entries: Iterable[Entry]) -> None:

@@ -116,7 +116,7 @@ def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[
     """Numbers of the demos to make, and the manifest without them."""
     ours = {"format": FORMAT, **asdict(options)}
     ours |= {"size": list(options.size), "tasks": list(options.tasks)}  # as JSON gives them back
-    entries = files.read_manifest(root)
+    entries = files.read_manifest(root, skip_damaged=True)
     theirs = files.read_options(root) if entries else ours
     if theirs is None:
         raise ValueError(f"{root} has demos but no {COLLECTION}; choose another folder")

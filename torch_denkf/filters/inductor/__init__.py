@@ -31,11 +31,13 @@ def options_for_processors() -> dict[str, Any]:
         try:
             from torch_denkf.filters.inductor.kernels import FewCalls
             from torch_denkf.filters.inductor.partition import FewSavedTensors
+            from torch_denkf.filters.inductor.scheduling import ShortFunctions
 
             return {
                 "cpp_wrapper": True,
                 "custom_partitioner_fn": FewSavedTensors(),
                 "post_grad_custom_post_pass": FewCalls(),
+                "_post_fusion_custom_pass": ShortFunctions(),
                 "guard_filter_fn": worth_checking,
             }
         except ImportError as error:

@@ -1,0 +1,236 @@
+"""Ensemble smoothers against the exact one, and against each other."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from tests.filters.factories import linear_denkf, linear_kalman, linear_system, toy_denkf, toy_frames
+from tests.filters.gaussian_for_tests import directional_check
+from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
+from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.functional import enrts_smooth, enrts_step, ensemble_cov
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LinearObservation,
+    LocalEnsembleAnalysis,
+)
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
+
+MEMBERS = 10_000
+SMOOTHERS = {"EnKS": EnKS, "EnRTS": EnRTS}
+
+
+def large_filter(scheme, **kwargs):
+    """The linear system with so many members that sampling errors are small."""
+    prior = GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=MEMBERS)
+    return linear_denkf(scheme, noisy=True, initial=prior, **kwargs)
+
+
+@pytest.mark.parametrize("lag", [None, 1, 3])
+@pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
+@pytest.mark.parametrize("name", SMOOTHERS)
+def test_many_members_are_the_exact_smoother(float64, name, scheme, lag):
+    frames = drive(2, 8)
+    mean, cov = joint_beliefs(frames, lag)
+    with torch.no_grad():
+        out = SMOOTHERS[name](large_filter(scheme), lag)(frames)
+    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
+    # The error of a mean of E draws is std / sqrt(E), that of a covariance about std std sqrt(2 / E); the gains of all
+    # steps have errors of that size, too. Five of them in each of 2 x 8 x (2 + 4) numbers.
+    assert ((out["smoothed", "mean"] - mean).abs() <= 5 * std / MEMBERS**0.5).all()
+    tolerance = 5 * (2 / MEMBERS) ** 0.5 * std.unsqueeze(-1) * std.unsqueeze(-2)
+    assert ((ensemble_cov(out["smoothed", "ensemble"]) - cov).abs() <= tolerance).all()
+    assert_close(out["smoothed", "var"], ensemble_cov(out["smoothed", "ensemble"]).diagonal(dim1=-2, dim2=-1))
+
+
+def test_the_tolerance_tells_a_smoother_from_a_filter(float64):
+    frames = drive(2, 8)
+    mean, cov = joint_beliefs(frames)
+    with torch.no_grad():
+        out = large_filter("etkf").sequence(frames)
+    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((out["belief", "mean"] - mean).abs() > 5 * std / MEMBERS**0.5).float().mean() > 0.5
+
+
+def test_members_with_the_exact_moments_give_the_exact_means(float64):
+    """A few members whose sample moments are exact, no noise: EnKS, EnRTS and the exact smoother agree to rounding."""
+    generator = torch.Generator().manual_seed(1)
+    members = torch.randn(6, 2, generator=generator)
+    members = members - members.mean(0)
+    members = members @ torch.linalg.inv(torch.linalg.cholesky(ensemble_cov(members))).mT
+    members = torch.tensor(MEAN) + members * torch.tensor(COV).sqrt()
+    filter = linear_denkf("etkf")
+    filter.initial.members.copy_(members)
+    kalman = linear_kalman()
+    kalman["transition"].noise.zero_()
+    frames = drive(3, 7)
+    exact = RTSSmoother(kalman)(frames.copy())
+    for smoother in (EnKS(filter), EnRTS(filter)):
+        out = smoother(frames.copy())
+        assert_close(out["smoothed", "mean"], exact["smoothed", "mean"], rtol=0, atol=1e-9)
+        assert_close(ensemble_cov(out["smoothed", "ensemble"]), exact["smoothed", "cov"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("scheme", ["sensor", "perturbed", "etkf", "sakov"])
+def test_step_by_step_is_the_recording(float64, scheme):
+    """What FixedLag says at t + lag is what EnKS says of t; at the end of an episode, what is there by then."""
+    filter, lag = toy_denkf(scheme), 3
+    frames = toy_frames([2, 9], resets=False)
+    frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
+    frames["is_init"][:, 0], frames["is_init"][0, 5] = True, True
+    online = FixedLag(filter, lag)
+    frames = online.draw_noise(frames)
+    steps = online.sequence(frames.copy())
+    whole = EnKS(filter, lag)(frames.copy())
+    for row, ends in enumerate(([5] * 5 + [9] * 4, [9] * 9)):
+        for t in range(9):
+            later = min(t + lag, ends[t] - 1)
+            if later == t:
+                expected = steps["belief", "ensemble"][row, t]
+            else:
+                expected = steps["belief", "past"][row, later, :, later - t - 1]
+            assert_close(whole["smoothed", "ensemble"][row, t], expected, rtol=0, atol=0)
+            if later == t + lag:
+                assert_close(steps["smoothed", "ensemble"][row, later], expected, rtol=0, atol=0)
+    assert_close(whole["belief", "ensemble"], filter.sequence(frames.copy())["belief", "ensemble"], rtol=0, atol=0)
+
+
+def test_rotations_turn_the_past_as_well(float64):
+    """Without process noise the rotated smoother keeps the exact moments, which a past left behind would not."""
+    filter = linear_denkf("etkf")
+    rotated = linear_denkf("etkf")
+    rotated["analysis"].rotate = True
+    frames = drive(2, 7)
+    plain, turned = EnKS(filter)(frames.copy()), EnKS(rotated)(frames.copy())
+    assert_close(turned["smoothed", "mean"], plain["smoothed", "mean"], rtol=0, atol=1e-9)
+    assert_close(turned["smoothed", "var"], plain["smoothed", "var"], rtol=0, atol=1e-9)
+    assert not torch.allclose(turned["smoothed", "ensemble"], plain["smoothed", "ensemble"])
+    with pytest.raises(ValueError, match="rotate=True"):
+        EnRTS(rotated)
+
+
+def test_several_analyses_each_correct_the_past(float64):
+    """Two readings one after the other are the two at once, for the past as for the present."""
+    _, _, H, R = linear_system()
+    both = linear_denkf("etkf")
+
+    def analysis(index, last):
+        keys = {"predicted_key": ("forecast", f"y{index}"), "sensor_key": f"reading{index}"}
+        keys |= {"noise_variance_key": ("sensor", f"noise{index}"), "observed_key": f"observed{index}"}
+        keys |= {"forecast_key": ("belief" if last else "forecast", "ensemble")}
+        return EnsembleAnalysis("etkf", **keys)
+
+    split = Filter(
+        {
+            "noise0": ConstantNoise(R[:1].sqrt(), in_key="reading0", out_key=("sensor", "noise0")),
+            "noise1": ConstantNoise(R[1:].sqrt(), in_key="reading1", out_key=("sensor", "noise1")),
+            "transition": both["transition"],
+            "observe0": LinearObservation(H[:1], out_key=("forecast", "y0")),
+            "first": analysis(0, False),
+            "observe1": LinearObservation(H[1:], in_key=("belief", "ensemble"), out_key=("forecast", "y1")),
+            "second": analysis(1, True),
+        },
+        initial=both.initial,
+    )
+    frames = drive(2, 6, missing=0.0, resets=False)
+    frames.update({f"reading{i}": frames["observation"][..., i : i + 1] for i in range(2)})
+    frames.update({f"observed{i}": frames["observed"][..., i : i + 1] for i in range(2)})
+    joint, serial = EnKS(both, 3)(frames.copy()), EnKS(split, 3)(frames.copy())
+    assert_close(serial["smoothed", "mean"], joint["smoothed", "mean"], rtol=0, atol=1e-9)
+    assert_close(serial["smoothed", "var"], joint["smoothed", "var"], rtol=0, atol=1e-9)
+
+
+def test_a_local_analysis_of_everything_is_the_global_one(float64):
+    R = linear_system()[3]
+    frames, filters = drive(2, 6, resets=False), []
+    for analysis in (EnsembleAnalysis("etkf", sensor_key="observation"), None):
+        if analysis is None:
+            analysis = LocalEnsembleAnalysis(torch.ones(2, 2), sensor_key="observation")
+        plain = linear_denkf("etkf")
+        filters.append(
+            DEnKF(
+                plain["transition"],
+                None,
+                plain["observation"],
+                ConstantNoise(R.sqrt(), in_key="observation"),
+                analysis,
+                initial=plain.initial,
+            )
+        )
+    globally, locally = (EnKS(filter, 3)(frames.copy()) for filter in filters)
+    assert_close(locally["smoothed", "ensemble"], globally["smoothed", "ensemble"], rtol=0, atol=1e-9)
+
+
+def test_inflation_leaves_the_past_alone(float64):
+    filter = linear_denkf("etkf")
+    out = FixedLag(filter, 2).sequence(drive(2, 3, resets=False, missing=0.0))
+    filter["analysis"].inflation = 1.5
+    inflated = FixedLag(filter, 2).sequence(drive(2, 3, resets=False, missing=0.0))
+    first = ("belief", "past")
+    assert_close(inflated[first][:, 1, :, 0], out[first][:, 1, :, 0], rtol=0, atol=0)
+    assert not torch.allclose(inflated["belief", "ensemble"][:, 1], out["belief", "ensemble"][:, 1])
+
+
+@pytest.mark.parametrize("size", [4, 7])
+def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
+    """In state space (fewer dimensions than members) and in the members' space."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (2, size, 5)
+    before, noise = (torch.randn(shape, generator=generator) for _ in range(2))
+    forecast = before + 0.3 * noise
+    # What a later reading does to members lies in the space that they span.
+    weights = 0.1 * torch.randn(2, size, size, generator=generator)
+    inputs = [value.requires_grad_() for value in (before, forecast, weights)]
+
+    def smooth(before, forecast, weights):
+        return enrts_step(before, forecast, forecast + weights @ (forecast - forecast.mean(-2, keepdim=True)))
+
+    assert torch.autograd.gradcheck(smooth, inputs)
+
+
+@pytest.mark.parametrize("make", [EnRTS, EnKS, lambda f: EnKS(f, 1), lambda f: EnRTS(f, 1), lambda f: FixedLag(f, 2)])
+def test_learned_parts_learn_from_what_they_look_back_at(float64, make):
+    filter = toy_denkf("perturbed", sensor_layer="none", layer="none", ensemble_size=6)
+    frames = toy_frames([2, 5], resets=False)
+    with torch.no_grad():  # the noise network starts at zero, where much of its gradient is zero, too
+        for parameter in filter["noise"].parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    smoother = make(filter)
+    running = smoother if isinstance(smoother, FixedLag) else smoother._filter_for(5)
+    frames = running.draw_noise(frames)
+    directional_check(
+        lambda: smoother.sequence(frames.copy())["smoothed", "ensemble"].square().sum(),
+        list(filter.parameters()),
+        step=1e-6,
+        rtol=1e-4,
+    )
+
+
+def test_compiled_functions_are_the_eager_ones():
+    ensemble, forecast = torch.randn(2, 4, 6, 3), torch.randn(2, 4, 6, 3)
+    follows = torch.tensor([[False, True, False, True], [False, True, True, True]])
+    for lag in (None, 2):
+        eager = enrts_smooth(ensemble, forecast, follows=follows, lag=lag)
+        compiled = torch.compile(enrts_smooth, fullgraph=True, backend="aot_eager")
+        assert_close(compiled(ensemble, forecast, follows=follows, lag=lag), eager, rtol=1e-3, atol=1e-3)
+
+
+def test_what_cannot_be_smoothed_says_so():
+    with pytest.raises(TypeError, match="EnRTS smooths an ensemble"):
+        EnRTS(linear_kalman())
+    with pytest.raises(TypeError, match="EnKS smooths an ensemble"):
+        EnKS(linear_kalman())
+    with pytest.raises(TypeError, match="has an ensemble"):
+        RTSSmoother(linear_denkf())
+    with pytest.raises(ValueError, match="at least 1"):
+        FixedLag(linear_denkf(), 0)
+    with pytest.raises(ValueError, match="0 or more"):
+        EnRTS(linear_denkf(), -1)
+    with pytest.raises(TypeError, match="carries a past already"):
+        FixedLag(FixedLag(linear_denkf(), 2), 2)
+    stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
+    with pytest.raises(KeyError, match="stored without a lag"):
+        FixedLag(linear_denkf(), 2).sequence(stored)

@@ -1,0 +1,132 @@
+"""Particle smoothers against the exact smoother, and against enumeration."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
+from tests.filters.gaussian_for_tests import known_process_noise
+from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
+from torch_denkf.filters import ParticleFilter
+from torch_denkf.functional import backward_smooth, backward_weights, gaussian_log_prob
+from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation, NoisyTransition
+from torch_denkf.smoothers import FixedLag, ParticleSmoother
+from torch_denkf.smoothers.particles import log_density_of_pairs
+
+
+def particles(size, *, control=None, **kwargs):
+    """The linear system; its noise is one that has a density."""
+    F, _, H, R = linear_system()
+    return ParticleFilter(
+        NoisyTransition(NoisyLinear(F, control=control), known_process_noise()),
+        None,
+        LinearObservation(H),
+        GaussianLikelihood(sensor_key="observation"),
+        noise=ConstantNoise(R.sqrt(), in_key="observation"),
+        initial=GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=size),
+        **kwargs,
+    )
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+def test_many_particles_are_the_exact_smoother(float64, lag):
+    """Within five standard errors of as many draws as the fewest particles that ever counted."""
+    frames, size = drive(2, 7), 2000
+    mean, cov = joint_beliefs(frames, lag)
+    with torch.no_grad():
+        out = ParticleSmoother(particles(size), lag)(frames.copy())
+        online = FixedLag(particles(size), 2).sequence(frames.copy())
+    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
+    count = torch.where(out["info", "ess"] > 0, out["info", "ess"], size).amin(1, keepdim=True)  # 0 at a start
+    bound = 5 * std / count.sqrt()
+    assert ((out["smoothed", "mean"] - mean).abs() < bound).all()
+    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 5 * (2 / count).sqrt()).all()
+    far = [((out[kind, "mean"] - mean) / std).square().mean().sqrt() for kind in ("smoothed", "belief")]
+    assert far[0] < 0.15 < 0.3 < far[1]
+    assert_close(out["smoothed", "log_weight"].exp().sum(-1), torch.ones(2, 7))
+    if lag == 2:  # the ancestors say the same, two steps later
+        age = online["smoothed", "age"].squeeze(-1) == 2
+        now, then = online["smoothed", "mean"][:, 2:][age[:, 2:]], mean[:, :-2][age[:, 2:]]
+        assert ((now - then).abs() < 2 * bound[:, :-2][age[:, 2:]]).all()
+
+
+def test_backward_weights_are_bayes_rule_on_a_chain(float64):
+    """Three particles at three times are the states of a chain: all 27 paths, enumerated."""
+    generator = torch.Generator().manual_seed(0)
+    moves = torch.randn(2, 3, 3, generator=generator)  # log p(to | from), up to a factor for each destination's place
+    first = torch.randn(3, generator=generator).log_softmax(-1)
+    likelihood = torch.randn(2, 3, generator=generator)
+    log_weights, prior = [first], first
+    for move, reading in zip(moves, likelihood, strict=True):
+        prior = (torch.logsumexp(prior.unsqueeze(-1) + move, 0) + reading).log_softmax(-1)
+        log_weights.append(prior)
+    paths = first[:, None, None] + (moves[0] + likelihood[0])[:, :, None] + (moves[1] + likelihood[1])[None]
+    paths = (paths - torch.logsumexp(paths.flatten(), 0)).exp()
+    expected = torch.stack([paths.sum((1, 2)), paths.sum((0, 2)), paths.sum((0, 1))])
+    densities = torch.cat([torch.zeros(1, 3, 3), moves])
+    assert_close(backward_smooth(torch.stack(log_weights), densities).exp(), expected, rtol=0, atol=1e-12)
+    follows = torch.tensor([False, True, False])
+    cut = backward_smooth(torch.stack(log_weights), densities, follows=follows)
+    assert_close(cut[1:], torch.stack(log_weights[1:]), rtol=0, atol=0)
+    assert_close(cut[0], backward_smooth(torch.stack(log_weights[:2]), densities[:2])[0], rtol=0, atol=0)
+
+
+def test_gradients_are_those_of_finite_differences(float64):
+    inputs = [torch.randn(2, 4).log_softmax(-1), torch.randn(2, 4, 4), torch.randn(2, 4).log_softmax(-1)]
+    assert torch.autograd.gradcheck(backward_weights, [value.requires_grad_() for value in inputs])
+
+
+def test_compiled_is_eager():
+    weights, moves = torch.randn(3, 5, 4).log_softmax(-1), torch.randn(3, 5, 4, 4)
+    for lag in (None, 2):
+        compiled = torch.compile(backward_smooth, fullgraph=True, backend="aot_eager")(weights, moves, lag=lag)
+        assert_close(compiled, backward_smooth(weights, moves, lag=lag), rtol=1e-5, atol=1e-5)
+
+
+def test_densities_of_pairs(float64):
+    values, means, root = torch.randn(3, 4, 2), torch.randn(3, 4, 2), torch.randn(3, 2, 2)
+    cov = root @ root.mT + torch.eye(2)
+    found = log_density_of_pairs(values, means, cov)
+    for i in range(4):
+        for j in range(4):
+            assert_close(found[:, i, j], gaussian_log_prob(values[:, j], means[:, i], cov))
+
+
+@pytest.mark.parametrize("previous", [False, True])
+def test_each_step_uses_the_action_that_led_into_it(float64, previous):
+    """The action stored at a time leads out of it; a policy's data store it one step later."""
+    control = torch.tensor([[3.0], [-2.0]])
+    filter = particles(5, control=control)
+    frames = drive(2, 4, resets=False, missing=0.0).exclude("observed")
+    action = torch.randn(2, 4, 1)
+    frames["action"] = action
+    out = filter.sequence(frames)
+    if previous:
+        out["previous", "action"] = torch.cat([torch.zeros(2, 1, 1), action[:, :-1]], 1)
+        del out["action"]
+    entries = {key: out[key] for key in out.keys(True, True)}
+    density = ParticleSmoother(filter)._densities(entries, out["belief", "ensemble"], out["belief", "log_weight"])
+    F, Q, _, _ = linear_system()
+    moved = out["belief", "ensemble"] @ F.mT + (action @ control.mT).unsqueeze(-2)
+    expected = log_density_of_pairs(out["belief", "ensemble"][:, 1:], moved[:, :-1], Q.expand(2, 3, 2, 2))
+    assert_close(density[:, 1:], expected, rtol=0, atol=1e-9)
+
+
+def test_what_cannot_be_smoothed_says_so():
+    with pytest.raises(TypeError, match="smooths particles"):
+        ParticleSmoother(linear_denkf())
+    F, Q, H, R = linear_system()
+    own = ParticleFilter(
+        NoisyLinear(F, Q),
+        None,
+        LinearObservation(H),
+        GaussianLikelihood(sensor_key="observation"),
+        noise=ConstantNoise(R.sqrt(), in_key="observation"),
+        initial=GaussianPrior(MEAN, [1.0, 1.0], ensemble_size=5),
+    )
+    with pytest.raises(TypeError, match="density of the motion"):
+        ParticleSmoother(own)
+    with pytest.raises(ValueError, match="picks none"):
+        FixedLag(particles(5, resampling="transport"), 2)
+    assert FixedLag(own, 2).sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))["smoothed", "mean"].ndim == 2

@@ -1,0 +1,107 @@
+"""RTS against one dense solve over all states; the UKF and the EKF are exact on a linear system."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.filters.factories import linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
+from tests.smoothers.joint import drive, joint_beliefs
+from torch_denkf.functional import rts_smooth
+from torch_denkf.smoothers import FixedLag, RTSSmoother
+
+FILTERS = {"Kalman": linear_kalman, **{name: name for name in ("EKF", "UKF", "BackpropKF")}}
+
+
+def make(name):
+    return linear_kalman() if name == "Kalman" else linear_filter(name)
+
+
+@pytest.mark.parametrize("lag", [None, 0, 1, 3])
+@pytest.mark.parametrize("name", FILTERS)
+def test_each_state_is_that_of_the_joint_gaussian(float64, name, lag):
+    frames = drive(4, 9)
+    mean, cov = joint_beliefs(frames, lag)
+    out = RTSSmoother(make(name), lag)(frames.copy())
+    assert_close(out["smoothed", "mean"], mean, rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "cov"], cov, rtol=0, atol=1e-10)
+    assert out["smoothed", "var"].equal(out["smoothed", "cov"].diagonal(dim1=-2, dim2=-1))
+    filtered = make(name).sequence(frames.copy())
+    assert_close(out["belief", "mean"], filtered["belief", "mean"], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_online_lag_says_it_that_much_later(float64, name):
+    lag, frames = 3, drive(4, 9)
+    out = FixedLag(make(name), lag).sequence(frames.copy())
+    age = out["smoothed", "age"].squeeze(-1)
+    for t in range(9):
+        whole = joint_beliefs(frames[:, : t + 1])  # all readings up to now
+        at = (t - age[:, t]).unsqueeze(-1)
+        mean, cov = (value[torch.arange(4), at.squeeze(-1)] for value in whole)
+        assert_close(out["smoothed", "mean"][:, t], mean, rtol=0, atol=1e-10)
+        assert_close(out["smoothed", "cov"][:, t], cov, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_an_update_at_the_first_frame_counts_for_the_past_too(float64, name):
+    frames = drive(3, 6, resets=False, missing=0.0)
+    filter = make(name)
+    filter.update_at_reset = True
+    whole = RTSSmoother(filter)(frames.copy())
+    online = FixedLag(filter, 5).sequence(frames.copy())
+    assert_close(online["smoothed", "mean"][:, -1], whole["smoothed", "mean"][:, 0], rtol=0, atol=1e-10)
+    assert_close(online["smoothed", "mean"][:, 0], online["belief", "mean"][:, 0], rtol=0, atol=1e-10)
+    assert online["smoothed", "age"][0].flatten().tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_gradients_are_those_of_finite_differences(float64):
+    frames = drive(1, 4, missing=0.0, resets=False)
+    F = linear_system()[0]
+    filtered = RTSSmoother(linear_kalman())(frames)
+    beliefs = [filtered["belief", "mean"], filtered["belief", "cov"]]
+    beliefs += [filtered["forecast", "mean"], filtered["forecast", "cov"]]
+    cross = torch.cat([torch.zeros(1, 1, 2, 2), filtered["belief", "cov"][:, :-1] @ F.mT], 1)
+    inputs = [value.detach().requires_grad_() for value in (*beliefs, cross)]
+    follows = torch.tensor([[False, True, True, False]])
+
+    for options in ({"follows": follows}, {"lag": 1}):
+
+        def smooth(mean, cov, forecast, forecast_cov, cross, options=options):
+            symmetric = [(value + value.mT) / 2 for value in (cov, forecast_cov)]
+            return rts_smooth(mean, symmetric[0], forecast, symmetric[1], cross, **options)
+
+        assert torch.autograd.gradcheck(smooth, inputs)
+
+
+@pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
+def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
+    filter, frames = learned_filter(name), learned_frames(3, 5)
+    for smoother in (RTSSmoother(filter), FixedLag(filter, 2)):
+        directional_check(
+            lambda smoother=smoother: sum(
+                smoother.sequence(frames.copy())["smoothed", key].square().sum() for key in ("mean", "cov")
+            ),
+            filter.parameters(),
+        )
+
+
+def test_compiled_functions_are_the_eager_ones():
+    frames = RTSSmoother(linear_kalman())(drive(2, 5))
+    values = [frames["belief", "mean"], frames["belief", "cov"], frames["forecast", "mean"], frames["forecast", "cov"]]
+    values.append(frames["belief", "cov"])
+    for lag in (None, 2):
+        eager = rts_smooth(*values, lag=lag)
+        compiled = torch.compile(rts_smooth, fullgraph=True, backend="aot_eager")(*values, lag=lag)
+        assert_close(compiled, eager, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_any_batch_and_precision(batch):
+    frames = drive(1, 5, resets=False)[0].expand(*batch, 5).clone()
+    out = RTSSmoother(linear_kalman())(frames.copy())
+    assert out["smoothed", "mean"].dtype == torch.float32
+    frames["observation"] = frames["observation"].double()
+    exact = RTSSmoother(linear_kalman().double())(frames)
+    assert_close(out["smoothed", "mean"].double(), exact["smoothed", "mean"], rtol=0, atol=1e-5)
+    assert_close(out["smoothed", "cov"].double(), exact["smoothed", "cov"], rtol=0, atol=1e-5)

@@ -1,0 +1,79 @@
+"""The belief of t - lag beside that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv, check_env_specs
+
+from tests.filters.factories import assert_equal, linear_kalman
+from tests.transforms import envs_for_tests as envs
+from torch_denkf.smoothers import EnKS, FixedLag, RTSSmoother
+from torch_denkf.transforms import DEnKFTransform
+
+LAG = 2
+KEYS = [("smoothed", name) for name in ("mean", "var", "age")]
+FILTERS = {"ensemble": envs.fixed_filter, "Kalman": linear_kalman}
+
+
+def lagged_env(name, **kwargs):
+    env = TransformedEnv(envs.base_env(**kwargs), DEnKFTransform(FILTERS[name](), lag=LAG))
+    return TransformedEnv(env, InitTracker())
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("batch", [[], [2]])
+def test_specs(name, batch):
+    check_env_specs(lagged_env(name, batch_size=batch, max_steps=4))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_rollout_is_the_recording_smoothed(float64, name):
+    """Rows reset at different times; what an environment says later is what the smoother says of the time before."""
+    env = lagged_env(name, batch_size=[2], max_steps=[3, 7], seed=0)
+    rollout = envs.random_rollout(env, 12)
+    assert rollout["is_init"].sum() == 6, "both rows start anew inside"
+    online = FixedLag(FILTERS[name](), LAG)
+    frames = rollout.select("observation", "observed", "is_init")
+    assert_equal(rollout, online.sequence(frames.copy()), [*KEYS, ("belief", "mean")], atol=1e-9)
+    smoother = EnKS if name == "ensemble" else RTSSmoother
+    whole = smoother(FILTERS[name](), LAG)(frames.copy())
+    age = rollout["smoothed", "age"].squeeze(-1)
+    for row in range(2):
+        for t in range(LAG, 12):
+            if age[row, t] == LAG:
+                for key in ("mean", "var"):
+                    now, then = rollout["smoothed", key][row, t], whole["smoothed", key][row, t - LAG]
+                    torch.testing.assert_close(now, then, rtol=0, atol=1e-9)
+    assert (age == LAG).sum() > 5
+
+
+def test_in_workers_and_in_a_collector():
+    make = partial(lagged_env, "ensemble", max_steps=4)
+    parallel = ParallelEnv(2, make)
+    try:
+        check_env_specs(parallel)
+        rollout = parallel.rollout(6, break_when_any_done=False)
+        assert rollout["next", "smoothed", "mean"].shape == (2, 6, 2)
+        assert rollout["smoothed", "age"][0, :, 0].tolist() == [0, 1, 2, 2, 0, 1]
+    finally:
+        parallel.close()
+    collector = Collector(make, frames_per_batch=8, total_frames=8)
+    for data in collector:
+        assert data["next", "smoothed", "mean"].isfinite().all()
+    collector.shutdown()
+
+
+def test_what_is_stored_without_the_ensemble():
+    transform = DEnKFTransform(envs.fixed_filter(), lag=LAG, store_ensemble=False)
+    env = TransformedEnv(envs.base_env(batch_size=[2], max_steps=4), transform)
+    check_env_specs(env)
+    rollout = envs.random_rollout(env)
+    assert set(rollout["smoothed"].keys()) == {"mean", "var", "age"}
+    assert set(rollout["belief"].keys()) == {"mean", "var"}
+
+
+def test_a_filter_that_cannot_be_smoothed_is_refused():
+    with pytest.raises(TypeError, match="carries a past already"):
+        DEnKFTransform(FixedLag(envs.fixed_filter(), 2), lag=2)

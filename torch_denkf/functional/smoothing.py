@@ -1,0 +1,155 @@
+r"""The Rauch-Tung-Striebel smoother: what later readings say about an earlier state, as a mean and a covariance.
+
+The step from t to t + 1 leaves a forecast m_f, P_f and the cross-covariance C of the state before and the state after
+it. With the gain :math:`G = C P_f^{-1}` the smoothed belief of t follows from that of t + 1. Only C differs between
+filters: P Fᵀ in a Kalman filter, with the Jacobian F in an extended one, from sigma points in an unscented one.
+
+Source: Rauch, Tung & Striebel 1965; Särkkä 2013, theorem 8.2 and section 9 (for the EKF and the UKF).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf._checks import check_shape
+from torch_denkf.functional.linalg import semidefinite_solve
+
+
+def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
+    """The smoother's gain G = C P_f⁻¹, also for a singular P_f.
+
+    Args:
+        cross: C, the covariance of the state at t and the state at t + 1, ``[*B, S, S]``, rows at t.
+        forecast_cov: P_f of t + 1, ``[*B, S, S]``.
+
+    Returns:
+        G, ``[*B, S, S]``.
+
+    Examples:
+        >>> import torch
+        >>> smoothing_gain(torch.tensor([[1.0]]), torch.tensor([[2.0]]))
+        tensor([[0.5000]])
+    """
+    return semidefinite_solve(forecast_cov, cross.mT).mT
+
+
+def rts_step(
+    mean: Tensor,
+    cov: Tensor,
+    forecast_mean: Tensor,
+    forecast_cov: Tensor,
+    cross: Tensor,
+    smoothed_mean: Tensor,
+    smoothed_cov: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """One step back in time: the smoothed belief of t from that of t + 1.
+
+    The covariance is (P − G P_f Gᵀ) + G P_s Gᵀ: what the next state leaves open, and what is not known of that.
+
+    Args:
+        mean: of the filter's belief at t, ``[*B, S]``.
+        cov: P, its covariance, ``[*B, S, S]``.
+        forecast_mean: of t + 1, ``[*B, S]``.
+        forecast_cov: P_f, ``[*B, S, S]``.
+        cross: C, the covariance of the states at t and t + 1 in that forecast, ``[*B, S, S]``, rows at t.
+        smoothed_mean: of t + 1, ``[*B, S]``.
+        smoothed_cov: P_s of t + 1, ``[*B, S, S]``.
+
+    Returns:
+        The smoothed mean ``[*B, S]`` and covariance ``[*B, S, S]`` of t.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        A random walk with P = Q = 1, whose next state turns out to be 2, exactly:
+
+        >>> import torch
+        >>> zero, one = torch.zeros(1), torch.ones(1, 1)
+        >>> mean, cov = rts_step(zero, one, zero, 2 * one, one, 2 * torch.ones(1), 0 * one)
+        >>> mean.round(decimals=4), cov.round(decimals=4)
+        (tensor([1.]), tensor([[0.5000]]))
+    """
+    square = (*mean.shape, mean.shape[-1])
+    for name, value in (("forecast_mean", forecast_mean), ("smoothed_mean", smoothed_mean)):
+        check_shape(name, value, mean.shape, "[*B, S]")
+    for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross), ("smoothed_cov", smoothed_cov)):
+        check_shape(name, value, square, "[*B, S, S]")
+    gain = smoothing_gain(cross, forecast_cov)
+    shift = gain @ (smoothed_mean - forecast_mean).unsqueeze(-1)
+    out = cov - gain @ cross.mT + gain @ smoothed_cov @ gain.mT
+    return mean + shift.squeeze(-1), (out + out.mT) / 2
+
+
+def rts_smooth(
+    mean: Tensor,
+    cov: Tensor,
+    forecast_mean: Tensor,
+    forecast_cov: Tensor,
+    cross: Tensor,
+    *,
+    follows: Tensor | None = None,
+    lag: int | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Smooth the beliefs of a whole sequence.
+
+    Args:
+        mean: of the filter's beliefs, ``[*B, T, S]``.
+        cov: their covariances, ``[*B, T, S, S]``.
+        forecast_mean: of each time, made from the belief before it, ``[*B, T, S]``.
+        forecast_cov: likewise, ``[*B, T, S, S]``.
+        cross: the covariance of the state before and the state at each time, ``[*B, T, S, S]``, rows before.
+        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it, such as the first
+            of an episode: nothing flows back from there. The first element's is not read. None: all follow.
+        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+
+    Returns:
+        The smoothed means ``[*B, T, S]`` and covariances ``[*B, T, S, S]``.
+
+    Raises:
+        ValueError: if the shapes do not fit, or ``lag`` is negative.
+
+    Examples:
+        >>> import torch
+        >>> mean, cov = torch.tensor([[0.0], [2.0]]), torch.tensor([[[1.0]], [[0.0]]])
+        >>> smoothed, _ = rts_smooth(mean, cov, torch.zeros(2, 1), 2 * torch.ones(2, 1, 1), torch.ones(2, 1, 1))
+        >>> smoothed.flatten().round(decimals=4)
+        tensor([1., 2.])
+    """
+    check_lag(lag)
+    values = (mean[..., :-1, :], cov[..., :-1, :, :]), (forecast_mean[..., 1:, :], forecast_cov[..., 1:, :, :])
+    (before, before_cov), (forecast, predicted_cov), link = *values, cross[..., 1:, :, :]
+    if follows is not None:
+        check_shape("follows", follows, mean.shape[:-1], "[*B, T]")
+        follows = follows[..., 1:]
+
+    def back(index: slice | int, later_mean: Tensor, later_cov: Tensor) -> tuple[Tensor, Tensor]:
+        own = before[..., index, :], before_cov[..., index, :, :]
+        step = forecast[..., index, :], predicted_cov[..., index, :, :], link[..., index, :, :]
+        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov)
+        if follows is None:
+            return new_mean, new_cov
+        joined = follows[..., index].unsqueeze(-1)
+        return torch.where(joined, new_mean, own[0]), torch.where(joined.unsqueeze(-1), new_cov, own[1])
+
+    count = mean.shape[-2]
+    if lag is None or lag >= count - 1:
+        means, covs = [mean[..., -1, :]], [cov[..., -1, :, :]]
+        for t in range(count - 2, -1, -1):
+            new_mean, new_cov = back(t, means[-1], covs[-1])
+            means.append(new_mean)
+            covs.append(new_cov)
+        return torch.stack(means[::-1], -2), torch.stack(covs[::-1], -3)
+    smoothed, smoothed_cov = mean, cov
+    for _ in range(lag):  # all times at once: each round takes in one more reading
+        moved = back(slice(None), smoothed[..., 1:, :], smoothed_cov[..., 1:, :, :])
+        smoothed = torch.cat([moved[0], mean[..., -1:, :]], -2)
+        smoothed_cov = torch.cat([moved[1], cov[..., -1:, :, :]], -3)
+    return smoothed, smoothed_cov
+
+
+def check_lag(lag: int | None) -> None:
+    """Raise ``ValueError`` for a negative lag."""
+    if lag is not None and lag < 0:
+        raise ValueError(f"lag counts the later readings that are used, 0 or more, or None for all; got {lag}.")

@@ -1,0 +1,186 @@
+r"""Fixed-lag smoothing of a mean and a covariance: the last L states of a Kalman filter, corrected by each reading.
+
+Of a state :math:`x_{t-j}` three things are carried: its smoothed mean, the product D of the smoother's gains of the
+steps since, and the covariance V that :math:`x_{t-j}` would keep if :math:`x_t` were known. With the belief of t,
+P, the covariance is :math:`V + D P D^T`, and a reading that moves the mean of t by d moves that of t - j by D d. It is
+the Rauch-Tung-Striebel smoother, forward in time, and does not ask how the reading was used.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf.functional import smoothing_gain
+from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._gaussian import GaussianTransition
+from torch_denkf.modules.kalman import LinearTransition
+from torch_denkf.modules.past import InPlaceOf, check_positive_lag, copy_sizes
+
+__all__ = ["CrossTransition", "LaggedMoments", "MomentsPast", "WithMomentsPast"]
+
+_PAST = ("past_mean", "past_cov", "past_gain")
+
+
+class CrossTransition(InPlaceOf):
+    """A forecast of mean and covariance, with the covariance of the states before and after the step.
+
+    Args:
+        transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
+            are kept.
+        cross_key: the covariance, ``[*B, S, S]``, rows before the step.
+
+    Raises:
+        TypeError: for another transition.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> double = CrossTransition(LinearTransition(2 * torch.eye(1), torch.eye(1)))
+        >>> double(TensorDict({"belief": {"mean": torch.ones(1), "cov": torch.eye(1)}}))["forecast", "cross"]
+        tensor([[2.]])
+    """
+
+    def __init__(
+        self,
+        transition: LinearTransition | GaussianTransition,
+        *,
+        cross_key: NestedKey = ("forecast", "cross"),
+    ):
+        if not isinstance(transition, LinearTransition | GaussianTransition):
+            raise TypeError(
+                f"{type(transition).__name__} does not give the covariance of the states before and after a step; "
+                "LinearTransition, EKFTransition and UKFTransition do."
+            )
+        needed, optional = reads(transition)
+        super().__init__(transition, needed, [*transition.out_keys, cross_key], optional_keys=optional)
+
+    def on_entries(self, entries, call):
+        """The forecast and the cross-covariance."""
+        written, cross = self.module.with_cross(entries, call, wanted=True)
+        return {**written, unravel_key(self.out_keys[-1]): cross}
+
+
+class WithMomentsPast(InPlaceOf):
+    """An initial mean and covariance with a past: L copies of them.
+
+    Args:
+        initial: writes ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]``.
+        lag: L.
+        age: see :class:`WithEnsemblePast`.
+        belief_key: prefix of what ``initial`` writes, and of ``past_mean`` ``[*B, L, S]``, ``past_cov`` and
+            ``past_gain`` ``[*B, L, S, S]``, the latest first.
+        smoothed_key: prefix of ``mean``, ``cov``, ``var`` and ``age``, see :class:`LaggedMoments`.
+
+    Raises:
+        ValueError: if ``lag`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> start = WithMomentsPast(MomentPrior(torch.zeros(2), torch.eye(2)), lag=3)
+        >>> start(TensorDict({}))["belief", "past_gain"].shape
+        torch.Size([3, 2, 2])
+    """
+
+    def __init__(
+        self,
+        initial: TensorDictModuleBase,
+        lag: int,
+        *,
+        age: int = 0,
+        belief_key: str = "belief",
+        smoothed_key: str = "smoothed",
+    ):
+        check_positive_lag(lag)
+        needed, optional = reads(initial)
+        own = [*((belief_key, name) for name in _PAST), *((smoothed_key, name) for name in _SMOOTHED)]
+        super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
+        self.lag, self.age, self.belief_key = lag, age, belief_key
+        copy_sizes(initial, self)
+
+    def on_entries(self, entries, call):
+        """The belief and its past: the state itself, of which nothing is left open."""
+        written = run_module(self.module, entries, call)
+        mean, cov = written[self.belief_key, "mean"], written[self.belief_key, "cov"]
+        gain = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
+        past = [torch.stack([value] * self.lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
+        age = torch.full((*call.batch_size, 1), self.age, device=mean.device)
+        own = (*past, mean, cov, cov.diagonal(dim1=-2, dim2=-1), age)
+        return {**written, **dict(zip(map(unravel_key, self.out_keys[-7:]), own, strict=True))}
+
+
+_SMOOTHED = ("mean", "cov", "var", "age")
+
+
+class MomentsPast(SubModel):
+    """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
+
+    Args:
+        belief_key: prefix of ``mean``, ``cov`` and of the past, see :class:`WithMomentsPast`.
+        forecast_key: prefix of ``cov`` and ``cross`` of the forecast, see :class:`CrossTransition`.
+        smoothed_key: prefix of ``age``.
+        out_key: prefix of ``mean``, ``cov`` and ``gain`` of the past at the new time, before its reading.
+    """
+
+    def __init__(
+        self,
+        *,
+        belief_key: str = "belief",
+        forecast_key: str = "forecast",
+        smoothed_key: str = "smoothed",
+        out_key: str = "past",
+    ):
+        in_keys = [(belief_key, "mean"), (belief_key, "cov"), (forecast_key, "cov"), (forecast_key, "cross")]
+        in_keys += [*((belief_key, name) for name in _PAST), (smoothed_key, "age")]
+        super().__init__(nn.Identity(), in_keys, [(out_key, name) for name in ("mean", "cov", "gain")])
+
+    def compute(self, mean, cov, forecast_cov, cross, past_mean, past_cov, past_gain, age):
+        """The past."""
+        # At the start of an episode, before its own frame, no step has been made.
+        start = (age < 0).unsqueeze(-1)
+        identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+        gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, forecast_cov)))
+        left_open = torch.where(start, 0, cov - gain @ torch.where(start, 0, cross.mT))
+        means = torch.cat([mean.unsqueeze(-2), past_mean[..., :-1, :]], -2)
+        gains = torch.cat([identity.expand(cov.shape).unsqueeze(-3), past_gain[..., :-1, :, :]], -3)
+        opens = torch.cat([torch.zeros_like(cov).unsqueeze(-3), past_cov[..., :-1, :, :]], -3)
+        opens = opens + gains @ left_open.unsqueeze(-3) @ gains.mT
+        return means, (opens + opens.mT) / 2, gains @ gain.unsqueeze(-3)
+
+
+class LaggedMoments(SubModel):
+    """The past after a reading, and what is believed of the state L steps ago.
+
+    Args:
+        belief_key: prefix of ``mean``, ``cov`` and of the past that is carried on, see :class:`WithMomentsPast`.
+        forecast_key: prefix of ``mean`` of the forecast.
+        smoothed_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]``, ``var`` ``[*B, S]`` and ``age``
+            ``[*B, 1]``, see :class:`LaggedBelief`.
+        past_key: prefix of what :class:`MomentsPast` writes.
+    """
+
+    def __init__(
+        self,
+        *,
+        belief_key: str = "belief",
+        forecast_key: str = "forecast",
+        smoothed_key: str = "smoothed",
+        past_key: str = "past",
+    ):
+        in_keys = [(belief_key, "mean"), (belief_key, "cov"), (forecast_key, "mean")]
+        in_keys += [*((past_key, name) for name in ("mean", "cov", "gain")), (smoothed_key, "age")]
+        out_keys = [*((belief_key, name) for name in _PAST), *((smoothed_key, name) for name in _SMOOTHED)]
+        super().__init__(nn.Identity(), in_keys, out_keys)
+
+    def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
+        """The past, and the belief of its oldest state."""
+        shift = (past_gain @ (mean - forecast)[..., None, :, None]).squeeze(-1)
+        past_mean, gain = past_mean + shift, past_gain[..., -1, :, :]
+        smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
+        smoothed = (smoothed + smoothed.mT) / 2
+        variance = smoothed.diagonal(dim1=-2, dim2=-1)
+        oldest = past_mean[..., -1, :]
+        age = (age + 1).clamp(max=past_mean.shape[-2])
+        return past_mean, past_cov, past_gain, oldest, smoothed, variance, age

@@ -1,0 +1,133 @@
+"""One base for all smoothers of sequences: filter, see which elements follow each other, smooth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torch_denkf.filters import Filter
+from torch_denkf.filters._slices import as_rows, starts_of
+from torch_denkf.functional.smoothing import check_lag
+from torch_denkf.modules._base import Entries
+
+__all__ = ["Smoother"]
+
+
+class Smoother(TensorDictModuleBase):
+    """Filters a sequence ``[*B, T]``, then says what each state looks like given what came later.
+
+    It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
+    ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
+    state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t what it believes of t - lag.) Nothing
+    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` heeds. The gradient flows
+    through filter and smoother.
+
+    A subclass writes :meth:`_smooth`, and :meth:`_extended` where the filter must say more than it does by itself.
+
+    Args:
+        filter: the filter; its parameters are the smoother's.
+        lag: how many later readings count; ``None`` for all that there are (fixed interval).
+        needed: keys of the filter's output that the smoother needs.
+        written: last names of what it writes.
+
+    Raises:
+        ValueError: if ``lag`` is negative.
+    """
+
+    def __init__(self, filter: Filter, lag: int | None, needed: Iterable[NestedKey], written: Iterable[str]):
+        super().__init__()
+        check_lag(lag)
+        self.filter, self.lag, self._needed = filter, lag, list(needed)
+        self.smoothed_keys: list[NestedKey] = [("smoothed", name) for name in written]
+        self.in_keys = list(filter.in_keys)
+        self.out_keys = [*filter.out_keys, *self.smoothed_keys]
+        self._running: tuple = (None, None)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Like :meth:`sequence`."""
+        return self.sequence(tensordict)
+
+    def sequence(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        detach_every: int | None = None,
+        keep: Sequence[NestedKey] | None = None,
+    ) -> TensorDictBase:
+        """Filters and smooths ``[*B, T]``; takes what :meth:`Filter.sequence` takes.
+
+        Args:
+            tensordict: frames, see there.
+            detach_every: truncates back-propagation through the filter's time; what flows back from later states does
+                not stop there.
+            keep: the filter's outputs to write beside the smoothed belief; all by default.
+
+        Returns:
+            ``tensordict``, with the outputs.
+
+        Raises:
+            ValueError: where :meth:`Filter.sequence` does.
+            KeyError: likewise.
+        """
+        keep = list(self.filter.out_keys) if keep is None else list(keep)
+        rows, new = as_rows(tensordict, starts_of(tensordict, self.filter.init_key))
+        wanted = list(dict.fromkeys([*keep, *self._needed]))
+        filter = self._filter_for(rows.batch_size[-1] if rows.ndim else 0)
+        out = filter.sequence(rows.copy(), detach_every=detach_every, keep=wanted)
+        # A step from the element before: not from a stored belief, as where a slice of a policy's data begins.
+        follows = self.filter.stepped(rows)
+        if new is not None:
+            follows = follows & ~new.reshape(rows.batch_size)
+        smoothed = self._smooth({key: out.get(key) for key in out.keys(True, True)}, follows, out)
+        written = {**{key: out.get(key) for key in keep}, **dict(zip(self.smoothed_keys, smoothed, strict=True))}
+        for key, value in written.items():
+            tensordict.set(key, value if rows is tensordict else value.flatten(0, 1))
+        return tensordict
+
+    def stepped(self, tensordict: TensorDictBase) -> Tensor:
+        """Which elements were stepped to, see :meth:`Filter.stepped`."""
+        return self.filter.stepped(tensordict)
+
+    def _filter_for(self, count: int) -> Filter:
+        """The filter that runs on sequences of ``count`` steps; made anew where a module has been replaced."""
+        self.filter.structure  # noqa: B018 - sorts the modules anew
+        made_for = (self.lag if self.lag is not None else max(count - 1, 1), *self.filter._sorted_for)
+        if self._running[0] != made_for:
+            self._running = (made_for, self._extended(made_for[0]))
+        filter, compiled = self._running[1], self.filter.compiled
+        if filter is not self.filter and (filter.compiled is None) != (compiled is None):
+            filter.compile(**({"chunk": 0} if compiled is None else {"chunk": compiled.chunk, **compiled.options}))
+        return filter
+
+    def _extended(self, lag: int) -> Filter:
+        """The filter, or one of the same modules that also writes what the smoother needs."""
+        return self.filter
+
+    def _smooth(self, entries: Entries, follows: Tensor, out: TensorDictBase) -> tuple[Tensor, ...]:
+        """The smoothed belief, in the order of ``smoothed_keys``.
+
+        Args:
+            entries: ``[*B, T, ...]``, what is read and what the filter wrote.
+            follows: which elements are a step on from those before them, ``[*B, T]``; the first is not read.
+            out: the same as a tensordict.
+        """
+        raise NotImplementedError
+
+
+def last_of_runs(follows: Tensor) -> Tensor:
+    """The last index of each element's run of elements that follow each other, ``[*B, T]``.
+
+    Example:
+        >>> last_of_runs(torch.tensor([False, True, False, True, True])).tolist()
+        [1, 1, 4, 4, 4]
+    """
+    count = follows.shape[-1]
+    ends = torch.ones_like(follows)
+    ends[..., :-1] = ~follows[..., 1:]
+    index = torch.arange(count, device=follows.device).expand(follows.shape)
+    # Of the ends at or after each element the first: a running minimum from behind.
+    return torch.where(ends, index, count).flip(-1).cummin(-1).values.flip(-1)

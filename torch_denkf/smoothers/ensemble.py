@@ -1,0 +1,127 @@
+"""Ensemble smoothers of recordings: the ensemble Kalman smoother, and the ensemble Rauch-Tung-Striebel smoother."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf.filters import Filter
+from torch_denkf.filters._structure import submodels
+from torch_denkf.functional import enrts_smooth
+from torch_denkf.modules.past import moments_of
+from torch_denkf.smoothers.base import Smoother, last_of_runs
+from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of
+
+__all__ = ["EnKS", "EnRTS"]
+
+
+class EnRTS(Smoother):
+    """Ensemble Rauch-Tung-Striebel smoother: one pass back over what the filter wrote.
+
+    The gain of each step back is a regression of members on their own forecasts. It asks nothing of the analysis, and
+    costs about as much as the filter's analysis. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and
+    ``var``, see :class:`Smoother`.
+
+    Args:
+        filter: an ensemble filter. Its analysis must keep members in their places: not ``rotate=True``.
+        lag: how many later readings count; ``None`` for all.
+
+    Raises:
+        TypeError: for a filter without an ensemble.
+        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own.
+
+    Reference:
+        Raanes, "On the ensemble Rauch-Tung-Striebel smoother and its equivalence to the ensemble Kalman smoother",
+        Q. J. R. Meteorol. Soc. 142, 2016.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import DEnKF
+        >>> smoother = EnRTS(DEnKF.paper(5, 2, ensemble_size=8))
+        >>> out = smoother(TensorDict({"pixels": torch.rand(2, 3, 6, 50, 150)}, [2, 3]))
+        >>> out["smoothed", "ensemble"].shape
+        torch.Size([2, 3, 8, 5])
+    """
+
+    def __init__(self, filter: Filter, lag: int | None = None):
+        kind, prefix = kind_of(filter)
+        if kind != "ensemble":
+            raise TypeError(f"EnRTS smooths an ensemble; {type(filter).__name__} carries {filter.carry_keys}.")
+        if any(getattr(part, "rotate", False) for part in submodels(filter)):
+            raise ValueError(
+                "An analysis with rotate=True gives each member another's place, so that EnRTS cannot tell what a "
+                "member's forecast was. Turn the rotation off, or use EnKS, which rotates the past as well."
+            )
+        keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
+        super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
+
+    def _smooth(self, entries, follows, out):
+        ensemble = enrts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag)
+        return ensemble, *moments_of(ensemble, None)
+
+
+class EnKS(Smoother):
+    """Ensemble Kalman smoother: each analysis corrects the members of the past L steps, too.
+
+    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the past as well,
+    so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
+    :class:`EnRTS` for long recordings. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and ``var``,
+    see :class:`Smoother`.
+
+    Args:
+        filter: an ensemble filter, see :class:`FixedLag`.
+        lag: how many later readings count; ``None`` for all.
+
+    Raises:
+        TypeError: for another filter.
+
+    Reference:
+        Evensen & van Leeuwen, "An ensemble Kalman smoother for nonlinear dynamics", Monthly Weather Review 128, 2000.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import DEnKF
+        >>> smoother = EnKS(DEnKF.paper(5, 2, ensemble_size=8), lag=2)
+        >>> out = smoother(TensorDict({"pixels": torch.rand(2, 3, 6, 50, 150)}, [2, 3]))
+        >>> out["smoothed", "mean"].shape
+        torch.Size([2, 3, 5])
+    """
+
+    def __init__(self, filter: Filter, lag: int | None = None):
+        kind, self.prefix = kind_of(filter)
+        if kind != "ensemble":
+            raise TypeError(f"EnKS smooths an ensemble; {type(filter).__name__} carries {filter.carry_keys}.")
+        keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
+        super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
+        self._filter_for(2)  # refuses what a lag cannot be added to
+
+    def _extended(self, lag):
+        return FixedLag(self.filter, lag) if lag else self.filter
+
+    def _smooth(self, entries, follows, out):
+        if self.lag == 0:
+            ensemble = entries[self.prefix, "ensemble"]
+        else:
+            ensemble = of_own_time(entries[self.prefix, "ensemble"], entries[self.prefix, "past"], follows)[0]
+        return ensemble, *moments_of(ensemble, None)
+
+
+def of_own_time(ensemble: Tensor, past: Tensor, follows: Tensor) -> tuple[Tensor, Tensor]:
+    """The members of each time as they are L steps later, or at the end of their episode.
+
+    Args:
+        ensemble: ``[*B, T, E, S]``.
+        past: at each time that of the L times before, ``[*B, T, E, L, S]``.
+        follows: ``[*B, T]``, see :class:`Smoother`.
+
+    Returns:
+        The members ``[*B, T, E, S]``, and the time at which they are so, ``[*B, T]``.
+    """
+    batch, (count, lag) = ensemble.shape[:-3], (ensemble.shape[-3], past.shape[-2])
+    now = torch.arange(count, device=ensemble.device)
+    later = torch.minimum(now + lag, last_of_runs(follows)).reshape(-1, count)
+    whole = torch.cat([ensemble.unsqueeze(-2), past], -2).movedim(-2, -3)  # [*B, T, L + 1, E, S], the present first
+    whole = whole.reshape(-1, *whole.shape[len(batch) :])
+    rows = torch.arange(len(whole), device=ensemble.device).unsqueeze(-1)
+    found = whole[rows, later, later - now]
+    return found.reshape(ensemble.shape), later.reshape(follows.shape)

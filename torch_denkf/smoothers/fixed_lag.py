@@ -1,0 +1,175 @@
+"""Fixed-lag smoothing online: any filter, with its last states beside its belief."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+
+from torch_denkf.filters import Filter
+from torch_denkf.modules import ResampledTransition
+from torch_denkf.modules._base import named_modules_of
+from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules.past import EnsemblePast, LaggedAnalysis, LaggedBelief, WithEnsemblePast
+from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, MomentsPast, WithMomentsPast
+
+__all__ = ["FixedLag", "kind_of", "rebuilt"]
+
+
+class FixedLag(Filter):
+    """A filter that also says, at each step, what it now believes of the state L steps ago.
+
+    The belief of t is the filter's own. Beside it stand ``("smoothed", "mean")`` and ``("smoothed", "var")``,
+    ``[*B, S]``, of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``: by how many
+    steps that state lies back, which is L, or fewer where the episode is younger. How it is done follows from the
+    belief:
+
+    =====================  ========================================================================  ==================
+    belief                 smoother                                                                  further entries
+    =====================  ========================================================================  ==================
+    ensemble               ensemble Kalman smoother: each analysis corrects the past's members, too  ``ensemble``
+    mean and covariance    Rauch-Tung-Striebel, forward in time                                      ``cov``
+    particles              their ancestors, with the present weights (Kitagawa 1996)                 ``ensemble``
+    =====================  ========================================================================  ==================
+
+    It is a :class:`~torch_denkf.filters.Filter` itself: steps, sequences, masks, resets, policies, transforms, replay
+    buffers and compiled steps work as with any other, and the gradient goes through it. The past is part of what it
+    carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is there already,
+    use :class:`EnKS`, :class:`EnRTS`, :class:`RTSSmoother` or :class:`ParticleSmoother`.
+
+    Args:
+        filter: an ensemble filter whose analyses are :class:`~torch_denkf.modules.EnsembleAnalysis` or
+            :class:`~torch_denkf.modules.LocalEnsembleAnalysis`, a Kalman, extended or unscented Kalman filter, or a
+            particle filter that does not resample by transport.
+        lag: L, in steps.
+
+    Raises:
+        TypeError: for another filter.
+        ValueError: if ``lag`` is not positive.
+
+    Reference:
+        Evensen & van Leeuwen, "An ensemble Kalman smoother for nonlinear dynamics", Monthly Weather Review 128, 2000.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> kf = FixedLag(KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one), lag=2)
+        >>> out = kf.sequence(TensorDict({"observation": torch.ones(4, 1)}, [4]))
+        >>> out["smoothed", "age"].flatten(), out["smoothed", "var"][-1] < out["belief", "var"][-1]
+        (tensor([0, 1, 2, 2]), tensor([True]))
+    """
+
+    def __init__(self, filter: Filter, lag: int):
+        kind, prefix = kind_of(filter)
+        age = -1 if filter.update_at_reset else 0
+        modules = OrderedDict(named_modules_of(filter))
+        names = list(modules)
+        place = names.index(filter.structure.transition[0])
+        if kind == "moments":
+            forecast = filter.structure.forecast_of[prefix, "mean"][0]
+            modules[names[place]] = CrossTransition(modules[names[place]], cross_key=(forecast, "cross"))
+            past = MomentsPast(belief_key=prefix, forecast_key=forecast)
+            last = LaggedMoments(belief_key=prefix, forecast_key=forecast)
+            initial = WithMomentsPast(filter.initial, lag, age=age, belief_key=prefix)
+        else:
+            initial = WithEnsemblePast(filter.initial, lag, age=age, belief_key=prefix)
+            last = LaggedBelief(belief_key=prefix, weighted=kind == "particles")
+            past = EnsemblePast(belief_key=prefix)
+            if kind == "particles":
+                transition = modules[names[place]]
+                modules[names[place]] = transition.with_past((prefix, "past"), ("forecast", "past"))
+                past = None
+            else:
+                modules = _with_lagged_analyses(modules)
+        ordered: OrderedDict[str, TensorDictModuleBase] = OrderedDict()
+        for index, (name, module) in enumerate(modules.items()):
+            ordered[name] = module
+            if index == place and past is not None:
+                ordered["past"] = past
+        ordered["smoothed"] = last
+        super().__init__(ordered, initial=initial, **options_of(filter))
+        self.lag, self._without_lag = lag, list(filter.carry_keys)
+
+    def sequence(self, tensordict, *, detach_every=None, keep=None):
+        """Filters a sequence, see :meth:`Filter.sequence`.
+
+        Raises:
+            KeyError: if the data hold beliefs that were stored without their past.
+        """
+        lacking = [key for key in self.carry_keys if tensordict.get(key, None) is None]
+        if lacking and all(tensordict.get(key, None) is not None for key in self._without_lag):
+            raise KeyError(
+                f"The data hold {self._without_lag}, from which a filter would go on, but not {lacking}: they were "
+                "stored without a lag. Leave them out: tensordict.exclude(*filter.belief_keys)."
+            )
+        return super().sequence(tensordict, detach_every=detach_every, keep=keep)
+
+
+def kind_of(filter: Filter) -> tuple[str, str]:
+    """What the belief is, ``"ensemble"``, ``"moments"`` or ``"particles"``, and the prefix of its entries.
+
+    Raises:
+        TypeError: for a filter that cannot be smoothed.
+    """
+    carry = [key for key in filter.carry_keys if isinstance(key, tuple) and len(key) == 2]
+    transition = filter.transition_module
+    for prefix in dict.fromkeys(key[0] for key in carry):
+        names = {key[1] for key in carry if key[0] == prefix}
+        if "past" in names or "past_mean" in names:
+            raise TypeError("This filter carries a past already; give the filter that was made for.")
+        if {"ensemble", "log_weight"} <= names and isinstance(transition, ResampledTransition):
+            return "particles", prefix
+        if {"mean", "cov"} <= names:
+            return "moments", prefix
+        if "ensemble" in names and "log_weight" not in names:
+            return "ensemble", prefix
+    raise TypeError(
+        f"{type(filter).__name__} carries {filter.carry_keys}; smoothing needs an ensemble, a mean and a covariance, "
+        "or particles with log-weights behind a ResampledTransition."
+    )
+
+
+def options_of(filter: Filter) -> dict:
+    """The options that a filter was made with."""
+    return {
+        "control_keys": filter.control_keys,
+        "init_key": filter.init_key,
+        "update_at_reset": filter.update_at_reset,
+        "forecast_keys": filter.forecast_keys,
+        "variance_ceiling": filter.variance_ceiling,
+        "check_finite": filter.check_finite,
+        "reject": filter.reject,
+    }
+
+
+def rebuilt(filter: Filter, changed: Mapping[str, TensorDictModuleBase]) -> Filter:
+    """A filter of the same modules, some of which are replaced in their places."""
+    modules = OrderedDict(named_modules_of(filter))
+    modules.update(changed)
+    return Filter(modules, initial=filter.initial, **options_of(filter))
+
+
+def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> OrderedDict[str, TensorDictModuleBase]:
+    """Modules whose analyses correct the past, too; also those inside plain sequences.
+
+    Raises:
+        TypeError: if there is no analysis of an ensemble among them, or one that cannot.
+    """
+    found = False
+
+    def lagged(module: TensorDictModuleBase) -> TensorDictModuleBase:
+        nonlocal found
+        if type(module) is TensorDictSequential:
+            return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
+        if isinstance(module, EnsembleUpdate) or hasattr(module, "info_key"):
+            found = True
+            return LaggedAnalysis(module)  # which refuses what it cannot wrap
+        return module
+
+    out = OrderedDict((name, lagged(module)) for name, module in modules.items())
+    if not found:
+        raise TypeError("There is no EnsembleAnalysis among the filter's modules, so a lag has nothing to learn from.")
+    return out

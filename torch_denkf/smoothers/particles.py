@@ -1,0 +1,130 @@
+"""Smoothers of particle filters: new weights by the motion's density, or the ancestors of later particles."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import unravel_key
+from torch import Tensor
+
+from torch_denkf.filters import Filter
+from torch_denkf.filters._structure import previous_key
+from torch_denkf.functional import backward_smooth, cholesky, weighted_mean
+from torch_denkf.modules import NoisyTransition, ResampledTransition
+from torch_denkf.modules._base import Call, Entries, run_module
+from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.modules.past import moments_of
+from torch_denkf.smoothers.base import Smoother
+from torch_denkf.smoothers.fixed_lag import kind_of
+
+__all__ = ["ParticleSmoother"]
+
+
+class ParticleSmoother(Smoother):
+    r"""Backward weights of a particle filter: the particles stay, those that lead to what came later count for more.
+
+    It needs the density of the motion, :math:`p(x_{t+1} | x_t)`, and so a
+    :class:`~torch_denkf.modules.NoisyTransition` with noise in every dimension, added after a motion that is
+    deterministic. Each step costs E² densities. For other motions :class:`FixedLag` follows the ancestors of the
+    particles, which a long lag leaves few of. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, the filter's
+    particles, their ``log_weight`` ``[*B, T, E]``, ``mean`` and ``var``, see :class:`Smoother`.
+
+    Args:
+        filter: a particle filter.
+        lag: how many later readings count; ``None`` for all.
+
+    Raises:
+        TypeError: for another filter, or a motion without a density.
+
+    Reference:
+        Doucet, Godsill & Andrieu, "On sequential Monte Carlo sampling methods for Bayesian filtering", Statistics and
+        Computing 10, 2000, section V.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import ParticleFilter
+        >>> from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LearnedTransition, Select
+        >>> filter = ParticleFilter(
+        ...     LearnedTransition(torch.nn.Linear(2, 2)),
+        ...     None,
+        ...     Select([0]),
+        ...     GaussianLikelihood(sensor_key="position"),
+        ...     noise=ConstantNoise([0.1], in_key="position"),
+        ...     initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=50),
+        ...     process_noise=0.1,
+        ... )
+        >>> ParticleSmoother(filter)(TensorDict({"position": torch.randn(3, 5, 1)}, [3, 5]))["smoothed", "mean"].shape
+        torch.Size([3, 5, 2])
+    """
+
+    def __init__(self, filter: Filter, lag: int | None = None):
+        kind, prefix = kind_of(filter)
+        transition = filter.transition_module
+        if kind != "particles" or not isinstance(transition, ResampledTransition):
+            raise TypeError(f"ParticleSmoother smooths particles; {type(filter).__name__} carries {filter.carry_keys}.")
+        motion = transition.module
+        if not isinstance(motion, NoisyTransition) or motion.before or motion.dims is not None:
+            raise TypeError(
+                "ParticleSmoother needs the density of the motion: a NoisyTransition with noise in all dimensions, "
+                "after the motion (process_noise= of ParticleFilter). FixedLag smooths particles of any motion."
+            )
+        keys = [(prefix, "ensemble"), (prefix, "log_weight")]
+        super().__init__(filter, lag, keys, ("ensemble", "log_weight", "mean", "var"))
+
+    def _smooth(self, entries, follows, out):
+        particles, log_weights = (entries[key] for key in self._needed)
+        densities = self._densities(entries, particles, log_weights)
+        smoothed = backward_smooth(log_weights, densities, follows=follows, lag=self.lag)
+        return particles, smoothed, *moments_of(particles, smoothed)
+
+    def _densities(self, entries: Entries, particles: Tensor, log_weights: Tensor) -> Tensor:
+        """Log-density of each particle at t, in the columns, given each at t − 1, in the rows, ``[*B, T, E, E]``."""
+        motion, structure = self.filter.transition_module.module, self.filter.structure
+        key, out_key = unravel_key(motion.in_keys[0]), unravel_key(motion.out_keys[0])
+        time, count = particles.ndim - 3, particles.shape[-3]
+
+        def before(value: Tensor) -> Tensor:
+            return value.narrow(time, 0, count - 1)
+
+        def after(value: Tensor) -> Tensor:
+            return value.narrow(time, 1, count - 1)
+
+        # A step reads the belief before it, the action that led out of there, and what else there is at its own time.
+        work = {name: after(value) for name, value in entries.items() if value.ndim > time}
+        work.update({name: before(entries[name]) for name in structure.belief if name in entries})
+        for control in structure.controls:
+            if control in entries:
+                work[control] = before(entries[control])
+            if previous_key(control) in entries:
+                work[control] = after(entries[previous_key(control)])
+        old, weights = before(particles), before(log_weights)
+        work.update({key: old, motion.mean_key: weighted_mean(old, weights)})
+        call = Call(old.shape[:-2], sample=False)
+        moved = run_module(motion.module["transition"], work, call)[out_key]
+        work[motion.forecast_mean_key] = weighted_mean(moved, weights)
+        noise = run_module(motion.module["noise"], work, call)[unravel_key(motion.module["noise"].out_keys[0])]
+        log_density = log_density_of_pairs(after(particles), moved, as_covariance(noise, work[motion.mean_key]))
+        return torch.cat([torch.zeros_like(log_density.narrow(time, 0, 1)), log_density], time)
+
+
+def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor) -> Tensor:
+    """Log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
+
+    Args:
+        values: ``[*B, E, S]``.
+        means: ``[*B, E, S]``.
+        cov: one for all pairs, ``[*B, S, S]``.
+
+    Returns:
+        The log-densities, ``[*B, E, E]``; NaN where ``cov`` is not positive definite.
+
+    Example:
+        >>> log_density_of_pairs(torch.zeros(1, 2), torch.zeros(1, 2), torch.eye(2))
+        tensor([[-1.8379]])
+    """
+    factor = cholesky(cov)
+    white = [torch.linalg.solve_triangular(factor, value.mT, upper=False).mT for value in (values, means)]
+    square = (white[0].unsqueeze(-3) - white[1].unsqueeze(-2)).square().sum(-1)
+    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None, None]
+    return -0.5 * (square + log_det + values.shape[-1] * math.log(2 * math.pi))

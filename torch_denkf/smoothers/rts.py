@@ -1,0 +1,62 @@
+"""The Rauch-Tung-Striebel smoother of the filters with a mean and a covariance."""
+
+from __future__ import annotations
+
+from torch_denkf.filters import Filter
+from torch_denkf.functional import rts_smooth
+from torch_denkf.modules.past_moments import CrossTransition
+from torch_denkf.smoothers.base import Smoother
+from torch_denkf.smoothers.fixed_lag import kind_of, rebuilt
+
+__all__ = ["RTSSmoother"]
+
+
+class RTSSmoother(Smoother):
+    """Rauch-Tung-Striebel smoother of a Kalman, extended or unscented Kalman filter.
+
+    For a :class:`~torch_denkf.filters.KalmanFilter` it is exact: the mean and the covariance of each state given all
+    readings. For an :class:`~torch_denkf.filters.EKF` it uses the Jacobian of the transition, for a
+    :class:`~torch_denkf.filters.UKF` its sigma points. It writes ``("smoothed", "mean")`` ``[*B, T, S]``,
+    ``("smoothed", "cov")`` ``[*B, T, S, S]`` and ``("smoothed", "var")`` ``[*B, T, S]``, see :class:`Smoother`.
+
+    Args:
+        filter: the filter.
+        lag: how many later readings count; ``None`` for all.
+
+    Raises:
+        TypeError: for a filter without a covariance, or with a transition that gives no cross-covariance.
+
+    Reference:
+        Särkkä, "Bayesian filtering and smoothing", 2013, sections 8.2, 9.1 and 9.3.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> smoother = RTSSmoother(KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one))
+        >>> out = smoother(TensorDict({"observation": torch.ones(4, 1)}, [4]))
+        >>> out["smoothed", "var"][:-1] < out["belief", "var"][:-1]
+        tensor([[True],
+                [True],
+                [True]])
+    """
+
+    def __init__(self, filter: Filter, lag: int | None = None):
+        kind, prefix = kind_of(filter)
+        if kind != "moments":
+            raise TypeError(f"RTSSmoother smooths a mean and a covariance; {type(filter).__name__} has an ensemble.")
+        self.place = filter.structure.transition[0]
+        forecast = filter.structure.forecast_of[prefix, "mean"][0]
+        self.cross_key = (forecast, "cross")
+        CrossTransition(filter.transition_module)  # refuses what gives no cross-covariance
+        keys = [(prefix, "mean"), (prefix, "cov"), *((forecast, name) for name in ("mean", "cov", "cross"))]
+        super().__init__(filter, lag, keys, ("mean", "cov", "var"))
+
+    def _extended(self, lag):
+        own = CrossTransition(self.filter.transition_module, cross_key=self.cross_key)
+        return rebuilt(self.filter, {self.place: own})
+
+    def _smooth(self, entries, follows, out):
+        mean, cov = rts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag)
+        return mean, cov, cov.diagonal(dim1=-2, dim2=-1)
