@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,13 +33,12 @@ def smoke(study: Study) -> Study:
 
 def main() -> None:
     """Runs a command."""
-    study, begun = parse(Study), time.time()
+    study = parse(Study)
     study = smoke(study) if study.smoke else study
     if study.command == "table":
         run_all(study)
         rows = rows_in(study.out)
-        header = f"`{command('g1')}`: {(time.time() - begun) / 60:.0f} min"
-        report(study.out, COLUMNS, rows, markdown(rows, header))
+        report(study.out, COLUMNS, rows, markdown(rows, f"`{command('g1')}`"))
     if study.command == "diagnosis" or study.smoke:
         sensors = [TrainedSensor(study, FIRST, seed, study.sensor_budget) for seed in study.seeds]
         write_page("\n".join(text for sensor in sensors for text in diagnose(sensor)), study.out / "diagnosis.md")

@@ -55,7 +55,8 @@ def over_seeds(rows: Iterable[dict], column: str, form: str = "{:.2f}", factor: 
 def markdown(rows: Sequence[dict], header: str) -> str:
     """A table for each state and sensor, one of the joints, and one of black frames."""
     seeds = len({row["seed"] for row in rows})
-    lines = [header, "", FAIRNESS, "", f"Means over {seeds} seed(s), ± the standard deviation over them."]
+    over = f"Means over {seeds} seed(s)" + (", ± the standard deviation over them." if seeds > 2 else ".")
+    lines = [header, "", FAIRNESS, "", over]
     for state, sensor in sorted({(row["state"], row["sensor"]) for row in rows}):
         here = pick(rows, state=state, sensor=sensor)
         unit = "degrees" if state == "arm" else "hundredths of a finger's way"
