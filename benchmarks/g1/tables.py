@@ -16,7 +16,7 @@ COVERED = tuple(f"{name}_coverage90" for name in NAMES)
 BLACKOUT = ("blackout_mae", "std_before", "std_blind", "std_after")
 _SCORES = ("joint_mae_deg", "crps", "coverage90", *ANGLES, *COVERED, *BLACKOUT, "validation_crps")
 COLUMNS = Columns(
-    (*KEYS, *_SCORES, "inflation", "parameters", "ms_per_step", "episodes"),
+    (*KEYS, *_SCORES, "parameters", "ms_per_step", "episodes"),
     text=KEYS[:4],
     whole=("seed", "parameters", "episodes"),
     order=lambda row: (
