@@ -44,7 +44,6 @@ setup(
         "dm-control>=1.0.50",
         "opencv-python-headless>=4.10",
         "numpy",
-        "filelock>=3.12",  # one process at a time in a folder
         "safetensors>=0.4",  # weights that are data only
         "lazy_loader>=0.4",  # `import torch_denkf` stays cheap
         "tqdm>=4.60",

@@ -2,9 +2,9 @@
 
     python examples/smoothing.py
 
-A filter knows the past; a smoother also knows what came later. The program compares both on recordings, shows a lag of a
-few steps in an environment that runs, and lets a loss score the smoothed belief. No data set, and no training but a few
-steps. It takes half a minute. The page behind this one is ``docs/how_to/smoothing.md``; the measured errors of all
+A filter knows the past; a smoother also knows what came later. The program compares both on recordings, shows a lag of
+a few steps in an environment that runs, and lets a loss score the smoothed belief. No data set, and no training but a
+few steps. It takes half a minute. The page behind this one is ``docs/how_to/smoothing.md``; the measured errors of all
 smoothers are in ``docs/results/smoothing.md``.
 """
 

@@ -94,6 +94,10 @@ class CompiledSteps:
     def _function(self, kind: tuple, steps: Steps, device: torch.device, make: Callable[[], Callable]) -> Callable:
         kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
+            if self.options.get("backend", "inductor") == "inductor":
+                from torch_denkf.filters.inductor import clear_damaged_libraries
+
+                clear_damaged_libraries()
             function = make()
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")

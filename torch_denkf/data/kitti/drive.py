@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data.cache import _cached, cache_folder, stamp
+from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.kitti.clock import read_times
 from torch_denkf.data.kitti.files import read_calibration, read_poses, scale_calibration
-from torch_denkf.data.pictures import check_size, text_of_size
+from torch_denkf.data.pictures import check_size, is_bomb, text_of_size
 from torch_denkf.vision.poses import poses_to_state
 
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
@@ -153,7 +153,7 @@ def read_kitti_drive(
     key = [_FORMAT, str(root), sequence, camera, height, width, colour]
     key += [(path.name, *stamp(path)) for path in [*texts, *files.values()]]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
-    return _cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
+    return cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
 
 
 def choose_camera(folder: Path, camera: str | None) -> str:
@@ -256,7 +256,7 @@ def _read(
 def _decode(file: Path, flags: int) -> np.ndarray | None:
     data = file.read_bytes()
     # OpenCV would fill the rest of a truncated file or complain on stderr: look for the end first.
-    if _END_OF_PNG not in data[-64:]:
+    if _END_OF_PNG not in data[-64:] or is_bomb(data):
         return None
     return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 

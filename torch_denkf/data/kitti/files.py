@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from torch_denkf._checks import read_lines
+from torch_denkf._files import replacing
 
 FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart
 ROTATION = 0.01  # how far R R^T may be from I: files of two digits pass
@@ -90,7 +91,8 @@ def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> n
 
 def write_poses(file: Path, poses: np.ndarray) -> None:
     """Write camera-to-world matrices ``[N, 3, 4]``, in metres, to a pose file."""
-    np.savetxt(file, poses.reshape(len(poses), 12), fmt="%.9e")
+    with replacing(file) as beside:
+        np.savetxt(beside, poses.reshape(len(poses), 12), fmt="%.9e")
 
 
 def read_calibration(file: Path, camera: str) -> np.ndarray:

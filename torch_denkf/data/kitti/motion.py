@@ -9,7 +9,7 @@ import cv2
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_denkf.data.cache import _cached, cache_folder
+from torch_denkf.data.cache import cache_folder, cached
 from torch_denkf.data.kitti.gaps import after_gap, steps_at
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
 
@@ -77,7 +77,7 @@ def with_motion(
         after = after_gap(drive)
         if after is not None:
             digest.update(after.contiguous().numpy().data)
-        motion = _cached(directory / f"motion-{digest.hexdigest()}", compute)
+        motion = cached(directory / f"motion-{digest.hexdigest()}", compute)
     drive = drive.copy() if keep_images else drive.exclude("image")
     return drive.update({"flow": motion["flow"], "road": motion["road"]})
 

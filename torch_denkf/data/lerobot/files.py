@@ -17,15 +17,18 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import numpy as np
 
 from torch_denkf._checks import check_count, check_number, read_lines
+from torch_denkf.data.lerobot.paths import stay_inside
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
 
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
+MOST_ROWS = 10**8  # of a data set: 38 days at 30 a second
 COMPLETE = "download the data set completely"
 
 
@@ -114,6 +117,7 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     if version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
+    stay_inside(root, f"images/{camera}", f"{file}, by the name of a camera,")
     if VERSIONS[version] == 2:
         episodes, meta = _episodes_of_version_2(root, info, camera)
     else:
@@ -122,6 +126,11 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     if not episodes:
         raise ValueError(f"{root} has no episodes; {COMPLETE}")
     _check_episodes(meta, episodes)
+    rows = sum(episode.length for episode in episodes)
+    if rows > MOST_ROWS:
+        raise ValueError(
+            f"{root} announces {rows} rows, more than the {MOST_ROWS} that are read; its metadata are wrong"
+        )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
 
@@ -156,6 +165,8 @@ def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
     if not isinstance(template, str):
         raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
     try:
+        if any(len(spec) > 4 for _, _, spec, _ in Formatter().parse(template) if spec):
+            raise ValueError("a number of more than 99 digits")
         path = root / template.format(**place)
     except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
         raise ValueError(
@@ -309,8 +320,7 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
     if data is None:
         names = [(value or {}).get("path")]
         names += [f"images/{camera}/episode{m}{episode:06d}/frame{m}{frame:06d}.png" for m in "_-"]
-        files = [
-            root / name for name in names if name and not Path(name).is_absolute() and ".." not in Path(name).parts
-        ]
+        source = f"frame {frame} of episode {episode} in {root}"
+        files = [stay_inside(root, name, source) for name in names if name]
         data = next((file.read_bytes() for file in files if file.is_file()), b"")
     return decode_picture(data)

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.data.cache import _cached, cache_folder, stamp
+from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.lerobot.files import (
     EpisodeFiles,
     Layout,
@@ -82,7 +82,7 @@ def read_recording(
     key += [(str(file.relative_to(root)), *stamp(file)) for file in _files(layout)]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
-    rows = _cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
+    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
     return DecodedRecording(rows, layout.fps, names, root)
 
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import threading
-import uuid
 import warnings
 import zipfile
 from collections.abc import Iterable
@@ -25,11 +25,14 @@ from typing import Any
 import numpy as np
 
 from torch_denkf._checks import check_count, read_lines
+from torch_denkf._files import clear_errors, write_bytes, write_text
 from torch_denkf.simulation.ur5.names import TASKS
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
 COMMAND = "denkf collect-ur5"
+MOST_BYTES = 1 << 32  # of one demo, unpacked: 350 pictures of 2,000 x 2,000
+_HEADER = 1 << 14  # bytes in which an array's header is, at most
 AGAIN = f"the collecting command ({COMMAND}), repeated, makes it again"
 
 
@@ -85,29 +88,32 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
     """Write a demo beside its place and rename it, so that a file of that name is complete. Equal demos, equal bytes.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: if the file cannot be written, as on a full disk; names it and the free space.
     """
     name = f"demo-{demo.number:06d}.npz"
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **vars(demo))
     data = buffer.getvalue()
-    beside = root / f".{name}-{uuid.uuid4().hex[:8]}"
-    try:
-        beside.write_bytes(data)
-        os.replace(beside, root / name)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(f"cannot write {root / name} ({error}); is the disk full?") from error
+    write_bytes(root / name, data)
     return Entry(demo.number, name, hashlib.sha256(data).hexdigest(), len(demo.state), len(demo.steps), failures)
 
 
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
     """None for a file with the manifest's checksum, or else what is the matter, for a message."""
     try:
-        data = (root / entry.file).read_bytes()
+        data = _place(root, entry).read_bytes()
     except OSError as error:
         return f"{root / entry.file} cannot be read ({error.strerror})"
     return _compare(root, entry, data)
+
+
+def _place(root: Path, entry: Entry) -> Path:
+    if not isinstance(entry.file, str) or entry.file in ("", "..") or Path(entry.file).name != entry.file:
+        raise ValueError(
+            f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
+            "anything of yours: download it from where you trust it, or take the line out"
+        )
+    return root / entry.file
 
 
 def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
@@ -119,8 +125,8 @@ def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
 _HEADERS = threading.Lock()
 
 
-def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, by name.
+def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, by name; what it announces is compared with the manifest before it is unpacked.
 
     NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 fails now and then where threads do it at a
     time ("AST constructor recursion depth mismatch", CPython issue 106905). So headers are read one after the other,
@@ -128,6 +134,7 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
     """
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        _refuse_other_arrays(archive, entry)
         for member in archive.namelist():
             stream = io.BytesIO(archive.read(member))
             with _HEADERS:
@@ -135,15 +142,51 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _refuse_other_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
+    """Looks at the headers alone: the rest could be of any size.
+
+    Raises:
+        ValueError: if an array is not what the manifest says.
+    """
+    expected: dict[str, tuple[int | None, ...]] = {"state": (entry.rows, 10), "action": (entry.rows, 7)}
+    expected |= {"success": (entry.rows,), "steps": (entry.frames,), "pixels": (entry.frames, 3, None, None)}
+    expected |= dict.fromkeys(("number", "task", "domain", "seed"), ())
+    names = [member.filename.removesuffix(".npy") for member in archive.infolist()]
+    if sorted(names) != sorted(expected):
+        raise ValueError(f"it holds {sorted(names)}, expected {sorted(expected)}")
+    total = sum(member.file_size for member in archive.infolist())
+    if total > MOST_BYTES:
+        raise ValueError(f"it announces {total} bytes, more than the {MOST_BYTES} that are unpacked")
+    for member, name in zip(archive.infolist(), names, strict=True):
+        with archive.open(member) as stream:
+            head = io.BytesIO(stream.read(_HEADER))
+        with _HEADERS:
+            version = np.lib.format.read_magic(head)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(head)
+        fits = len(shape) == len(expected[name])
+        fits = fits and all(want in (None, there) for want, there in zip(expected[name], shape, strict=True))
+        if not fits or math.prod(shape) * dtype.itemsize != member.file_size - head.tell():
+            raise _OtherShape(f"has {name!r} of shape {shape}, {MANIFEST} says {expected[name]}")
+
+
+class _OtherShape(ValueError):
+    """An array that is not what the manifest says."""
+
+
 def read_demo(root: Path, entry: Entry) -> Demo:
     """Read a demo and compare it with its line in the manifest.
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
+        ValueError: if it was changed, does not hold what the line says, lies outside of the folder, or has numbers that
+            are not finite.
     """
-    file = root / entry.file
+    file = _place(root, entry)
     try:
+        size = file.stat().st_size
+        if size > MOST_BYTES:
+            raise ValueError(f"{file} has {size} bytes, more than a demo can have ({MOST_BYTES}); {AGAIN}")
         data = file.read_bytes()
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{file} is missing, but {MANIFEST} lists it; {AGAIN}") from error
@@ -151,8 +194,10 @@ def read_demo(root: Path, entry: Entry) -> Demo:
     if wrong is not None:
         raise ValueError(f"{wrong}; {AGAIN}")
     try:
-        fields: dict[str, Any] = _read_arrays(data)  # numbers and names are arrays without dimensions yet
+        fields: dict[str, Any] = _read_arrays(data, entry)  # numbers and names are arrays without dimensions yet
         demo = Demo(**fields)
+    except _OtherShape as error:
+        raise ValueError(f"{file} {error}") from error
     except (TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} does not hold a demo ({error}); was it written by another version?") from error
     demo.number, demo.seed = int(demo.number), int(demo.seed)
@@ -228,18 +273,32 @@ def _entry(line: str) -> Entry:
 
 def write_manifest(root: Path, entries: Iterable[Entry]) -> None:
     """Write the whole manifest, in the demos' order, at once."""
-    _replace(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
+    write_text(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
 
 
 def append_to_manifest(root: Path, entry: Entry) -> None:
-    """Add a demo that was just written."""
-    with (root / MANIFEST).open("a") as file:
-        file.write(_line(entry))
+    """Add a demo that was just written.
+
+    Raises:
+        OSError: if it cannot be added, as on a full disk; the manifest is then as it was.
+    """
+    file = root / MANIFEST
+    with clear_errors(file):
+        before = file.stat().st_size if file.exists() else 0
+        try:
+            with file.open("ab") as stream:
+                stream.write(_line(entry).encode())
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError:
+            if file.exists():
+                os.truncate(file, before)
+            raise
 
 
 def write_options(root: Path, options: dict) -> None:
     """Write what all demos of the folder follow from."""
-    _replace(root / COLLECTION, json.dumps(options, indent=1) + "\n")
+    write_text(root / COLLECTION, json.dumps(options, indent=1) + "\n")
 
 
 def read_options(root: Path) -> dict | None:
@@ -258,9 +317,3 @@ def read_options(root: Path) -> dict | None:
 
 def _line(entry: Entry) -> str:
     return json.dumps(asdict(entry)) + "\n"
-
-
-def _replace(file: Path, text: str) -> None:
-    beside = file.with_name(f".{file.name}-{uuid.uuid4().hex[:8]}")
-    beside.write_text(text)
-    os.replace(beside, file)

@@ -14,7 +14,9 @@ from typing import Any
 
 import torch
 
-__all__ = ["TESTED_VERSIONS", "need_compiler", "options_for_processors"]
+from torch_denkf.filters.inductor.libraries import clear_damaged_libraries, clear_full_cache
+
+__all__ = ["TESTED_VERSIONS", "clear_damaged_libraries", "clear_full_cache", "need_compiler", "options_for_processors"]
 
 #: Versions of torch, by their first two numbers, that the passes were tested with.
 TESTED_VERSIONS = ("2.13",)
