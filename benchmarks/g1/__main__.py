@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.common.arguments import command, parse
-from benchmarks.common.tables import report
-from benchmarks.g1.base import SensorBudget
+from benchmarks.common.tables import report, write_page
+from benchmarks.g1.base import SensorBudget, TrainedSensor
+from benchmarks.g1.diagnosis import diagnose
 from benchmarks.g1.pictures import draw_all
-from benchmarks.g1.study import Study, rows_in, run_all
+from benchmarks.g1.study import FIRST, Study, rows_in, run_all
 from benchmarks.g1.tables import COLUMNS, markdown
 from benchmarks.g1.training import FilterBudget
 
@@ -33,13 +33,15 @@ def smoke(study: Study) -> Study:
 
 def main() -> None:
     """Runs a command."""
-    study, begun = parse(Study), time.time()
+    study = parse(Study)
     study = smoke(study) if study.smoke else study
     if study.command == "table":
         run_all(study)
         rows = rows_in(study.out)
-        header = f"`{command('g1')}`: {(time.time() - begun) / 60:.0f} min"
-        report(study.out, COLUMNS, rows, markdown(rows, header))
+        report(study.out, COLUMNS, rows, markdown(rows, f"`{command('g1')}`"))
+    if study.command == "diagnosis" or study.smoke:
+        sensors = [TrainedSensor(study, FIRST, seed, study.sensor_budget) for seed in study.seeds]
+        write_page("\n".join(text for sensor in sensors for text in diagnose(sensor)), study.out / "diagnosis.md")
     if study.command == "pictures" or study.smoke:
         print(*draw_all(study), sep="\n")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 
 import torch
 from tensordict import TensorDict
@@ -58,7 +59,7 @@ class SensorSpread:
     Args:
         target: what is read.
         tune: readings of the tuning episodes, by condition.
-        validation: of the validation episodes; they choose a factor for the coverage.
+        validation: of the validation episodes; they choose when to stop, and a factor for the coverage.
         updates: of the fit.
     """
 
@@ -69,25 +70,36 @@ class SensorSpread:
         validation: dict[str, TensorDict],
         updates: int = 400,
     ):
-        features, error, _ = _pairs([tune[name] for name in PICTURES])
+        features, error = _pairs([tune[name] for name in PICTURES])
+        checked, wrong = _pairs([validation[name] for name in PICTURES])
         root = error.square().mean(0).sqrt().clamp_min(1e-4)
-        options = {"num_cells": (32, 32), "in_features": features.shape[-1], "in_key": "encoding"}
+        options = {"num_cells": (16,), "in_features": features.shape[-1], "in_key": "encoding"}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             self.noise = DiagonalNoise(target.size, r=root, **options)
-            optimiser = torch.optim.AdamW(self.noise.parameters(), lr=5e-3, weight_decay=0.01)
-            for _ in range(updates):
+            optimiser = torch.optim.AdamW(self.noise.parameters(), lr=2e-3, weight_decay=0.1)
+            best, kept = self._score(checked, wrong), deepcopy(self.noise.state_dict())
+            for update in range(updates):
                 index = torch.randint(len(error), (1024,))
-                variance = self._variance(features[index])
-                loss = (crps_gaussian(torch.zeros_like(variance), variance, error[index]) / root).mean()
+                loss = (self._crps(features[index], error[index]) / root).mean()
                 optimiser.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.noise.parameters(), 1.0)
                 optimiser.step()
-        features, error, _ = _pairs([validation[name] for name in PICTURES])
+                if update % 20 == 19 and self._score(checked, wrong) < best:
+                    best, kept = self._score(checked, wrong), deepcopy(self.noise.state_dict())
+            self.noise.load_state_dict(kept)
         with torch.no_grad():
-            away = (error.abs() / self._variance(features).sqrt()).flatten()
+            away = (wrong.abs() / self._variance(checked).sqrt()).flatten()
         self.factor = float(away.quantile(0.9)) / 1.645
+
+    def _crps(self, features: Tensor, error: Tensor) -> Tensor:
+        variance = self._variance(features)
+        return crps_gaussian(torch.zeros_like(variance), variance, error)
+
+    @torch.no_grad()
+    def _score(self, features: Tensor, error: Tensor) -> float:
+        return float(self._crps(features, error).mean())
 
     def _variance(self, features: Tensor) -> Tensor:
         return self.noise(TensorDict({"encoding": features}, batch_size=[len(features)]))["sensor", "noise"]
@@ -99,12 +111,12 @@ class SensorSpread:
         return self.factor**2 * self._variance(features.flatten(0, 1)).unflatten(0, features.shape[:2])
 
 
-def _pairs(readings: Sequence[TensorDict]) -> tuple[Tensor, Tensor, Tensor]:
+def _pairs(readings: Sequence[TensorDict]) -> tuple[Tensor, Tensor]:
     """Encodings and errors of all frames that are seen."""
     parts = [one[one["observed"].squeeze(-1)] for one in readings]
     features = torch.cat([part["sensor", "encoding"] for part in parts])
     truth = torch.cat([part["state"] for part in parts])
-    return features, torch.cat([part["sensor", "ensemble"].mean(-2) for part in parts]) - truth, truth
+    return features, torch.cat([part["sensor", "ensemble"].mean(-2) for part in parts]) - truth
 
 
 class Baselines:
@@ -158,8 +170,9 @@ class Baselines:
         if name == "held":
             first = self.var.expand_as(truth[:, 0])
             return hold_last(read, seen, self.start.expand_as(truth[:, 0])), hold_last(var, seen, first)
-        if name == "sensor":  # it knows nothing where it sees nothing
-            return torch.where(seen, read, self.mean), torch.where(seen, var, self.var)
+        if name == "sensor":  # it knows nothing where no picture arrives
+            there = readings["arrived"]
+            return torch.where(there, read, self.mean), torch.where(there, var, self.var)
         raise ValueError(f"there is no baseline {name!r}; there are {self.names}")
 
 

@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -48,8 +49,9 @@ def filter_rows(recipe: G1Recipe, model: Filter, readings: dict[str, TensorDict]
     """A filter in all conditions."""
     row = readings["clean"][:1, :TIMED]
     own, rows, size = cost(model, lambda: run_filter(model, row), row.shape[1]), [], recipe.target.size
-    for condition, reading in readings.items():
-        mean, var = run_filter(model, reading)
+    means, variances = run_filter(model, torch.cat(list(readings.values())))
+    parts = (one.split(len(readings["clean"])) for one in (means, variances))
+    for (condition, reading), mean, var in zip(readings.items(), *parts, strict=True):
         scored = score_row(recipe.target, mean[..., :size], var[..., :size], reading, condition)
         rows.append({**names, **scored, **own})
     return rows

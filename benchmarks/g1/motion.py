@@ -18,7 +18,7 @@ from benchmarks.g1.targets import Target
 from torch_denkf.modules import LearnedTransition, SubModel, run_module
 from torch_denkf.training import Stage, train_part
 
-FADING = 0.97  # of a bias in a row, before training
+FADING = 0.98  # of a bias in a row, before training
 DELAYS = (0, 2)  # rows: the robot follows a command after some
 AHEAD = 8  # rows that the motion runs by itself in training
 

@@ -18,7 +18,7 @@ from torch_denkf.plots import belief_video, plot_bands
 
 LABELS = [f"{name.replace('_', ' ')}, deg" for name in NAMES]
 DEGREES = [180 / np.pi] * len(NAMES)
-SHOWN = (("clean", 0), ("black20_unannounced", 1))  # condition, and which of the saved episodes
+SHOWN = (("clean", 0), ("black20", 1), ("black20_unannounced", 1))  # condition, and which of the saved episodes
 
 
 def read_belief(file: Path, condition: str, which: int) -> TensorDict:
@@ -60,7 +60,9 @@ def draw_all(study: Recordings) -> Iterator[Path]:
 def _title(belief: TensorDict, condition: str) -> str:
     error = (belief["belief", "mean"] - belief["state"])[1:].abs().mean().rad2deg()
     text = f"episode {int(belief['episode'][0])}, unseen in training: {error:.2f} deg on average"
-    return text + ("; shaded: 20 black frames that nothing announces" if condition != "clean" else "")
+    if condition == "clean":
+        return text
+    return text + "; shaded: 20 black frames" + ", which nothing announces" * condition.endswith("unannounced")
 
 
 def draw_joints(belief: TensorDict, fps: float, path: Path, condition: str) -> Path:

@@ -61,7 +61,7 @@ def failing(pixels: Tensor, place: Tensor, condition: str, draw: Tensor, exact: 
 def read_codes(
     sensor: ImageSensor,
     data: LeRobotReplay,
-    hand: HandPlace,
+    hand: HandPlace | None,
     numbers: Sequence[int],
     *,
     condition: str,
@@ -69,6 +69,8 @@ def read_codes(
     file: Path,
 ) -> TensorDict:
     """Features of all frames of some episodes ``[N, T]``, the shorter ones filled up; kept in ``file``.
+
+    Where that is there, the place of the hand is not needed.
 
     ================ ============= ====================================================================================
     ``code``         [N,T,F]       of the sensor's trunk
@@ -81,6 +83,8 @@ def read_codes(
     if file.exists():
         saved = read_checkpoint(file)
         return TensorDict(saved, batch_size=saved["code"].shape[:2])
+    if hand is None:
+        raise ValueError(f"there is no {file}; pass the place of the hand, to read the pictures")
     by_number, parts = {episode.number: episode for episode in data.episodes}, []
     longest = max(by_number[number].length for number in numbers)
     for number in numbers:
@@ -132,6 +136,7 @@ def with_readings(
     ``motion``              [N,T,2D]        with rates
     ``action``              [N,T,2D]        commands, see :func:`benchmarks.g1.motion.delayed`
     ``encoders``            [N,T,E,K]       noisy readings of the joints that have an encoder
+    ``arrived``             [N,T,1]         False where there is no picture, not even a repeat
     ``start``               [N,T,D]         where episodes begin on average
     ======================= =============== ===========================================================================
     """
@@ -143,6 +148,7 @@ def with_readings(
         ensembles.append(samples[..., dims].clone())
         encodings.append(encoding)
     out = codes.select("observed", "valid")
+    out["arrived"] = out["valid"].clone()
     truth, command = codes["truth"][..., dims], codes["command"][..., dims]
     out["sensor"] = TensorDict(
         {"ensemble": torch.cat(ensembles), "encoding": torch.cat(encodings)}, batch_size=out.batch_size
@@ -174,16 +180,26 @@ def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
 def fail(readings: TensorDict, condition: str, black: TensorDict, seed: int = 0) -> TensorDict:
     """A copy of clean readings ``[N, T]`` whose camera fails: frames do not arrive, or are black."""
     count, steps = readings.shape
-    out, seen = readings.copy(), readings["observed"].clone()
     if condition == "missing":
         lost = torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING
-        return out.set("observed", seen & ~lost)
+        return without(readings, lost)
     begin = blackouts(readings["valid"].sum((1, 2)), seed).unsqueeze(-1)
     step = torch.arange(steps)
     dark = ((step >= begin) & (step < begin + BLACK)).unsqueeze(-1)
     if condition == "black20":
-        return out.set("observed", seen & ~dark)
-    return with_black(out, dark, black)
+        return without(readings, dark)
+    return with_black(readings, dark, black)
+
+
+def without(readings: TensorDict, lost: Tensor) -> TensorDict:
+    """Readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
+    out = readings.copy()
+    for key in ("observed", "arrived"):
+        out[key] = out[key] & ~lost
+    sensor = readings["sensor"].copy()
+    sensor["ensemble"] = torch.where(lost.unsqueeze(-1), 0.0, sensor["ensemble"])
+    sensor["encoding"] = torch.where(lost, 0.0, sensor["encoding"])
+    return out.set("sensor", sensor)
 
 
 def with_black(readings: TensorDict, dark: Tensor, black: TensorDict) -> TensorDict:
@@ -204,18 +220,17 @@ def with_black(readings: TensorDict, dark: Tensor, black: TensorDict) -> TensorD
 
 
 class Windows:
-    """Draws windows of readings, with failing cameras, that begin from a wrong state.
+    """Draws windows of readings, with failing cameras, that begin near what the sensor says.
 
     Args:
         readings: of the tuning episodes ``[N, T]``, by condition.
         black: of a black frame.
         length: of the windows.
-        target: what is estimated.
     """
 
-    def __init__(self, readings: dict[str, TensorDict], black: TensorDict, length: int, target: Target):
+    def __init__(self, readings: dict[str, TensorDict], black: TensorDict, length: int):
         self.all = torch.stack([readings[name] for name in PICTURES])
-        self.black, self.length, self.target = black, length, target
+        self.black, self.length = black, length
         self.lengths = readings["clean"]["valid"].sum((1, 2))
         if length > int(self.lengths.min()):
             raise ValueError(f"windows of {length} rows do not fit in an episode of {int(self.lengths.min())}")
@@ -229,7 +244,7 @@ class Windows:
         Args:
             generator: of all random numbers.
             batch: how many.
-            error: how wrong they begin, ``[D]``.
+            error: how far they begin from what the sensor says, ``[D]``.
             padding: numbers of the filters' state beyond place and rates.
         """
         length = self.length
@@ -242,14 +257,15 @@ class Windows:
         first = (draw() * (self.lengths[episode] - length + 1)).long()
         rows = first.unsqueeze(-1) + torch.arange(length)
         windows = self.all[which.unsqueeze(-1), episode.unsqueeze(-1), rows]
+        # The start must say less than the sensor, or a filter learns to hold on to it, which fails in whole episodes.
+        start = windows["sensor", "ensemble"][:, 0].mean(-2)
+        start = start + error * torch.randn(start.shape, generator=generator)
         lost = draw(length, 1) < draw(1, 1) - 0.5
         begin = 1 + (draw(1) * (length - 1)).long()
         kind, step = draw(1, 1), torch.arange(length)
         stretch = ((step >= begin) & (step < begin + (draw(1) * (BLACK + 1)).long())).unsqueeze(-1)
-        windows["observed"] = windows["observed"] & ~lost & ~(stretch & (kind < 0.17))
+        windows = without(windows, lost | (stretch & (kind < 0.17)))
         windows = with_black(windows, stretch & (kind > 0.83), self.black)
         windows["padded"] = pad(windows["motion"], (0, padding))
-        size = self.target.size
-        noise = torch.randn(batch, 1, size, generator=generator)
-        windows["start"] = windows["motion"][..., :size] + error * noise
+        windows["start"] = start.unsqueeze(1).expand_as(windows["state"])
         return windows

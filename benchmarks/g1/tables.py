@@ -16,7 +16,7 @@ COVERED = tuple(f"{name}_coverage90" for name in NAMES)
 BLACKOUT = ("blackout_mae", "std_before", "std_blind", "std_after")
 _SCORES = ("joint_mae_deg", "crps", "coverage90", *ANGLES, *COVERED, *BLACKOUT, "validation_crps")
 COLUMNS = Columns(
-    (*KEYS, *_SCORES, "inflation", "parameters", "ms_per_step", "episodes"),
+    (*KEYS, *_SCORES, "parameters", "ms_per_step", "episodes"),
     text=KEYS[:4],
     whole=("seed", "parameters", "episodes"),
     order=lambda row: (
@@ -27,9 +27,10 @@ COLUMNS = Columns(
 )
 FAIRNESS = (
     "All filters of a seed read the same sensor, begin with the same learned motion, and learn from the same windows "
-    "with as many updates. Each has one number (a factor on the noise, or tempering of weights) chosen from the same "
-    "nine values for the coverage on the same validation episodes, over all conditions. `sensor` knows the mean pose "
-    "alone where it sees nothing; `held` holds its last reading there."
+    "with as many updates (the LSTM, which knows no motion, with six times as many). Each has one number (a factor on "
+    "the noise, or tempering of weights) chosen from the same seven values for the coverage on the same validation "
+    "episodes, over all conditions. `sensor` reads every picture, repeats too, and knows the mean pose alone where "
+    "none arrives; `held` holds its last reading there."
 )
 
 
@@ -54,7 +55,8 @@ def over_seeds(rows: Iterable[dict], column: str, form: str = "{:.2f}", factor: 
 def markdown(rows: Sequence[dict], header: str) -> str:
     """A table for each state and sensor, one of the joints, and one of black frames."""
     seeds = len({row["seed"] for row in rows})
-    lines = [header, "", FAIRNESS, "", f"Means over {seeds} seed(s), ± the standard deviation over them."]
+    over = f"Means over {seeds} seed(s)" + (", ± the standard deviation over them." if seeds > 2 else ".")
+    lines = [header, "", FAIRNESS, "", over]
     for state, sensor in sorted({(row["state"], row["sensor"]) for row in rows}):
         here = pick(rows, state=state, sensor=sensor)
         unit = "degrees" if state == "arm" else "hundredths of a finger's way"

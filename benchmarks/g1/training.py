@@ -17,7 +17,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.training import Stage
 
-INFLATIONS = (0.6, 0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.1)
+INFLATIONS = (0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1)
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class FilterBudget:
     """Updates of each stage; the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
-    filter: int = 120  # updates of a filter on readings
-    length: int = 24  # rows of the filter's windows
-    batch: int = 16  # windows an update
+    filter: int = 45  # updates of a filter on readings
+    length: int = 64  # rows of the filter's windows
+    batch: int = 8  # windows an update
 
 
 @torch.no_grad()
@@ -35,7 +35,7 @@ def run_filter(model: Filter, readings: TensorDict) -> tuple[Tensor, Tensor]:
     """Means and variances ``[N, T, S]`` of a filter, from where episodes begin on average."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        out = model.sequence(readings.exclude("motion", "valid", "state"))
+        out = model.sequence(readings.exclude("motion", "valid", "state", "arrived"))
     return out["belief", "mean"], out["belief", "var"]
 
 
@@ -79,16 +79,16 @@ def train_filter(
     """
     torch.manual_seed(seed)
     model = recipe.build()
-    padding = recipe.size - 2 * recipe.target.size
+    padding, updates = recipe.size - 2 * recipe.target.size, budget.filter * recipe.longer
 
     def stages() -> list[Stage]:
         return [
             Stage(
                 "filter",
                 recipe.loss(recipe.for_training(model)),
-                lambda generator, _: windows.sample(generator, budget.batch, 1.5 * recipe.error, padding),
-                budget.filter,
-                lr=5e-3,
+                lambda generator, _: windows.sample(generator, budget.batch, recipe.error, padding),
+                updates,
+                lr=2e-3,
                 validate=lambda: filter_error(recipe, model, validation),
             )
         ]
@@ -103,7 +103,7 @@ def train_filter(
         seed=seed,
         device="cpu",
         monitor="crps",
-        validate_every=max(budget.filter // 4, 1),
+        validate_every=max(updates // 3, 1),
         save_every=100,
     )
     return model

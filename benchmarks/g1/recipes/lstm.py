@@ -15,9 +15,10 @@ HIDDEN = 128
 
 @register
 class LSTM(G1Recipe):
-    """Reads encoding and reading."""
+    """Reads encoding and reading. It knows no motion, and is trained for longer."""
 
     bias = False
+    longer = 6
 
     def modules(self):
         size, motion = self.target.size, self.motion
