@@ -2,7 +2,16 @@
 
 from pathlib import Path
 
-ORDER = ("first_filter", "own_recordings", "two_sensors", "training", "diagnostics", "policy", "to_robot")
+ORDER = (
+    "first_filter",
+    "all_filters",
+    "own_recordings",
+    "two_sensors",
+    "training",
+    "diagnostics",
+    "policy",
+    "to_robot",
+)
 
 
 class ReadingOrder:

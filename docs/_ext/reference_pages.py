@@ -23,6 +23,7 @@ OWN_METHODS = {
         ``_reset_on_native_autoreset``     the same, in environments that reset themselves
         ``_reset_mask``                    which rows reset, where groups of agents have masks of their own
         ``_step``                          one step of the filter; called by ``env.step``
+        ``_emit``                          puts what is kept of a step into what the environment emits
         ``_trial``                         a step on zeros, whose results tell the shapes of the specs
         ``_add_specs``                     the specs of what that trial wrote
         ``_post_step_mdp_hooks``           with ``store_ensemble=False``, leaves the ensemble out of what is stored

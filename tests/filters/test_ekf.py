@@ -1,5 +1,7 @@
 """Oracles of all Gaussian filters (EKF, UKF, Backprop KF): the Kalman filter, differences of losses, the true noise."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -20,9 +22,12 @@ from tests.filters.gaussian_for_tests import (
     prior,
 )
 from torch_denkf.envs.linear import LinearGaussianEnv
+from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import (
+    AroundState,
     CholeskyNoise,
     ConstantNoise,
+    GaussianPrior,
 )
 from torch_denkf.objectives import GaussianLoss
 from torch_denkf.transforms import DEnKFTransform
@@ -247,3 +252,13 @@ def test_the_noise_is_read_where_its_module_writes_it(float64, name):
     torch.testing.assert_close(found["camera", "r"], R.expand(3, 12, 2), rtol=1e-14, atol=0)
     alone = linear_filter(name, noise=noise).sequence(frames.exclude("sensor"))
     assert_equal(alone, expected, [*BELIEF, *INFO], atol=0)
+
+
+@pytest.mark.parametrize("name", [*FILTERS, "LSTMFilter"])
+@pytest.mark.parametrize("initial", [GaussianPrior([0.0, 0.0], [1.0, 1.0]), AroundState([1.0, 1.0])])
+def test_the_initial_belief_of_an_ensemble_is_refused(name, initial):
+    lstm = partial(LSTMFilter, None, features=16, state_dim=2)
+    make = lstm if name == "LSTMFilter" else partial(linear_filter, name)
+    message = rf"{name} carries .*'cov'.*{type(initial).__name__}, writes .*MomentPrior.*GaussianAround"
+    with pytest.raises(ValueError, match=message):
+        make(initial=initial)

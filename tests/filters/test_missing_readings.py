@@ -15,12 +15,15 @@ from tests.filters.factories import (
 )
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
+from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
+    FromSensor,
     GaussianPrior,
     LinearObservation,
+    WithWeights,
 )
 
 LOG_WEIGHT = ("belief", "log_weight")
@@ -150,6 +153,42 @@ def test_one_of_two_sensors_may_be_missing(float64):
         )
         expected = one.step(td.select("belief").copy().set("y", y[[kept]]))
         close(both.step(td.exclude(missing).copy(), without=[missing]), expected, BELIEF)
+
+
+@pytest.mark.parametrize("case", ["plain", "weights", "update at reset", "stale"])
+def test_a_start_without_the_reading_is_the_prior(float64, case):
+    """The belief starts from reading 0 where it is there, from N(mean, std) where it is not; reading 1 is another's."""
+    plain = linear_denkf()
+    mean, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
+    start = FromSensor([0], mean, std, ensemble_size=7, sensor_key="y0", noise_variance_key="r0")
+    modules = {"transition": plain["transition"]}
+    modules |= parts_of_reading(0, "forecast", "mid", info_key="i0")
+    modules |= parts_of_reading(1, "mid", "belief", info_key="i1")
+    if case == "weights":
+        filter = bootstrap(7, initial=WithWeights(start))
+        filter.module.update(torch.nn.ModuleDict({"r0": modules["r0"]}))
+        noise_key = ("noise", "initial.initial")
+    else:
+        filter = Filter(modules, initial=start, update_at_reset=case == "update at reset")
+        noise_key = ("noise", "initial")
+    z, y = torch.randn(7, 2), torch.randn(2)
+    given = TensorDict({"y0": y[:1], "y1": y[1:], "observation": y, noise_key: z})
+    if case == "stale":
+        given = filter.initialise(given)
+    expected = mean + std * z
+    out = filter.initialise(given if case == "stale" else given.exclude("y0"), without=["y0"])
+    if case == "update at reset":  # with the reading that is there
+        after = Filter({"transition": plain["transition"], **parts_of_reading(1, "forecast", "belief")}, initial=start)
+        forecast = TensorDict({"forecast": {"ensemble": expected}, "y1": y[1:]})
+        for name in ("r1", "h1", "a1"):
+            forecast = after[name](forecast)
+        expected = forecast[ENSEMBLE]
+    torch.testing.assert_close(out[ENSEMBLE], expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(out[MEAN], expected.mean(-2), rtol=0, atol=1e-12)
+    with pytest.raises(KeyError, match="'y0'"):
+        filter.initialise(given.exclude("y0"))
+    with pytest.raises(KeyError, match="no module must find"):
+        filter.initialise(given, without=["y2"])
 
 
 @pytest.mark.parametrize("kind", ["ensemble", "kalman", "particles"])

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.filters.factories import linear_kalman, linear_system
 from tests.filters.particle_for_tests import E, bootstrap, readings
@@ -73,6 +74,39 @@ def test_variance_and_likelihood_of_many_particles(float64):
         assert z.square().mean().sqrt() < 2
     assert (out["belief", "var"] / exact["belief", "var"] - 1)[:, 1:].abs().max() < 0.3
     assert (out["info", "log_likelihood"] - exact["info", "log_likelihood"])[:, 1:].abs().max() < 0.4
+
+
+def test_innovation_and_nis_are_the_kalman_filters(float64):
+    td = readings(20)
+    td["observed"][7] = False
+    exact = linear_kalman().sequence(td.copy())
+    rows, innovation, nis = 8, ("info", "innovation"), ("info", "nis")
+    with torch.no_grad():
+        out = bootstrap(20000).sequence(td.expand(rows, 20).clone())
+    # Standard errors of mean and variance of 20000 particles, of which resampling keeps two thirds: about 1 %.
+    torch.testing.assert_close(out[innovation], exact[innovation].expand(rows, -1, -1), rtol=0, atol=0.06)
+    torch.testing.assert_close(out[nis], exact[nis].expand(rows, -1, -1), rtol=0.06, atol=0.02)
+    assert (out[nis][:, 7] == 0).all()
+    assert (out[innovation].masked_select(~td["observed"]) == 0).all()
+    assert (out[nis][:, 1:7] > 0).any()
+
+
+@pytest.mark.parametrize("way", ["prediction", "compiled", "nan"])
+def test_innovation_and_nis_in_other_ways_of_running(float64, way):
+    filter = bootstrap(50)
+    td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
+    if way == "compiled":
+        filter.draw_noise(td)
+        expected = filter.step(td.copy())
+        out = filter.compile(backend="eager").step(td.copy())
+        for key in (("info", "innovation"), ("info", "nis")):
+            torch.testing.assert_close(out[key], expected[key])
+        return
+    if way == "nan":
+        td["observation"], td["observed"] = torch.full((2,), torch.nan), torch.tensor([False])
+    out = filter.predict(td) if way == "prediction" else filter.step(td)
+    assert out["info", "nis"].tolist() == [0.0]
+    assert out["info", "innovation"].tolist() == [0.0, 0.0]
 
 
 def test_the_estimate_of_the_likelihood_is_unbiased(float64):

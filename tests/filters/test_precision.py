@@ -21,6 +21,7 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     StochasticMLP,
+    UnicycleTransition,
 )
 
 
@@ -94,3 +95,19 @@ def test_a_replaced_network_draws_its_own_noise():
     filter.module["observation"] = Select([0, 1])
     out = filter.sequence(frames.copy())
     assert out["forecast", "observation"][:, 1:].equal(out["forecast", "ensemble"][:, 1:, :, :2])
+
+
+@pytest.mark.parametrize("value", [0.1, torch.tensor(0.1), np.float32(0.1)])
+def test_a_number_in_a_dictionary_is_an_entry_of_one(value):
+    filter = DEnKF(
+        UnicycleTransition(torch.zeros_like, dt="seconds"),
+        None,
+        Select([3, 4]),
+        ConstantNoise([0.3, 0.05], in_key="reading"),
+        initial=GaussianPrior([0.0, 0.0, 0.0, 1.0, 0.0], [0.0] * 5, ensemble_size=4),
+        observation_key="reading",
+    )
+    belief = filter.initialise({}).update({"reading": torch.tensor([1.0, 0.0])})
+    out = filter.predict({"seconds": value, "belief": belief["belief"]})
+    torch.testing.assert_close(out["belief", "mean"], torch.tensor([0.1, 0.0, 0.0, 1.0, 0.0]))
+    assert out["seconds"].shape == (1,)

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.filters._steps import _without_reading
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -274,3 +275,34 @@ def test_noise_is_drawn_in_the_precision_of_what_is_read_and_all_or_none_is_give
     del td["noise", "self", "pull"]  # half of it is as good as none
     torch.manual_seed(0)
     assert module(td)["y"].equal(drawn[0] - drawn[1])
+
+
+class Returns(SubModel):
+    """A sub-model of two out_keys, and whatever its compute returns."""
+
+    def __init__(self, out):
+        super().__init__(nn.Identity(), ["x"], [("belief", "mean"), ("belief", "var")])
+        self.out, self.reading_keys = out, self.in_keys
+
+    def compute(self, x):
+        return self.out
+
+    def without_reading(self, x):
+        return self.out
+
+
+@pytest.mark.parametrize(
+    ("out", "got"),
+    [
+        (torch.zeros(2), "1 values"),
+        ((torch.zeros(2),) * 3, "3 values"),
+        (None, "NoneType"),
+        ({"a": torch.zeros(2)}, "dict"),
+    ],
+)
+def test_too_few_or_too_many_values_name_the_module_and_its_keys(out, got):
+    keys = r"\[\('belief', 'mean'\), \('belief', 'var'\)\], 2 values; it returned "
+    with pytest.raises(ValueError, match=r"Returns.compute\(\) .*" + keys + got):
+        Returns(out)(TensorDict({"x": torch.zeros(2)}))
+    with pytest.raises(ValueError, match=r"Returns.without_reading\(\) .*" + keys + got):
+        _without_reading(Returns(out), {})

@@ -321,3 +321,16 @@ def test_a_tempered_likelihood_is_that_of_more_noise(float64):
         out = ParticleAnalysis(tempering=tempering)(GaussianLikelihood(sensor_key="y")(td.copy()))
         weights.append(out["belief", "log_weight"])
     torch.testing.assert_close(*weights, rtol=0, atol=1e-12)
+
+
+def test_the_innovation_of_angles_is_the_shorter_way_round():
+    likelihood = GaussianLikelihood(angles=[0], sensor_key="y")
+    predicted, weights = torch.tensor([[3.0], [-3.0]]), torch.tensor([0.25, 0.75]).log()
+    forecast = {"ensemble": predicted, "observation": predicted, "log_weight": weights}
+    td = TensorDict({"forecast": forecast, "y": torch.tensor([-2.5]), "sensor": {"noise": torch.tensor([0.01])}})
+    out = ParticleAnalysis(likelihood)(likelihood(td))
+    gap = 2 * math.pi - 6  # between the two predictions
+    innovation = 0.5 + 0.25 * gap
+    variance = 2 * 0.25 * 0.75 * gap**2 + 0.01
+    torch.testing.assert_close(out["info", "innovation"], torch.tensor([innovation]))
+    torch.testing.assert_close(out["info", "nis"], torch.tensor([innovation**2 / variance]))

@@ -1,8 +1,11 @@
 """Oracle: a naive loop over the members, one forward each."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torch._dynamo.testing import CompileCounter
 
 from torch_denkf.modules import ImageSensor, VectorSensor, convolutional_trunk
 
@@ -181,3 +184,43 @@ def test_pixels_are_standardised_channel_by_channel():
         for sensor, x in ((standard, pixels), (plain, by_hand))
     ]
     torch.testing.assert_close(*outs)
+
+
+# ------------------------------------------------------------------------------------------------ the pixels' range
+
+
+def gray_sensor(**kwargs):
+    return ImageSensor(2, image_shape=(1, 8, 8), ensemble_size=3, num_cells=(4,), **kwargs)
+
+
+def warnings_of(sensor, *frames):
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        for frame in frames:
+            sensor(TensorDict({"pixels": frame}))
+    return [str(one.message) for one in record]
+
+
+def test_floating_point_pixels_up_to_255_are_said_once():
+    bright = torch.rand(1, 8, 8) * 255
+    (message,) = warnings_of(gray_sensor(), torch.zeros(1, 8, 8), bright, bright)  # specs are tried out on zeros
+    assert "'pixels'" in message
+    assert "uint8" in message
+
+
+@pytest.mark.parametrize("case", ["uint8", "unit", "standardised", "in the units of the pixels", "compiled"])
+def test_no_warning_for_pixels_as_they_should_be(case):
+    bright, options = torch.rand(1, 8, 8) * 255, {}
+    pixels = {"uint8": bright.byte(), "unit": bright / 255, "standardised": torch.randn(1, 8, 8)}.get(case, bright)
+    if case == "in the units of the pixels":
+        options = {"pixel_loc": [127.0], "pixel_scale": [60.0]}
+    sensor = gray_sensor(**options)
+    if case == "compiled":  # and what was compiled is not compiled again after an eager look
+        count = CompileCounter()
+        compute = torch.compile(lambda x: sensor.compute(x, noise=None), backend=count, fullgraph=True)
+        compute(pixels / 255)
+        warnings_of(sensor, pixels / 255)
+        compute(pixels / 255)
+        assert count.frame_count == 1
+        return
+    assert not warnings_of(sensor, pixels, pixels)

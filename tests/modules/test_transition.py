@@ -38,6 +38,14 @@ def test_learned_transition_is_its_formula(float64, batch, residual, scaled, act
     torch.testing.assert_close(forecast(transition, state, action=drive), expected, rtol=0, atol=1e-13)
 
 
+def test_commands_are_standardised(float64):
+    state, drive, net = torch.randn(4, 5, 3), 300 + 90 * torch.randn(4, 2), nn.Linear(5, 3)
+    plain = LearnedTransition(net, action_key="action")
+    scaled = LearnedTransition(net, action_key="action", action_loc=[300.0, 300.0], action_scale=[90.0, 45.0])
+    expected = forecast(plain, state, action=(drive - 300) / torch.tensor([90.0, 45.0]))
+    torch.testing.assert_close(forecast(scaled, state, action=drive), expected, rtol=0, atol=1e-13)
+
+
 def test_residual_of_a_zero_network_is_the_identity():
     net = nn.Linear(3, 3)
     nn.init.zeros_(net.weight), nn.init.zeros_(net.bias)

@@ -95,6 +95,26 @@ def test_what_was_not_observed_is_shaded(width):
     assert not plot_bands(run, dims=[0], observed=torch.ones(40, 1, dtype=torch.bool))[0].patches
 
 
+def test_each_component_is_shaded_by_its_own_sensors_mask():
+    run = ensemble_run()
+    gps = torch.ones(40, 1, dtype=torch.bool)
+    gps[30:32] = False
+    run["gps_observed"], encoder = gps, torch.ones(40, dtype=torch.bool)
+    encoder[5] = False
+    readings = {0: torch.arange(40.0), 2: torch.arange(40.0)}
+    panels = plot_bands(run, dims=[0, 1, 2], time=DT, observed={0: "gps_observed", 2: encoder}, readings=readings)
+    spans = [[(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches] for axes in panels]
+    np.testing.assert_allclose(spans[0], [(2.95, 3.15)])
+    assert spans[1] == []
+    np.testing.assert_allclose(spans[2], [(0.45, 0.55)])
+    assert line(panels[0], "readings")[1].tolist() == [float(t) for t in range(40) if t not in (30, 31)]
+    assert line(panels[2], "readings")[1].tolist() == [float(t) for t in range(40) if t != 5]
+    with pytest.raises(ValueError, match=r"observed of \[1\] belong to no drawn component"):
+        plot_bands(run, dims=[0], observed={1: encoder})
+    with pytest.raises(KeyError, match="no 'imu'"):
+        plot_bands(run, observed={1: "imu"})
+
+
 def test_angles_stay_beside_the_mean():
     rng = torch.Generator().manual_seed(0)
     theta = torch.linspace(0, 9, 30)

@@ -9,7 +9,8 @@ import torch
 from PIL import Image
 
 from tests.plots.runs_for_tests import ensemble_run
-from torch_denkf.plots import belief_video, write_video
+from torch_denkf.plots import belief_video, plot_bands, plot_path, write_video
+from torch_denkf.plots._scene import Scene
 
 
 def smooth_frames(count=6, height=48, width=64):
@@ -138,6 +139,31 @@ def test_the_belief_grows_beside_the_camera(tmp_path, ending):
     np.testing.assert_allclose(np.diff(ends[1:-1]), np.diff(ends[1:-1]).mean(), atol=3)
     path = [blue(frame[bottom + 80 :, :right]).sum() for frame in got]
     assert (np.diff(path) > 0).sum() >= 8
+
+
+def test_the_last_frame_is_the_whole_picture(tmp_path):
+    run, name = ensemble_run(steps=20), "the angle of the right shoulder's yaw joint, rad"
+    run["pixels"] = torch.full((20, 3, 8, 16), 0.5)
+    scene = Scene((8, 5), 100, None, run["pixels"], path=True, bands=2)
+    plot_path(run, ax=scene.path)
+    plot_bands(run, dims=[0, 1], names=[name, "y"], ax=scene.bands)
+    scene.freeze(run["observed"].any(-1), np.arange(20))
+    middle, last = scene.frame(9), scene.frame(19)
+    boxes = [axes.get_window_extent() for axes in scene.bands]
+    label = scene.bands[0].yaxis.label.get_window_extent()
+    assert label.height <= 1.01 * boxes[0].height
+    # What the bands hide until then is what there is when all is drawn at once, artist by artist.
+    for part in [part for axes in scene.bands for part in (*axes.lines, *axes.collections, *axes.patches)]:
+        part.set_visible(True)
+    for _, part in scene.moving:
+        part.set_animated(False)
+    scene.canvas.draw()
+    assert np.abs(scene._buffer().astype(int) - last).max() <= 2
+    for box in boxes:
+        rows = slice(round(500 - box.y1), round(500 - box.y0))
+        half = round((box.x0 + box.x1) / 2)
+        assert (middle[rows, : half - 1] == last[rows, : half - 1])[:, round(box.x0) :].all()
+        assert not blue(middle[rows, half + 1 : round(box.x1)]).any()
 
 
 def vermilion(frame):

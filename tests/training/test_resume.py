@@ -128,3 +128,15 @@ def test_stages_may_be_added_after_the_end(tmp_path):
     assert list(three) == ["sensor", "filter", "end_to_end"]
     assert {name: three[name] for name in two} == two
     assert three["end_to_end"]["metrics"]["mse"] <= two["filter"]["metrics"]["mse"]
+
+
+def test_a_finished_training_that_is_started_again_says_so(tmp_path, caplog):
+    make_trainer(tmp_path).fit()
+    assert not caplog.messages
+    make_trainer(tmp_path).fit()
+    (message,) = caplog.messages
+    assert str(tmp_path) in message
+    assert "fit(resume=False)" in message
+    caplog.clear()
+    make_trainer(tmp_path).fit(resume=False)
+    assert not caplog.messages

@@ -14,14 +14,20 @@ from __future__ import annotations
 
 import argparse
 import math
+import warnings
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 from torch_denkf._progress import progress_bar
 from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
+
+#: Share of the usual time between frames by which one may be off; containers round to milliseconds.
+_UNEVEN = 0.2
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +43,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
     add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
-    add("--fps", type=float, help="frames in a second; that of a video by default")
+    add("--fps", type=float, help="frames in a second; by default that of a video, or the times of its frames")
     add("--times", type=Path, metavar="FILE", help="a time in s for each frame, a row each")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
@@ -67,6 +73,8 @@ def _run(args: argparse.Namespace) -> None:
     folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
     calibration = read_camera(args.calibration, args.camera or folder)
     times, fps = _times(args.times, source), source.fps if args.fps is None else args.fps
+    if times is None and args.fps is None:
+        times = _uneven(source)
     if times is None and fps is None:
         raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
     beliefs = track(
@@ -118,6 +126,23 @@ def _times(file: Path | None, source) -> Sequence[float] | None:
     if len(times) >= source.first + source.count:
         return times[source.first : source.first + source.count]
     raise ValueError(f"{file} has {len(times)} times, but {source.path} has {source.count} frames")
+
+
+def _uneven(source) -> Sequence[float] | None:
+    """The times that a video says its frames were taken at, where they are not evenly spaced."""
+    stamps = source.stamps()
+    if stamps is None:
+        return None
+    gaps = [after - before for before, after in pairwise(stamps)]
+    usual = median(gaps)
+    off = sum(abs(gap - usual) > _UNEVEN * usual for gap in gaps)
+    if off:
+        warnings.warn(
+            f"{source.path}: {off} of {len(gaps)} frames come earlier or later than {usual:.3g} s after the one before "
+            f"(at most {max(gaps):.3g} s); the times in the file are used. Pass --fps to take them as even.",
+            stacklevel=2,
+        )
+    return stamps if off or source.fps is None else None
 
 
 def _counted(source):

@@ -6,6 +6,8 @@ from .kitti.mirror import mirror_drive
 from .kitti.motion import with_motion
 from .kitti.render import random_drive, render_drives, roadside_scene, write_drives
 from .kitti.replay import KITTIOdometryExperienceReplay
+from .lerobot.lag import lag_errors
+from .lerobot.repeats import repeated_pictures
 from .lerobot.replay import LeRobotExperienceReplay as LeRobotExperienceReplay
 from .lerobot.replay import LeRobotReplay
 from .lerobot.rows import recording_from_rows
@@ -33,6 +35,7 @@ __all__ = [
     "bridge_gaps",
     "drive_frames",
     "frames_at",
+    "lag_errors",
     "list_kitti_drives",
     "lorenz96_step",
     "lorenz96_tendency",
@@ -41,6 +44,7 @@ __all__ = [
     "read_kitti_drive",
     "recording_from_rows",
     "render_drives",
+    "repeated_pictures",
     "roadside_scene",
     "sample_windows",
     "steps_between",

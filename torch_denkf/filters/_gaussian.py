@@ -6,12 +6,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Unpack
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter, FilterOptions
 
-__all__ = ["GaussianFilter", "GaussianOptions"]
+__all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
 
 class GaussianOptions(FilterOptions, total=False):
@@ -50,6 +50,9 @@ class GaussianFilter(Filter):
         observation_key: likewise.
         observed_key: likewise.
         **kwargs: of :class:`Filter`.
+
+    Raises:
+        ValueError: if ``initial`` writes no mean and covariance.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class GaussianFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
         update = analysis(
             inflation=inflation,
             angles=angles,
@@ -76,3 +80,14 @@ class GaussianFilter(Filter):
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, analysis=update)
         super().__init__(modules, initial=initial, **kwargs)
+
+
+def refuse_other_beliefs(owner: str, initial: TensorDictModuleBase, carry: Sequence[NestedKey]) -> None:
+    """Raises a ``ValueError`` where an initial belief lacks the mean or the covariance that a filter carries."""
+    written = [unravel_key(key) for key in initial.out_keys]
+    if not set(map(unravel_key, carry)).issubset(written):
+        raise ValueError(
+            f"{owner} carries {list(carry)}, and its initial belief, {type(initial).__name__}, writes {written}. Use "
+            "MomentPrior(mean, cov), or GaussianAround(std) around a known state; GaussianPrior, AroundState and "
+            "FromSensor are for ensembles and particles."
+        )

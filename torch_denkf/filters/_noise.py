@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import torch
+from tensordict import unravel_key
 
+from torch_denkf.filters._said import say_eager
 from torch_denkf.filters._structure import Placed
 from torch_denkf.modules._base import Entries, SubModel, flat_noise, random_parts
 
@@ -58,7 +60,10 @@ def draw_noise(
                 dtype=dtype,
                 generator=generator,
             )
-            complete = complete and noise is not None
+            if noise is None:
+                complete = False
+                if not as_far_as_known:
+                    say_eager(filter, *_undrawn(place, part))
             drawn.update(flat_noise(noise, place))
     return drawn if complete or as_far_as_known else None
 
@@ -74,10 +79,24 @@ def _sizes(filter: Filter, entries: Entries) -> tuple[int | None, int | None]:
 
 
 def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | None:
-    """O of the reading that a sub-model uses: from the entry, or from the module that writes it."""
+    """O of the reading that a sub-model uses: from the entry, or from the module that writes it.
+
+    A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
+    """
+    known = filter._structure.observation_dims
     key = getattr(part, "noise_variance_key", None)
-    if key is None:
-        return None
-    if key in entries:
-        return entries[key].shape[-1]
-    return filter._structure.observation_dims.get(key)
+    if key is not None:
+        return entries[key].shape[-1] if key in entries else known.get(key)
+    found = {known[key] for key in map(unravel_key, part.in_keys) if key in known}
+    found |= {entries[key].shape[-1] for key in map(unravel_key, getattr(part, "reading_keys", ())) if key in entries}
+    return found.pop() if len(found) == 1 else None
+
+
+def _undrawn(place: str, part: SubModel) -> tuple[str, str]:
+    """Why a noise could not be drawn before the step, and what to do."""
+    name = type(part).__name__
+    return (
+        f"{name} at place {place!r} cannot draw its noise before the step.",
+        f"Its draw_noise() must return a tensor from members=, state_dim= and observation_dim=; where {name} needs "
+        "observation_dim, let its attribute noise_variance_key name the entry that holds the variances of its reading.",
+    )

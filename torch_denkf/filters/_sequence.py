@@ -12,6 +12,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._said import say_ignored_mask
 from torch_denkf.filters._steps import Steps, blank, previous_key
 from torch_denkf.filters._structure import Structure
 from torch_denkf.filters._summaries import summaries
@@ -64,6 +65,7 @@ def filter_rows(
     structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
     entries, call = filter.entries_of(rows), Call(size, time=True)
     check_inputs(filter, entries, rows, carry=False)
+    say_ignored_mask(filter, rows)
     with set_recurrent_mode(True):  # for modules that are not this package's
         frames = filter.steps().frames(entries, call)
     entries.update(frames)

@@ -105,7 +105,15 @@ class Steps(NamedTuple):
                 entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
         return self._update(entries, written, call, reset, start, missing)
 
-    def first(self, entries: Entries, call: Call, start: Entries, *, in_sequence: bool = True) -> Entries:
+    def first(
+        self,
+        entries: Entries,
+        call: Call,
+        start: Entries,
+        *,
+        in_sequence: bool = True,
+        missing: set[NestedKey] | None = None,
+    ) -> Entries:
         """The first step of a sequence: its belief is ``start``; the update is made if that is to see its frame."""
         structure = self.structure
         entries = {**entries, **{key: start[key] for key in structure.carry}}
@@ -114,7 +122,7 @@ class Steps(NamedTuple):
             out = self.run([structure.transition], entries, call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
-        return self._update(entries, forecast, call, every, start, None)
+        return self._update(entries, forecast, call, every, start, missing)
 
     def _update(
         self,
@@ -247,9 +255,8 @@ def previous_key(key: NestedKey) -> NestedKey:
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
     """What a module writes where its reading is missing; nothing if it does not know."""
     readings = set(getattr(module, "reading_keys", ()))
-    if not isinstance(module, SubModel) or not readings:
+    if not isinstance(module, SubModel) or not readings or not hasattr(module, "without_reading"):
         return {}
     values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
     values += [entries.get(key) for key in module.optional_keys]
-    out = module.without_reading(*values)
-    return dict(zip(module.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))
+    return module.by_key(module.without_reading(*values), "without_reading")

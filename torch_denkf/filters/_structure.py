@@ -41,6 +41,7 @@ class Structure(NamedTuple):
         beside: what else the transition writes.
         observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
         readings: raw entries that the analyses' readings are made of.
+        unmasked: modules of the update that take in a reading and read no mask.
         own_info: new names for diagnostics that several analyses would write under one.
         totals: sums of those over the analyses.
         likelihoods: the log-likelihood of each analysis' reading.
@@ -61,6 +62,7 @@ class Structure(NamedTuple):
     beside: tuple[NestedKey, ...]
     observation_dims: dict[NestedKey, int]
     readings: tuple[NestedKey, ...]
+    unmasked: tuple[Placed, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
     totals: dict[NestedKey, tuple[NestedKey, ...]]
     likelihoods: tuple[NestedKey, ...]
@@ -126,6 +128,7 @@ class Structure(NamedTuple):
             beside=tuple(key for key in _out(steps[0][1]) if key not in forecast_of.values()),
             observation_dims=_observation_dims([*frames, *steps[1:]]),
             readings=tuple(_readings(frames, steps[1:], needed)),
+            unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
             totals=totals,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
@@ -207,6 +210,20 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
             found.update(dict.fromkeys(reads(module)[0]))
     made_by_steps = {key for _, module in update for key in _out(module)}
     return [key for key in found if key in needed and key not in made_by_steps]
+
+
+def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[Placed]:
+    """The modules of the update that take in a reading, but name no optional entry, as a mask would be.
+
+    They say what their reading is, or they write the belief and read an entry that no step makes.
+    """
+    made = {*carry, *(key for _, module in steps for key in _out(module))}
+    for place, module in steps[1:]:
+        for part in _in_sequences(module):
+            must, may = reads(part)
+            updates = not made.issuperset(must) and not set(carry).isdisjoint(_out(part))
+            if not may and (updates or len(getattr(part, "reading_keys", ())) > 0):
+                yield place, part
 
 
 def _refuse_overwriting(modules: Sequence[Placed]) -> None:

@@ -11,7 +11,6 @@ At a reset the forecast is the initial belief, and so is the belief unless ``upd
 
 from __future__ import annotations
 
-import warnings
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
@@ -35,6 +34,7 @@ from torch_denkf.filters._checks import (
 from torch_denkf.filters._compiled import CompiledSteps
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._primer import LastAction, belief_primer
+from torch_denkf.filters._said import say_eager, say_ignored_mask, say_once, say_up_to_date
 from torch_denkf.filters._sequence import filter_rows
 from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.filters._steps import Steps, blank, previous_key, where_rows
@@ -129,7 +129,7 @@ class Filter(TensorDictSequential):
         self.update_at_reset, self.forecast_keys = update_at_reset, dict(forecast_keys or {})
         self.variance_ceiling, self.check_finite = variance_ceiling, check_finite
         self.compiled: CompiledSteps | None = None
-        self._said_ceiling = False
+        self._said: set[str] = set()
         self._sorted_for: tuple = ()
         refuse_two_precisions(self)
         self._sort()
@@ -207,7 +207,9 @@ class Filter(TensorDictSequential):
 
         The first call of each kind (chunk, batch size, with or without gradients) compiles, later ones reuse that;
         copies and pickles of the filter compile anew. Noise is drawn outside, so a seed gives what it gives eagerly, up
-        to rounding. Steps stay eager where the size of a noise is not known in advance, and on a policy's data.
+        to rounding. Calls stay eager where the size of a noise is not known in advance, and in :meth:`predict` and
+        ``step(without=...)``, which would compile anew for each reading that is lost; a warning says so once. On a
+        policy's data they stay eager, too.
 
         Args:
             chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
@@ -243,6 +245,8 @@ class Filter(TensorDictSequential):
             if previous_key(key) in entries:
                 entries[key] = entries[previous_key(key)]
         check_inputs(self, entries, tensordict)
+        say_ignored_mask(self, tensordict)
+        say_up_to_date(self, entries[structure.carry[0]])
         reset, known = starts_of(tensordict, self.init_key, step=True), entries.get(_KNOWN)
         if known is not None:
             known = known.reshape(*tensordict.batch_size, 1)
@@ -270,7 +274,8 @@ class Filter(TensorDictSequential):
 
         Args:
             tensordict: carry, frame, and what else the modules read; the new belief is written there. A dictionary of
-                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision.
+                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision; a number is an entry
+                ``[1]``.
             without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
                 out, and the belief is the forecast unless another sensor has something to say.
 
@@ -286,6 +291,11 @@ class Filter(TensorDictSequential):
         entries = self.entries_of(tensordict, one_step=True)
         check_inputs(self, entries, tensordict, without)
         if without:
+            say_eager(
+                self,
+                "predict() and step(without=...) leave readings out.",
+                "Hide what is missing with a mask instead, which keeps the step compiled.",
+            )
             call, steps, missing = Call(tensordict.batch_size), self.steps(), set(without)
             written = steps.frames(entries, call, missing)
             written.update(steps.advance({**entries, **written}, call, missing=missing))
@@ -293,6 +303,7 @@ class Filter(TensorDictSequential):
             if lost:
                 raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
         else:
+            say_ignored_mask(self, tensordict)
             written = self.take_step(entries, tensordict.batch_size)
         if self.check_finite and not torch.compiler.is_compiling():
             refuse_non_finite(self.structure, entries, written)
@@ -325,17 +336,30 @@ class Filter(TensorDictSequential):
         written.update(steps.advance({**entries, **written}, call))
         return written
 
-    def initialise(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``."""
+    def initialise(
+        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
+    ) -> TensorDictBase:
+        """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
+
+        Args:
+            tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
+            without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
+                its prior.
+
+        Raises:
+            KeyError: if an entry is missing, or ``without`` names what no module reads.
+        """
         tensordict = self._of_one_robot(tensordict)
         entries, call, structure = self.entries_of(tensordict), Call(tensordict.batch_size), self.structure
+        missing = set(refuse_unknown_readings(structure, without))
         frame_keys, written = set(structure.frame_keys), {}
         if self.update_at_reset or not frame_keys.isdisjoint(chain(*reads(self.initial))):
-            written = self.steps().frames(entries, call)
+            written = self.steps().frames(entries, call, missing)
             entries.update(written)
-        start = self.initial_belief(entries, call)
+        entries = {key: value for key, value in entries.items() if key not in missing}
+        start = self.initial_belief(entries, call._replace(missing=frozenset(missing)))
         if self.update_at_reset:
-            written.update(self.steps().first(entries, call, start, in_sequence=False))
+            written.update(self.steps().first(entries, call, start, in_sequence=False, missing=missing))
         else:
             written.update(start)
             written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
@@ -453,13 +477,14 @@ class Filter(TensorDictSequential):
             return tensordict
         like = self.like()
         out = TensorDict(dict(tensordict), batch_size=[])
+        out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
         if like is None:
             return out
         return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
 
     def _look_at_ceiling(self, written: Entries) -> None:
         """Says whether a variance is held at its ceiling, where a compiled graph could not."""
-        if self.variance_ceiling is None or self._said_ceiling or torch.compiler.is_compiling():
+        if self.variance_ceiling is None or "ceiling" in self._said or torch.compiler.is_compiling():
             return
         for key in self.steps().variance_keys():
             value = written.get(key)
@@ -467,13 +492,12 @@ class Filter(TensorDictSequential):
                 self._say_ceiling(key)
 
     def _say_ceiling(self, key: NestedKey) -> None:
-        if not self._said_ceiling:
-            self._said_ceiling = True
-            warnings.warn(
-                f"The variance in {key!r} has reached variance_ceiling={self.variance_ceiling:g} and is held there: "
-                "nothing observes what grows. Said once.",
-                stacklevel=2,
-            )
+        say_once(
+            self,
+            "ceiling",
+            f"The variance in {key!r} has reached variance_ceiling={self.variance_ceiling:g} and is held there: "
+            "nothing observes what grows.",
+        )
 
 
 def _flat(sequence: TensorDictSequential) -> Iterator[Any]:

@@ -47,6 +47,7 @@ class DEnKF(Filter):
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
         angles: components of the observation that are angles in radians, for the default ``analysis``.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
+        observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
             ``check_finite`` of :class:`Filter`.
 
@@ -77,17 +78,21 @@ class DEnKF(Filter):
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
         observation_key: NestedKey | None = None,
+        observed_key: NestedKey | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
-        if analysis is not None and (angles or observation_key is not None):
-            raise ValueError("angles and observation_key are for the default analysis; give them to yours instead.")
+        if analysis is not None and (angles or observation_key is not None or observed_key is not None):
+            raise ValueError(
+                "angles, observation_key and observed_key are for the default analysis; give them to yours instead."
+            )
         if analysis is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
             reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
-            keys = {"sensor_key": reading, "noise_variance_key": noise.out_keys[0]}
+            mask = "observed" if observed_key is None else observed_key
+            keys = {"sensor_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)

@@ -31,6 +31,7 @@ class KalmanFilter(Filter):
         control: B, ``[S, A]``, of the action; ``None`` for none.
         angles: components of the observation that are angles in radians.
         observation_key: readings ``[*B, O]``.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
             ``update_at_reset``, ``variance_ceiling`` and ``check_finite`` of :class:`Filter`.
 
@@ -55,6 +56,7 @@ class KalmanFilter(Filter):
         control: torch.Tensor | None = None,
         angles: Sequence[int] = (),
         observation_key: NestedKey = "observation",
+        observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
         action: dict[str, Any] = {}
@@ -62,6 +64,12 @@ class KalmanFilter(Filter):
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(
             transition=LinearTransition(transition, transition_noise, **action),
-            analysis=KalmanAnalysis(observation, observation_noise, observation_key=observation_key, angles=angles),
+            analysis=KalmanAnalysis(
+                observation,
+                observation_noise,
+                observation_key=observation_key,
+                observed_key=observed_key,
+                angles=angles,
+            ),
         )
         super().__init__(modules, initial=MomentPrior(mean, cov), **kwargs)

@@ -37,7 +37,8 @@ class ParticleFilter(Filter):
         sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where ``likelihood`` reads the tensordict.
         observation: writes the predicted observations ``("forecast", "observation")``.
         likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
-        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default.
+        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default. With a Gaussian likelihood that
+            writes ``("info", "innovation")`` and ``("info", "nis")``, too.
         noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
         resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
             :class:`~torch_denkf.modules.ResampledTransition`; a transition that is one already is left as it is.
@@ -106,6 +107,8 @@ class ParticleFilter(Filter):
             likelihood = GaussianLikelihood(angles=angles, observed_key=observed_key, **keys)
         elif angles:
             raise ValueError("angles are for the default likelihood; give them to yours instead.")
+        if analysis is None:
+            analysis = ParticleAnalysis(likelihood if isinstance(likelihood, GaussianLikelihood) else None)
         if not isinstance(transition, ResampledTransition):
             transition = ResampledTransition(
                 transition,
@@ -124,7 +127,7 @@ class ParticleFilter(Filter):
             transition=transition,
             observation=observation,
             likelihood=likelihood,
-            analysis=ParticleAnalysis() if analysis is None else analysis,
+            analysis=analysis,
         )
         super().__init__(
             OrderedDict((name, module) for name, module in modules.items() if module is not None),

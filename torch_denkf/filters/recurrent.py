@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf.filters._gaussian import refuse_other_beliefs
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules.kalman import MomentPrior
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
@@ -104,6 +105,7 @@ class LSTMFilter(Filter):
         )
         if initial is None:
             initial = MomentPrior(update.loc, update.scale.square().diag())
+        refuse_other_beliefs(type(self).__name__, initial, [("belief", "mean"), ("belief", "cov")])
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(transition=LSTMTransition(), lstm=update)
         if vehicle:

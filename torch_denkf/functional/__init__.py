@@ -42,7 +42,7 @@ from torch_denkf.functional.unscented import (
     unscented_update,
     unscented_weights,
 )
-from torch_denkf.functional.weighted import crps_weighted, weighted_mean, weighted_var
+from torch_denkf.functional.weighted import crps_weighted, weighted_innovation, weighted_mean, weighted_var
 
 __all__ = [
     "Analysis",
@@ -105,5 +105,6 @@ __all__ = [
     "unicycle_jacobians",
     "weighted_mean",
     "weighted_var",
+    "weighted_innovation",
     "crps_weighted",
 ]

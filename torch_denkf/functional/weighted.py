@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf.functional.gaussian import solve_for_gain
 
 
 def weighted_mean(particles: Tensor, log_weights: Tensor) -> Tensor:
@@ -54,6 +56,46 @@ def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
     anomalies = particles - weighted_mean(particles, log_weights).unsqueeze(-2)
     size = particles.shape[-2]
     return weighted_mean(anomalies.square(), log_weights) * (size / (size - 1))
+
+
+def weighted_innovation(
+    predicted: Tensor, log_weights: Tensor, observation: Tensor, noise: Tensor, *, observed: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """The innovation of weighted particles, and its normalised square.
+
+    The innovation is y − Σ wⁱ h(xⁱ). Its covariance is that of the predicted observations, with the factor of
+    :func:`weighted_var`, plus R. For a linear Gaussian system and many particles both are the Kalman filter's.
+
+    Args:
+        predicted: h(xⁱ), ``[*B, E, O]``, in the sensor's units.
+        log_weights: log wⁱ before the update, normalised, ``[*B, E]``.
+        observation: y, ``[*B, O]``.
+        noise: variances, the diagonal of R, ``[*B, O]``.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; where it is False, observation and noise may be NaN.
+
+    Returns:
+        The innovation ``[*B, O]``, 0 where nothing was observed, and the NIS ``[*B, 1]`` over what was observed.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if there are fewer than two particles.
+
+    Examples:
+        >>> particles, weights = torch.tensor([[-1.0], [1.0]]), torch.tensor([0.5, 0.5]).log()
+        >>> innovation, nis = weighted_innovation(particles, weights, torch.tensor([4.0]), torch.tensor([2.0]))
+        >>> print(f"{innovation.item():.1f} {nis.item():.1f}")
+        4.0 4.0
+    """
+    check_particles(predicted, log_weights, min_size=2)
+    size, dim = predicted.shape[-2:]
+    check_shape("observation", observation, (*predicted.shape[:-2], dim), "[*B, O]")
+    mean = weighted_mean(predicted, log_weights)
+    innovation, anomalies = observation - mean, predicted - mean.unsqueeze(-2)
+    if observed is not None:
+        innovation, noise = torch.where(observed, innovation, 0), torch.where(observed, noise, 1)
+        anomalies = torch.where(observed.unsqueeze(-2), anomalies, 0)
+    spread = (anomalies * log_weights.exp().unsqueeze(-1)).mT @ anomalies * (size / (size - 1))
+    _, nis, _ = solve_for_gain(spread + noise.diag_embed(), innovation.unsqueeze(-1), innovation)
+    return innovation, nis
 
 
 def crps_weighted(particles: Tensor, log_weights: Tensor, target: Tensor) -> Tensor:

@@ -27,12 +27,14 @@ class Call(NamedTuple):
         place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
+        missing: entries that an initial belief must do without.
     """
 
     batch_size: torch.Size
     place: str = "self"
     sample: bool = True
     time: bool = False
+    missing: frozenset[NestedKey] = frozenset()
 
     def part(self, name: str) -> Call:
         """The call of a part of the module."""
@@ -160,8 +162,22 @@ class SubModel(TensorDictModule):
             extra["batch_size"] = call.batch_size
         if "noise" in self._wants:
             extra["noise"] = self._noise(entries, values, call)
-        out = self.compute(*values, **extra)
-        return dict(zip(self.out_keys, (out,) if isinstance(out, Tensor) else out, strict=True))
+        return self.by_key(self.compute(*values, **extra))
+
+    def by_key(self, out: Tensor | Sequence[Tensor], method: str = "compute") -> Entries:
+        """What ``method`` returned, under :attr:`out_keys`.
+
+        Raises:
+            ValueError: if it is not one tensor for each of them.
+        """
+        values = (out,) if isinstance(out, Tensor) else out if isinstance(out, (tuple, list)) else None
+        if values is None or len(values) != len(self.out_keys):
+            got = type(out).__name__ if values is None else f"{len(values)} values"
+            raise ValueError(
+                f"{type(self).__name__}.{method}() returns a tensor for each of its out_keys, in their order: "
+                f"{list(self.out_keys)}, {len(self.out_keys)} values; it returned {got}."
+            )
+        return dict(zip(self.out_keys, values, strict=True))
 
     def required(self, entries: Entries, key: NestedKey) -> Tensor:
         """The entry ``key``.

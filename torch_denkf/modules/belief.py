@@ -3,6 +3,7 @@ r"""Initial beliefs: the first ensemble :math:`X_0 = [x^1_0, \dots, x^E_0]` of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey
@@ -123,7 +124,7 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used.
+    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
         dims: state dimensions that the sensor reads, in the observation's order.
@@ -162,6 +163,14 @@ class FromSensor(_InitialEnsemble):
         register_constant(self, "mean", mean)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
+
+    def on_entries(self, entries, call):
+        """The belief; without its reading the prior."""
+        if call.missing.isdisjoint(self.in_keys):
+            return super().on_entries(entries, call)
+        mean, std = (part.expand(*call.batch_size, -1) for part in (self.mean, self.std))
+        noise = cast("torch.Tensor | None", self._noise(entries, [], call))
+        return self.by_key(self._members(mean, std, noise, call.batch_size))
 
     def compute(self, reading, variance, observed=None, *, noise, batch_size):
         """The belief."""

@@ -20,15 +20,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import (
+    align_angles,
     effective_sample_size,
     jitter_copies,
     soft_resample,
     systematic_resample,
     transport_resample,
+    weighted_innovation,
     weighted_mean,
     weighted_var,
 )
 from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules.likelihood import GaussianLikelihood
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]
 
@@ -251,6 +254,8 @@ class ParticleAnalysis(SubModel):
     errors. Where nothing is observed the weights stay, exactly.
 
     Args:
+        likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
+            ``None`` for neither.
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
@@ -258,7 +263,9 @@ class ParticleAnalysis(SubModel):
         belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
             ``var`` ``[*B, S]``.
         info_key: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
-            and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`.
+            and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`; with a ``likelihood``
+            also ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``, see
+            :func:`~torch_denkf.functional.weighted_innovation`.
 
     Raises:
         KeyError: if an entry is missing.
@@ -276,6 +283,7 @@ class ParticleAnalysis(SubModel):
 
     def __init__(
         self,
+        likelihood: GaussianLikelihood | None = None,
         *,
         tempering: float = 1.0,
         forecast_key: NestedKey = ("forecast", "ensemble"),
@@ -284,15 +292,25 @@ class ParticleAnalysis(SubModel):
         belief_key: str = "belief",
         info_key: str = "info",
     ):
+        of_reading = [] if likelihood is None else likelihood.in_keys
+        diagnostics = ["ess", "log_likelihood", *["innovation", "nis"] * bool(of_reading)]
         super().__init__(
             nn.Identity(),
-            [forecast_key, log_weight_key, log_likelihood_key],
+            [forecast_key, log_weight_key, log_likelihood_key, *of_reading],
             [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
-            + [(info_key, name) for name in ("ess", "log_likelihood")],
+            + [(info_key, name) for name in diagnostics],
+            optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
         self.tempering, self.info_key = tempering, info_key
+        self.angles: list[int] = [] if likelihood is None else likelihood.angles
+        self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
 
-    def compute(self, particles, prior, log_likelihood):
+    def without_reading(self, particles, prior, log_likelihood, predicted, *_):
+        """What is written where there is no reading: the likelihood says what the belief is, the innovation is zero."""
+        ones = torch.ones_like(predicted[..., 0, :])
+        return self.compute(particles, prior, log_likelihood, predicted, ones, ones, torch.zeros_like(ones).bool())
+
+    def compute(self, particles, prior, log_likelihood, *of_reading):
         """The belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
@@ -306,4 +324,11 @@ class ParticleAnalysis(SubModel):
             weighted_var(particles, log_weights),
             effective_sample_size(log_weights).unsqueeze(-1),
             torch.where(seen, total, torch.zeros_like(total)),
+            *(self._innovation(prior, *of_reading) if of_reading else ()),
         )
+
+    def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
+        predicted, reading = align_angles(predicted, reading, self.angles, observed)
+        if reading.ndim == predicted.ndim:
+            reading = reading.mean(-2)
+        return weighted_innovation(predicted, prior, reading, variance, observed=observed)

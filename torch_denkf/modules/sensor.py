@@ -2,6 +2,7 @@ r"""Learned sensors: :math:`\tilde y^i_t \sim s_\xi(\tilde y^i_t \mid y_t)` (the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -18,6 +19,8 @@ __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 
 #: Bytes of a trunk's results at a time, on a CPU: glibc keeps blocks of this size for the next chunk.
 CPU_TRUNK_MEMORY = 32 * 2**20
+#: No image in [0, 1] has such a value, and hardly a standardised one; nearly every image in [0, 255] has.
+_TOO_BRIGHT = 10.0
 #: Table I: (channels, kernel, stride) of each convolution.
 PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
 
@@ -128,7 +131,8 @@ class ImageSensor(_Sensor):
         scale: standard deviation of the observation ``[O]``.
         pixel_loc: mean of each channel ``[C]``, after the division by 255 of uint8 images.
         pixel_scale: standard deviation of each channel ``[C]``; the trunk reads standardised pixels.
-        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point in [0, 1].
+        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point in [0, 1]. Floating-point images that
+            seem to be in [0, 255] give a warning; the first that is not black is looked at.
         out_key: learned observations ``[*B, E, O]``.
         encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
             if anywhere.
@@ -190,6 +194,7 @@ class ImageSensor(_Sensor):
             channels = as_floating(default if value is None else value)
             self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
+        self._looked = False
 
     def _frames_at_once(self, device: torch.device) -> int | None:
         memory = self.trunk_memory
@@ -215,7 +220,25 @@ class ImageSensor(_Sensor):
             )
         if measurement.dtype == torch.uint8:
             measurement = measurement.to(self.loc.dtype) / 255
-        return (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
+            return (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
+        measurement = (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
+        if not torch.compiler.is_compiling() and not self._looked:  # in this order: no compiled code depends on it
+            self._look(measurement)
+        return measurement
+
+    def _look(self, pixels: torch.Tensor) -> None:
+        try:
+            largest = float(pixels.detach().abs().nan_to_num().max())
+        except RuntimeError:  # no pixels, or under vmap, where a number has no value
+            return
+        self._looked = largest > 0  # specs are tried out on zeros
+        if largest > _TOO_BRIGHT:
+            warnings.warn(
+                f"ImageSensor reads {self.in_keys[0]!r} in floating point up to {largest:.0f}; it expects [0, 1]. Give "
+                "it uint8 images, which it divides by 255, or divide them; with pixel_loc and pixel_scale in the units "
+                "of the pixels any range will do. Said once.",
+                stacklevel=2,
+            )
 
 
 class VectorSensor(_Sensor):

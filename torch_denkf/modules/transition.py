@@ -42,6 +42,9 @@ class MemberNetwork(SubModel):
 class LearnedTransition(MemberNetwork):
     r"""A learned transition, residual by default: :math:`x_t = x_{t-1} + s \circ f_\theta((x_{t-1} - m) / s, a)`.
 
+    Commands in degrees, or in ticks of an encoder, are far from what a network likes to read: give their mean and
+    standard deviation, and it reads :math:`(a - m_a) / s_a`.
+
     Args:
         network: maps ``[*, S]`` (or ``[*, S + A]`` with an action) to ``[*, S]``; a :class:`StochasticMLP` makes
             the process noise.
@@ -50,6 +53,8 @@ class LearnedTransition(MemberNetwork):
         scale: standard deviation :math:`s` of each state dimension, ``[S]``; the network works in these units.
         action_key: entry ``[*B, A]`` that drives the transition *into* the new state, i.e. the action taken at
             the previous step; ``None`` for none.
+        action_loc: mean of each command ``[A]``, in its units; zero by default.
+        action_scale: standard deviation of each command ``[A]``; one by default.
         in_key: the belief's ensemble ``[*B, E, S]``.
         out_key: the forecast ensemble ``[*B, E, S]``.
 
@@ -73,6 +78,8 @@ class LearnedTransition(MemberNetwork):
         loc: torch.Tensor | Sequence[float] | None = None,
         scale: torch.Tensor | Sequence[float] | None = None,
         action_key: NestedKey | None = None,
+        action_loc: torch.Tensor | Sequence[float] | None = None,
+        action_scale: torch.Tensor | Sequence[float] | None = None,
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
@@ -81,6 +88,8 @@ class LearnedTransition(MemberNetwork):
         self.residual, self.action_key = residual, action_key
         register_constant(self, "loc", loc)
         register_constant(self, "scale", scale)
+        register_constant(self, "action_loc", action_loc)
+        register_constant(self, "action_scale", action_scale)
 
     def compute(self, state, action=None, *, noise):
         """The forecast ensemble."""
@@ -88,6 +97,8 @@ class LearnedTransition(MemberNetwork):
         if self.scale is not None:
             features = features / self.scale
         if action is not None:
+            action = action if self.action_loc is None else action - self.action_loc
+            action = action if self.action_scale is None else action / self.action_scale
             action = action.to(state.dtype).unsqueeze(-2)
             features = torch.cat([features, action.expand(*state.shape[:-1], action.shape[-1])], -1)
         change = self._run(features, noise)

@@ -11,6 +11,7 @@ from torch_denkf.plots._axes import BELIEF, READING, new_figure, step_bounds
 from torch_denkf.plots._frames import as_picture
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
@@ -53,26 +54,58 @@ class Scene:
             figure.suptitle(title)
 
     def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
-        """Fixes layout and limits, and remembers what is to grow."""
+        """Fixes layout and limits, and draws once what stands still, with the bands and without."""
         self.seen, self.bounds = seen, step_bounds(seconds)
+        self._shrink_labels()
         self.figure.draw_without_rendering()
         self.figure.set_layout_engine("none")
         drawn = [axes for axes in (self.path, *self.bands) if axes is not None]
         for axes in drawn:
             axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())
         self.lines: list[tuple[Line2D, np.ndarray]] = []
+        self.moving: list[tuple[Axes, Artist]] = []
+        if self.camera is not None:
+            self.note = self.camera.annotate(
+                "", (0.5, 0), (0, -3), "axes fraction", "offset points", color=READING, ha="center", va="top"
+            )
+            self.moving += [(self.camera, part) for part in (self.image, *self.camera.spines.values(), self.note)]
         if self.path is not None:
             self.path.set_aspect("auto")  # the limits are those of equal scales
             self.lines = [(line, np.asarray(line.get_data())) for line in self.path.get_lines()]
             self.lines = [(line, data) for line, data in self.lines if data.shape[1] == len(seconds)]
             self.here = self.path.plot([], [], "o", color=BELIEF, markersize=5, zorder=3)[0]
+            grow = [*self.path.patches, *(line for line, _ in self.lines), self.here]
+            self.moving += [(self.path, part) for part in sorted(grow, key=lambda part: part.get_zorder())]
+        for _, part in self.moving:
+            part.set_animated(True)
+        self.all_bands = self._picture()
+        for axes in self.bands:
+            for artist in (*axes.lines, *axes.collections, *axes.patches):
+                artist.set_visible(False)
+        self._picture()
+        self.background = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def _shrink_labels(self) -> None:
+        """Makes the bands' names fit beside their Axes."""
+        self.figure.draw_without_rendering()
+        for axes in self.bands:
+            label = axes.yaxis.label
+            room = axes.get_window_extent().height / max(label.get_window_extent().height, 1)
+            label.set_fontsize(label.get_fontsize() * min(1.0, room))
+
+    def _picture(self) -> np.ndarray:
+        self.canvas.draw()
+        return self._buffer()
+
+    def _buffer(self) -> np.ndarray:
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
     def frame(self, step: int) -> np.ndarray:
         """The picture of one step, ``[H, W, 3]`` uint8."""
         if self.camera is not None and self.pictures is not None:
             self.image.set_data(as_picture(self.pictures[step]))
             unseen = self.seen is not None and not bool(self.seen[step])
-            self.camera.set_xlabel("not observed" if unseen else " ", color=READING)
+            self.note.set_text("not observed" if unseen else "")
             for spine in self.camera.spines.values():
                 spine.set(color=READING if unseen else "black", linewidth=3 if unseen else 0.8)
         for line, data in self.lines:
@@ -82,17 +115,17 @@ class Scene:
         if self.path is not None:
             for patch in self.path.patches:
                 patch.set_visible(int(str(patch.get_gid()).removeprefix("step ")) <= step)
+        self.canvas.restore_region(self.background)
+        for axes, part in self.moving:
+            axes.draw_artist(part)
+        picture = self._buffer()
         for axes in self.bands:
-            self._uncover(axes, self.bounds[step + 1])
-        self.canvas.draw()
-        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+            self._uncover(picture, axes, self.bounds[step + 1])
+        return picture
 
-    @staticmethod
-    def _uncover(axes: Axes, until: float) -> None:
-        """Clips what is drawn in the Axes at the right of ``until``."""
-        from matplotlib.transforms import Bbox, TransformedBbox
-
-        box = TransformedBbox(Bbox([[axes.get_xlim()[0], 0], [until, 1]]), axes.get_xaxis_transform())
-        for artist in (*axes.lines, *axes.collections, *axes.patches):
-            artist.set_clip_path(None)
-            artist.set_clip_box(box)
+    def _uncover(self, picture: np.ndarray, axes: Axes, until: float) -> None:
+        """Copies into the picture what is drawn in the Axes at the left of ``until``."""
+        box, height = axes.get_window_extent(), len(picture)
+        right = min(axes.transData.transform((until, 0))[0], box.x1)
+        rows, columns = slice(round(height - box.y1), round(height - box.y0)), slice(round(box.x0), round(right))
+        picture[rows, columns] = self.all_bands[rows, columns]

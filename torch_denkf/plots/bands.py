@@ -39,7 +39,7 @@ def plot_bands(
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
     readings: Mapping[int, Tensor] | None = None,
-    observed: Truth = None,
+    observed: Truth | Mapping[int, Truth] = None,
     time: float | Tensor | None = None,
     level: float = 0.9,
     band: Literal["auto", "ensemble", "variance"] = "auto",
@@ -58,7 +58,8 @@ def plot_bands(
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
         readings: by component, ``[T]`` in the state's units; NaN and what is not observed are left out.
         observed: ``[T]``, ``[T, 1]`` or ``[T, O]`` bool, or its key; by default ``"observed"`` of the roll-out where it
-            is there. Steps at which no reading was observed are shaded.
+            is there. Steps at which no reading was observed are shaded. With several sensors, one for each component:
+            ``{0: "gps_observed", 1: encoder_mask}``; components without one are not shaded.
         time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
         level: probability of the band.
         band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
@@ -84,8 +85,9 @@ def plot_bands(
         >>> [round(float(edge), 2) for edge in axes.collections[0].get_datalim(axes.transData).intervaly]
         [-3.29, 3.29]
     """
-    read = read_belief(belief, truth, observed, one_sequence=True)
+    read = read_belief(belief, truth, None if isinstance(observed, Mapping) else observed, one_sequence=True)
     chosen = dims_of(read, dims)
+    masks = _masks(belief, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
     labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
     seconds = times_of(time, len(read.mean))
@@ -93,13 +95,15 @@ def plot_bands(
     angular = [dim in {int(angle) % read.mean.shape[-1] for angle in angles} for dim in chosen]
     mean, lower, upper = _edges(read, chosen, angular, level, band)
     true = None if read.truth is None else _beside(with_truth(read, chosen), mean, angular)
-    stray = sorted(set(readings or {}) - set(chosen))
-    if stray:
-        raise ValueError(f"readings of {stray} belong to no drawn component; dims are {chosen}")
+    for what, given in (("readings", readings or {}), ("observed", masks)):
+        stray = sorted(set(given) - set(chosen))
+        if stray:
+            raise ValueError(f"{what} of {stray} belong to no drawn component; dims are {chosen}")
     within = f"{100 * level:g} % of the belief"
     for column, (axes, dim, label, scale) in enumerate(zip(panels, chosen, labels, scales, strict=True)):
-        if read.observed is not None:
-            _shade(axes, bounds, ~read.observed.any(-1))
+        seen = masks.get(dim)
+        if seen is not None:
+            _shade(axes, bounds, ~seen)
         if lower is not None and upper is not None:
             edges = (scale * lower[:, column].numpy(), scale * upper[:, column].numpy())
             style: dict[str, Any] = {
@@ -115,8 +119,8 @@ def plot_bands(
                 raise ValueError(f"readings of component {dim} must be [{len(seconds)}]; got {len(values)}")
             values = _beside(values, mean[:, [column]], [angular[column]])[:, 0]
             shown = values.isfinite()
-            if read.observed is not None:
-                shown &= read.observed.any(-1)
+            if seen is not None:
+                shown &= seen
             dots = scale * values[shown].numpy()
             axes.plot(seconds[shown.numpy()], dots, ".", color=READING, markersize=3.5, label="readings")
         if true is not None:
@@ -128,6 +132,16 @@ def plot_bands(
     if legend:
         legend_above(*panels)
     return panels
+
+
+def _seen(read: Belief) -> Tensor | None:
+    """The steps at which anything was observed, ``[T]``."""
+    return None if read.observed is None else read.observed.any(-1)
+
+
+def _masks(belief: TensorDictBase | Tensor, observed: Mapping[int, Truth]) -> dict[int, Tensor | None]:
+    """The steps at which each component's sensor observed, ``[T]``."""
+    return {dim: _seen(read_belief(belief, None, mask, one_sequence=True)) for dim, mask in observed.items()}
 
 
 def _edges(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from torch_denkf.training.update import Updates, seed_update
 
 __all__ = ["FilterTrainer"]
 
+_LOG = logging.getLogger("torch_denkf")
 _VALIDATION = 2**32 - 1  # the "stage" whose seed every validation starts from
 
 
@@ -37,7 +39,8 @@ class FilterTrainer(HookPoints):
     **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
-    outside of their ``state_dict``, and a sampler none at all.
+    outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
+    logger ``"torch_denkf"`` says so.
 
     **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
     another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
@@ -275,6 +278,12 @@ class FilterTrainer(HookPoints):
             if state["best"] is not None:  # the file may be from validations that are about to be repeated
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])
             self._logs.open(state["logs"])
+            if state["stage"] == len(self.stages):
+                _LOG.warning(
+                    "The training in %s is finished: its result is read and nothing is trained. Start anew with "
+                    "fit(resume=False), or give another out.",
+                    self.out,
+                )
             return state
         for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
             file.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters.base import where_rows
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
@@ -39,8 +40,9 @@ class DEnKFTransform(Transform):
     In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
     :class:`~torch_denkf.filters.Filter`.
 
-    A filter belongs either here or into the policy, not both: a policy's filter carries its own belief, under
-    ``("previous", ...)``, and would overwrite this one. Behind this transform, torchrl's ``FrameSkipTransform`` makes
+    A filter belongs either here or into the policy, not both: a policy's filter would start from a belief that has seen
+    the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
+    belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
     groups of agents, the belief is the environment's, and starts anew where any agent does.
 
@@ -141,9 +143,7 @@ class DEnKFTransform(Transform):
             if kept is not None:  # otherwise what follows says what is missing
                 if self.check_finite and not all(torch.isfinite(kept[key]).all() for key in self.filter.carry_keys):
                     self._assert_finite({**_present(next_tensordict, self.in_keys), **kept})
-                for key, name in self._names.items():
-                    next_tensordict.set(name, kept[key])
-                return next_tensordict
+                return self._emit(kept, next_tensordict)
         entries = {}
         for key in self.filter.carry_keys:
             name = self._names[key]
@@ -160,12 +160,17 @@ class DEnKFTransform(Transform):
             value = next_tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
+        say_ignored_mask(self.filter, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
             written = self.filter.take_step(entries, next_tensordict.batch_size)
         if self.check_finite:
             self._assert_finite({**entries, **written})
+        return self._emit(written, next_tensordict)
+
+    def _emit(self, written: Mapping[NestedKey, torch.Tensor], next_tensordict: TensorDictBase) -> TensorDictBase:
         for key, name in self._names.items():
             next_tensordict.set(name, written[key])
+        mark_up_to_date(written[self.filter.carry_keys[0]])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -256,12 +256,32 @@ def test_without_the_extra(tmp_path, root, monkeypatch):
             open_all(root)
 
 
+@pytest.mark.parametrize("dims", [[2, 0], ["wrist", "shoulder"], ["wrist", 0]])
+def test_some_numbers_of_the_state(root, dims):
+    data, whole = open_all(root, dims=dims, action_dims=[1]), open_all(root)
+    assert data.names == ("wrist", "shoulder")
+    assert data[:]["state"].equal(whole[:]["state"][:, [2, 0]])
+    assert data[:]["action"].equal(whole[:]["action"][:, [1]])
+    assert data.statistics["state", "std"].equal(whole.statistics["state", "std"][[2, 0]])
+    assert whole.names == tuple(NAMES)
+    shared.check_contract(data)
+
+
+@pytest.mark.parametrize("dims", [[3], [-1], ["hand"], []])
+def test_numbers_that_the_state_has_not(root, dims):
+    with pytest.raises(ValueError, match=r"^dims=.* others than the 3 numbers there are, shoulder, elbow, wrist$"):
+        open_all(root, dims=dims)
+    with pytest.raises(ValueError, match=r"^action_dims=\[2\] .* the 2 numbers there are$"):
+        open_all(root, action_dims=[2])
+
+
 def test_names_and_actions_are_optional(tmp_path):
     write_version_2(tmp_path, [4], images="bytes")
     info = json.loads((tmp_path / "meta/info.json").read_text())
     for names, expected in (
         (NAMES, tuple(NAMES)),
         ({"motors": NAMES[:2], "gripper": ["g"]}, ("shoulder", "elbow", "g")),
+        ([NAMES], tuple(NAMES)),  # as Unitree's converter writes them
         (["motors"], None),
         (None, None),
     ):

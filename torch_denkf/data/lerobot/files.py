@@ -81,10 +81,12 @@ class Layout:
         return int(feature["shape"][0])
 
     def names(self, key: str) -> tuple[str, ...] | None:
-        """Names of a feature's numbers, where each has one: LeRobot writes lists, or lists below a common name."""
+        """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
         names = self.features[key].get("names")
         if isinstance(names, dict):
-            names = [name for part in names.values() for name in (part if isinstance(part, list) else [part])]
+            names = list(names.values())
+        if isinstance(names, list):
+            names = [name for part in names for name in (part if isinstance(part, list) else [part])]
         if not names or len(names) != self.width(key):
             return None
         return tuple(str(name) for name in names)

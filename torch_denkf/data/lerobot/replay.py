@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Unpack
+from typing import Literal, Unpack
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data.episodes import Episode
+from torch_denkf.data.episodes import ROW, Episode
 from torch_denkf.data.lerobot.recording import DecodedRecording, read_recording
+from torch_denkf.data.lerobot.repeats import repeated_pictures
 from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
 from torch_denkf.data.replay import EpisodeReplay
@@ -68,6 +71,16 @@ class LeRobotReplay(EpisodeReplay):
 
     Of the episodes 0 to 4, 5 to 9 and so on one each is for tests, drawn by a hash.
 
+    **Repeated pictures.** A recorder that writes more rows than its camera takes pictures shows some twice.
+    ``repeats="mask"`` marks the second one as not observed: it carries no news, and a filter that counts it becomes too
+    sure of itself. See :func:`torch_denkf.data.repeated_pictures`.
+
+    **Lag.** The picture of row t may show the robot as the states record it ``lag`` rows later (negative: earlier).
+    With a ``lag``, each row pairs a state with the picture that shows it: the row of state t has the picture of row
+    t - lag, and each episode loses ``abs(lag)`` rows that have no partner. Actions stay with their states. On a robot,
+    with a positive lag, a filter that reads the newest picture says what the encoders will report ``lag`` rows later;
+    with a negative lag its belief is ``abs(lag)`` rows old. See :func:`torch_denkf.data.lag_errors` for an estimate.
+
     Args:
         root: folder that holds ``meta`` and ``data``; or a recording that
             :func:`torch_denkf.data.recording_from_rows` made, which has its camera, keys and size already.
@@ -75,18 +88,25 @@ class LeRobotReplay(EpisodeReplay):
         state_key: feature of the state.
         action_key: feature of the action; None for none, as are data sets without an ``"action"``.
         size: (H, W) to scale the images to, whatever their aspect.
+        dims: numbers of the state to keep, in this order, by place or by name: an arm of a whole robot. None for all.
+        action_dims: numbers of the action to keep, by place. Commands to other joints are noise to a learned motion.
+        repeats: ``"keep"`` or ``"mask"`` repeated pictures.
+        lag: rows by which the states are later than the pictures.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
         episodes: of this split, with the recording's own ``number``.
         fps: rows a second.
-        names: of the state's numbers, such as the joints; None where the recording names none.
+        names: of the state's numbers that are kept, such as the joints; None where the recording names none.
+        lag: as it was passed.
+        repeats_masked: rows of this split that are not observed because their picture is a repeat.
 
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the folder, a parquet file or a video.
         ValueError: for versions of the format that are not read, cameras and features that are not there, files that
-            are damaged or contradict the metadata, splits without episodes, episodes that are shorter than a slice.
+            are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes, episodes
+            that are shorter than a slice or the lag, and other words for ``repeats``.
 
     Examples:
         >>> data = LeRobotReplay("aloha_static_coffee", camera="cam_high", slice_len=16, batch_size=64)
@@ -122,9 +142,15 @@ class LeRobotReplay(EpisodeReplay):
         state_key: str = "observation.state",
         action_key: str | None = "action",
         size: tuple[int, int] = (96, 128),
+        dims: Sequence[int | str] | None = None,
+        action_dims: Sequence[int] | None = None,
+        repeats: Literal["keep", "mask"] = "keep",
+        lag: int = 0,
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
+        if repeats not in ("keep", "mask"):
+            raise ValueError(f"repeats is 'keep' or 'mask', got {repeats!r}")
         if isinstance(root, DecodedRecording):
             recording = root
         else:
@@ -137,24 +163,71 @@ class LeRobotReplay(EpisodeReplay):
                 cache=options.get("cache", True),
                 progress=options.get("progress", True),
             )
-        self.fps, self.names = recording.fps, recording.names
+        self.fps, self.names, self.lag = recording.fps, recording.names, lag
         self._images = JoinedPictures([recording.rows["image"]])
-        numbers, lengths = torch.unique_consecutive(recording.rows["episode"], return_counts=True)
+        rows, self._shown = _paired(recording.rows.exclude("image"), lag)
+        if dims is not None:
+            kept = _places("dims", dims, recording.names, rows["state"].shape[-1])
+            rows["state"] = rows["state"][:, kept]
+            self.names = recording.names and tuple(recording.names[place] for place in kept)
+        if action_dims is not None and "action" in rows:
+            rows["action"] = rows["action"][:, _places("action_dims", action_dims, None, rows["action"].shape[-1])]
+        numbers, lengths = torch.unique_consecutive(rows.pop("episode"), return_counts=True)
         starts = (lengths.cumsum(0) - lengths).tolist()
+        repeated = torch.zeros(len(rows), dtype=torch.bool)
+        if repeats == "mask":
+            seen = torch.where(rows["observed"].squeeze(-1), self._shown, -1)
+            repeated = repeated_pictures(self._images, seen, rows["step"].squeeze(-1) == 0)
+            rows["observed"] = rows["observed"] & ~repeated.unsqueeze(-1)
         super().__init__(
-            recording.rows.exclude("image", "episode", "frame").set("step", recording.rows["frame"]),
+            rows,
             [
                 LeRobotEpisode(f"episode_{number:06d}", start, length, number)
                 for number, start, length in zip(numbers.tolist(), starts, lengths.tolist(), strict=True)
             ],
             for_tests=lambda episode: is_for_tests(episode.number),
-            pictures=partial(float_pictures, self._images),
+            pictures=partial(_pictures_of_rows, self._images, self._shown),
             root=recording.source,
             **options,
         )
+        self.repeats_masked = int(repeated[self.storage[:][ROW].squeeze(-1)].sum())
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor]:
-        return picture_statistics(self._images, index[self._all_rows["observed"].squeeze(-1)[index]])
+        return picture_statistics(self._images, self._shown[index[self._all_rows["observed"].squeeze(-1)[index]]])
+
+
+def _paired(rows: TensorDict, lag: int) -> tuple[TensorDict, Tensor]:
+    """Rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
+    numbers, lengths = torch.unique_consecutive(rows["episode"], return_counts=True)
+    if int(lengths.min()) <= abs(lag):
+        short = numbers[lengths <= abs(lag)].tolist()
+        raise ValueError(f"lag={lag} leaves nothing of the episodes {short[:10]}, which have no more rows; pass less")
+    frame = rows["frame"].squeeze(-1)
+    length = lengths.repeat_interleave(lengths)
+    index = ((frame - lag >= 0) & (frame - lag < length)).nonzero().squeeze(-1)
+    shown = index - lag
+    first = index[torch.cat([torch.ones(1, dtype=torch.bool), rows["episode"][index].diff() != 0])]
+    begin = first.repeat_interleave(lengths - abs(lag))
+    out = rows[index].exclude("frame")
+    out["step"] = rows["frame"][index] - rows["frame"][begin]
+    if lag:
+        out["time"] = rows["time"][index] - rows["time"][begin]
+        out["observed"] = rows["observed"][shown]
+    return out, shown
+
+
+def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dict[str, Tensor]:
+    return float_pictures(images, shown[row])
+
+
+def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
+    """Places of the numbers that are asked for by place or name."""
+    places = {name: place for place, name in enumerate(names or ())}
+    chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
+    if not chosen or not all(0 <= place < width for place in chosen):
+        known = f", {', '.join(names)}" if names else ""
+        raise ValueError(f"{argument}={list(dims)} names none or others than the {width} numbers there are{known}")
+    return chosen
 
 
 def __getattr__(name: str):

@@ -126,7 +126,8 @@ class RecordingReplay(EpisodeReplay):
 
     A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
     So a filter with ``observed_key="imu_observed"`` does not count one reading twice, and a model that is driven by the
-    held value, such as an ``action``, reads it in all rows. With ``"linear"`` every value counts as observed.
+    held value, such as an ``action``, reads it in all rows. ``"observed"``, the filters' default, is the camera's.
+    With ``"linear"`` every value counts as observed.
 
     Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read anew each time.
 

@@ -1,0 +1,1 @@
+"""Study: a real arm that its head camera watches."""

@@ -1,0 +1,90 @@
+"""What all filters of a sensor and a seed share: sensor, statistics, the hand's place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from benchmarks.g1.aim import HandPlace
+from benchmarks.g1.recordings import ARM, Recordings, Roles, bytes_of, rows_of, targets
+from benchmarks.g1.sensors import SENSORS, FramePool, Statistics, train_sensor
+from torch_denkf.modules import ImageSensor
+from torch_denkf.training import read_checkpoint, write_checkpoint
+
+CHECKED = 1200  # frames that a sensor is validated on
+
+
+@dataclass(frozen=True)
+class SensorBudget:
+    """Updates of a sensor, and frames in each."""
+
+    glimpse: int = 2600
+    paper: int = 1000
+    frames: int = 32
+
+
+class TrainedSensor:
+    """A sensor and what belongs to it.
+
+    Args:
+        recordings: the study's.
+        kind: name of the sensor.
+        seed: of roles and of all random numbers.
+        budget: updates.
+    """
+
+    def __init__(self, recordings: Recordings, kind: str, seed: int, budget: SensorBudget):
+        self.recordings, self.kind, self.seed, self.budget = recordings, kind, seed, budget
+        self.name = f"{kind}-{seed}"
+        self.out = recordings.out / "sensors" / self.name
+
+    @cached_property
+    def roles(self) -> Roles:
+        """Who trains, tunes, validates, is tested."""
+        return self.recordings.roles(self.seed)
+
+    @cached_property
+    def target(self) -> Tensor:
+        """True numbers of arm and hand, of all rows, ``[N, 13]``."""
+        return targets(self.recordings.data.storage[:])
+
+    def seen(self, numbers: list[int]) -> Tensor:
+        """Rows of episodes that have a new picture."""
+        rows = rows_of(self.recordings.data, numbers)
+        return rows[self.recordings.data.storage[:]["observed"].squeeze(-1)[rows]]
+
+    @cached_property
+    def hand(self) -> HandPlace:
+        """Where the hand is in the picture, of the arm's joints."""
+        data = self.recordings.data
+        return HandPlace(data, rows_of(data, self.roles.sensor), data.storage[:]["state"][:, list(ARM)])
+
+    def pool(self, rows: Tensor) -> FramePool:
+        """Frames of some rows."""
+        target = self.target[rows]
+        return FramePool(bytes_of(self.recordings.data, rows), target, self.hand(target[:, : len(ARM)]))
+
+    @cached_property
+    def trained(self) -> tuple[ImageSensor, Statistics]:
+        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        facts_file, build = self.out / "facts.pt", SENSORS[self.kind]
+        if (self.out / "sensor.pt").exists() and facts_file.exists():
+            facts = Statistics(**read_checkpoint(facts_file))
+            sensor = build(facts)
+            sensor.load_state_dict(read_checkpoint(self.out / "sensor.pt")["sensor"])
+            return sensor.eval(), facts
+        data = self.recordings.data
+        train = self.pool(self.seen(self.roles.sensor))
+        checked = self.seen([*self.roles.tune, *self.roles.validation])
+        held_out = self.pool(checked[:: max(len(checked) // CHECKED, 1)])
+        sequences = [self.target[rows_of(data, [number])] for number in self.roles.sensor]
+        facts = Statistics.of(sequences, train.pixels)
+        torch.manual_seed(self.seed)
+        sensor = build(facts)
+        updates = getattr(self.budget, self.kind)
+        train_sensor(sensor, train, held_out, out=self.out, seed=self.seed, updates=updates, batch=self.budget.frames)
+        write_checkpoint(facts_file, vars(facts))
+        return sensor.eval(), facts

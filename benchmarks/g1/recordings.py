@@ -1,0 +1,129 @@
+"""The recordings of the study, and which episodes train, tune, validate and are tested, never within one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.data import LeRobotReplay, lag_errors, recording_from_rows
+from torch_denkf.data.episodes import hashed_share
+from torch_denkf.data.lerobot.recording import DecodedRecording
+from torch_denkf.data.lerobot.replay import is_for_tests
+
+ARM, HAND = range(7, 14), range(20, 26)  # numbers of the robot's 26: the right arm, rad, and the right hand, 0 to 1
+JOINTS, FINGERS = len(ARM), len(HAND)
+READ = JOINTS + FINGERS  # numbers that a sensor reads: arm, then hand
+NAMES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+LAGS = range(-8, 11)  # rows that are tried
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Where the recordings are, and how they are read."""
+
+    root: Path = Path("../shared/data/g1")  # LeRobot folder
+    out: Path = Path("runs/g1")  # checkpoints, logs, table, beliefs, decoded pictures
+    size: tuple[int, int] = (180, 240)  # of the pictures, (height, width)
+    tune: int = 6  # episodes that train the filters, unseen by the sensor
+    validation: int = 5  # episodes to choose by, unseen by both
+    drawn: bool = False  # a drawn robot instead of the folder
+
+    @cached_property
+    def _source(self) -> Path | DecodedRecording:
+        return drawn_recording(self.size) if self.drawn else self.root
+
+    def open(self, lag: int = 0) -> LeRobotReplay:
+        """All episodes, with repeats masked."""
+        return LeRobotReplay(
+            self._source, size=self.size, split="all", repeats="mask", lag=lag, cache=self.out / "cache"
+        )
+
+    @cached_property
+    def lag(self) -> int:
+        """Rows by which the states are later than the pictures, from the episodes that are not tested on."""
+        file = self.out / "lag.json"
+        if not file.exists():
+            data = LeRobotReplay(
+                self._source, size=self.size, split="train", repeats="mask", cache=self.out / "cache", progress=False
+            )
+            errors = lag_errors(data, LAGS, dims=ARM)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps({"lag": min(errors, key=errors.__getitem__), "errors": errors}, indent=1))
+        return int(json.loads(file.read_text())["lag"])
+
+    @cached_property
+    def data(self) -> LeRobotReplay:
+        """All episodes, with repeats masked and the lag taken out."""
+        return self.open(self.lag)
+
+    def roles(self, seed: int) -> Roles:
+        """Who trains, tunes and validates with a seed; tested are always the same."""
+        tests = {e.number for e in self.data.episodes if is_for_tests(e.number)}
+        rest = [e.number for e in self.data.episodes if e.number not in tests]
+        drawn = sorted(rest, key=lambda number: hashed_share(str(number), f"g1 {seed}"))
+        held = self.tune + self.validation
+        return Roles(
+            sorted(drawn[held:]), sorted(drawn[self.validation : held]), sorted(drawn[: self.validation]), sorted(tests)
+        )
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Numbers of episodes by what they are for."""
+
+    sensor: list[int]  # train the sensor and the motion
+    tune: list[int]  # train the filters
+    validation: list[int]  # choose
+    test: list[int]
+
+    def __post_init__(self):
+        everyone = [*self.sensor, *self.tune, *self.validation, *self.test]
+        if len(set(everyone)) < len(everyone):
+            raise ValueError(f"episodes with two roles: {sorted({e for e in everyone if everyone.count(e) > 1})}")
+        for name in ("sensor", "tune", "validation", "test"):
+            if not getattr(self, name):
+                raise ValueError(f"no episodes are left for {name!r}; record more, or ask for less tune and validation")
+
+
+def rows_of(data: LeRobotReplay, numbers: list[int]) -> Tensor:
+    """Rows of some episodes, ``[n]``."""
+    wanted = set(numbers)
+    return torch.cat([torch.arange(e.start, e.start + e.length) for e in data.episodes if e.number in wanted])
+
+
+def bytes_of(data: LeRobotReplay, rows: Tensor) -> Tensor:
+    """Pictures of some rows, uint8 ``[n, 3, H, W]``."""
+    return torch.cat([(data[part]["pixels"] * 255).round().to(torch.uint8) for part in rows.split(256)])
+
+
+def targets(rows: TensorDict) -> Tensor:
+    """What a sensor reads of rows: arm and hand, ``[*, 13]``."""
+    return torch.cat([rows["state"][..., list(ARM)], rows["state"][..., list(HAND)]], -1)
+
+
+def drawn_recording(size: tuple[int, int], episodes: int = 20, length: int = 45) -> DecodedRecording:
+    """A robot drawn by code, for a run without the recordings: a dark spot and its shadow go where the joints say."""
+    generator, phases = torch.Generator().manual_seed(0), torch.arange(length) / length
+    states, pictures = [], []
+    down, right = torch.linspace(-1, 1, size[0]).view(-1, 1), torch.linspace(-1, 1, size[1])
+    for _ in range(episodes):
+        swing = 0.3 * torch.rand(26, generator=generator) + 0.1
+        state = swing * (6.3 * phases.unsqueeze(-1) + 0.5 * torch.rand(26, generator=generator)).sin()
+        place = state[:, [7, 8, 10, 13]].view(length, 4, 1, 1)
+        spots = [((down - place[:, k]) ** 2 + (right - place[:, k + 1]) ** 2) / 0.05 for k in (0, 2)]
+        grey = 200 - 90 * (-spots[0]).exp() - 60 * (-spots[1]).exp()
+        grey[3::4] = grey[2:-1:4]  # every fourth picture is a repeat
+        states.append(state)
+        pictures.append(grey.round().to(torch.uint8).unsqueeze(1).expand(-1, 3, -1, -1))
+    rows = {
+        "observation": {"image": torch.cat(pictures), "state": torch.cat(states)},
+        "action": torch.cat(states).roll(-2, 0),
+        "episode": torch.arange(episodes).repeat_interleave(length),
+    }
+    return recording_from_rows(TensorDict(rows, batch_size=[episodes * length]), fps=30.0)

@@ -1,0 +1,205 @@
+"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from tyro.conf import OmitArgPrefixes, Positional
+
+from benchmarks.common.arguments import some_of
+from benchmarks.common.jobs import once, read_rows
+from benchmarks.g1.base import SensorBudget, TrainedSensor
+from benchmarks.g1.baselines import Baselines
+from benchmarks.g1.evaluation import baseline_rows, filter_rows, save_beliefs
+from benchmarks.g1.motion import Motion, train_motion
+from benchmarks.g1.readings import (
+    CONDITIONS,
+    PICTURES,
+    Windows,
+    black_readings,
+    fail,
+    read_codes,
+    with_readings,
+)
+from benchmarks.g1.recipes import FILTERS, G1Recipe
+from benchmarks.g1.recipes._base import MEMBERS
+from benchmarks.g1.recordings import Recordings, rows_of
+from benchmarks.g1.sensors import SENSORS
+from benchmarks.g1.targets import TARGETS, Target
+from benchmarks.g1.training import FilterBudget, filter_error, train_filter
+from torch_denkf.filters import Filter
+
+FIRST = "glimpse"  # the sensor that all filters read
+
+
+@dataclass(frozen=True)
+class Study(Recordings):
+    """A real arm that its head camera watches: seven joints and a hand, with every filter that is registered.
+
+    table: estimate the lag, train sensors and filters, test. pictures: plots and videos of what a table left in --out.
+    What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    """
+
+    command: Positional[Literal["table", "pictures"]] = "table"
+    filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
+    sensors: some_of(sorted(SENSORS)) = (FIRST, "paper")
+    states: some_of(sorted(TARGETS)) = ("arm", "hand")
+    seeds: tuple[int, ...] = (0, 1, 2)
+    sensor_budget: OmitArgPrefixes[SensorBudget] = field(default_factory=SensorBudget)
+    budget: OmitArgPrefixes[FilterBudget] = field(default_factory=FilterBudget)
+    smoke: bool = False  # a tiny run of everything, on a drawn robot
+
+
+class Base:
+    """What all filters of a sensor, a seed and a target share.
+
+    Args:
+        study: the study.
+        sensor: trained.
+        target: what is estimated.
+    """
+
+    def __init__(self, study: Study, sensor: TrainedSensor, target: Target):
+        self.study, self.trained, self.target = study, sensor, target
+        self.name = f"{target.name}-{sensor.name}"
+        self._motions: dict[bool, Motion] = {}
+
+    @cached_property
+    def sequences(self) -> list[tuple[Tensor, Tensor]]:
+        """True states and commands of the sensor's and the filters' training episodes."""
+        data, roles, dims = self.study.data, self.trained.roles, list(self.target.dims)
+        command = torch.cat([data.storage[:]["action"][:, 7:14], data.storage[:]["action"][:, 20:26]], -1)
+        rows = [rows_of(data, [number]) for number in (*roles.sensor, *roles.tune)]
+        return [(self.trained.target[at][:, dims], command[at][:, dims]) for at in rows]
+
+    @property
+    def start(self) -> Tensor:
+        """Where the training episodes begin, ``[N, D]``."""
+        return torch.stack([state[0] for state, _ in self.sequences])
+
+    def _readings(self, role: str) -> dict[str, TensorDict]:
+        """What the sensor reads of the episodes of a role, in all conditions."""
+        trained, study = self.trained, self.study
+        sensor, _ = trained.trained
+        numbers, out = getattr(trained.roles, role), {}
+        for condition in PICTURES:
+            file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
+            exact = role == "test"
+            codes = read_codes(sensor, study.data, trained.hand, numbers, condition=condition, exact=exact, file=file)
+            out[condition] = with_readings(sensor, codes, self.target, MEMBERS, self.start.mean(0))
+        for condition in set(CONDITIONS) - set(PICTURES):
+            out[condition] = fail(out["clean"], condition, self.black)
+        return {condition: out[condition] for condition in CONDITIONS}
+
+    @cached_property
+    def black(self) -> TensorDict:
+        """The reading of a black frame."""
+        return black_readings(self.trained.trained[0], self.target, MEMBERS)
+
+    @cached_property
+    def tune(self) -> dict[str, TensorDict]:
+        """Readings that filters are trained on."""
+        return self._readings("tune")
+
+    @cached_property
+    def validation(self) -> dict[str, TensorDict]:
+        """Readings to choose by."""
+        return self._readings("validation")
+
+    @cached_property
+    def test(self) -> dict[str, TensorDict]:
+        """Readings of the test episodes."""
+        return self._readings("test")
+
+    @cached_property
+    def baselines(self) -> Baselines:
+        """All baselines."""
+        return Baselines(self.target, [state for state, _ in self.sequences], self.tune, self.validation)
+
+    def motion(self, actions: bool) -> Motion:
+        """The motion, trained once on true states."""
+        if actions not in self._motions:
+            seed, study = self.trained.seed, self.study
+            torch.manual_seed(seed)
+            motion = Motion(self.trained.trained[1], self.target, actions)
+            out = study.out / "motions" / f"{self.target.name}{'-actions' * actions}-{seed}"
+            self._motions[actions] = train_motion(
+                motion, self.sequences, out=out, seed=seed, updates=study.budget.motion
+            )
+        return self._motions[actions]
+
+    @cached_property
+    def error(self) -> Tensor:
+        """Root mean square error of the sensor on clean validation episodes, ``[D]``."""
+        clean = self.validation["clean"]
+        at = clean["observed"].squeeze(-1)
+        return (clean["sensor", "ensemble"].mean(-2) - clean["state"])[at].square().mean(0).sqrt().clamp_min(1e-4)
+
+    def train(self, name: str) -> tuple[G1Recipe, Filter]:
+        """Trains a filter, or reads it."""
+        kind = FILTERS[name]
+        sensor, facts = self.trained.trained
+        encoding = sensor.module["head"].layers[-1].in_features
+        recipe = kind(
+            self.target, facts, self.motion(kind.actions), self.error, self.start.std(0).clamp_min(1e-3), encoding
+        )
+        windows = Windows(self.tune, self.black, self.study.budget.length, self.target)
+        out = self.study.out / "filters" / f"{name}-{self.name}"
+        model = train_filter(
+            recipe, windows, joined(self.validation), out=out, seed=self.trained.seed, budget=self.study.budget
+        )
+        return recipe, model
+
+
+def joined(readings: dict[str, TensorDict]) -> TensorDict:
+    """Readings of all conditions as one batch."""
+    return torch.cat(list(readings.values()))
+
+
+def run_all(study: Study) -> None:
+    """Trains and tests everything: all filters of the arm with the first sensor, fewer of all else."""
+    for seed in study.seeds:
+        for kind in study.sensors:
+            sensor = TrainedSensor(study, kind, seed, study.sensor_budget)
+            for state in study.states:
+                chosen = study.filters if (kind, state) == (FIRST, "arm") else set(study.filters) & SHORT[state]
+                if kind == FIRST or state == "arm":
+                    run_jobs(study, sorted(chosen), sensor, TARGETS[state])
+
+
+SHORT = {"arm": {"denkf"}, "hand": {"denkf", "denkfactions", "dekf", "lstm"}}  # what the other tables show
+
+
+def run_jobs(study: Study, filters: Sequence[str], sensor: TrainedSensor, target: Target) -> None:
+    """Trains and tests what is not done already; leaves rows in ``--out/rows``."""
+    base, folder = Base(study, sensor, target), study.out / "rows"
+    names = {"sensor": sensor.kind, "state": target.name, "seed": sensor.seed}
+    once(folder / f"baselines-{base.name}.json", partial(_baselines, base, names))
+    for name in filters:
+        once(folder / f"{name}-{base.name}.json", partial(_filter, base, {**names, "filter": name}))
+
+
+def _baselines(base: Base, names: dict) -> list[dict]:
+    return baseline_rows(base.baselines, base.target, base.test, names)
+
+
+def _filter(base: Base, names: dict) -> list[dict]:
+    recipe, model = base.train(names["filter"])
+    rows = filter_rows(recipe, model, base.test, names)
+    rows[0]["validation_crps"] = filter_error(recipe, model, joined(base.validation))["crps"]
+    if names["filter"] in ("denkf", "denkfactions") and base.target.name == "arm" and base.trained.kind == FIRST:
+        file = base.study.out / "beliefs" / f"{names['filter']}-{base.name}.npz"
+        save_beliefs(recipe, model, base.test, base.trained.roles.test, file)
+    return rows
+
+
+def rows_in(out: Path) -> list[dict]:
+    """All rows that a study's folder holds."""
+    return read_rows(sorted((out / "rows").glob("*.json")))
