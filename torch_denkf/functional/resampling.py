@@ -111,8 +111,8 @@ def jitter_copies(
     the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
     rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
     widens the distribution, less so with more particles. N is the *effective* number of particles. To the weighted
-    covariance comes a share 1 / N of that of all particles: of equal weights both together are the unbiased sample
-    covariance; and where a few particles have all the weight, which says little about the spread, the kernel is wide.
+    covariance comes a share 1 / N² of that of all particles: where one or two have all the weight, which says little
+    about the spread, the kernel is wide, and a filter that has lost the state finds it again.
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
@@ -140,10 +140,10 @@ def jitter_copies(
     check_shape("normal", normal, particles.shape, "[*B, E, S]")
     if factor < 0:
         raise ValueError(f"factor scales the jitter's width, 0 or more; got {factor}.")
-    size, dim = particles.shape[-2:]
+    dim = particles.shape[-1]
     weights, count = log_weights.exp().unsqueeze(-1), effective_sample_size(log_weights)[..., None, None]
     anomalies = particles - (weights * particles).sum(-2, keepdim=True)
-    cov = anomalies.mT @ (weights * anomalies) + ensemble_cov(particles) / count
+    cov = anomalies.mT @ (weights * anomalies) + ensemble_cov(particles) / count**2
     width = factor * count ** (-1 / (dim + 4))
     same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
     copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
