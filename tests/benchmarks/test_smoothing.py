@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from benchmarks.smoothing.__main__ import COLUMNS, Study, joined, page
 from benchmarks.smoothing.cases import CASES
 from benchmarks.smoothing.ours import rows
+from benchmarks.smoothing.study import COLUMNS, Study, joined, page
 from benchmarks.smoothing.systems import SYSTEMS, Cycle, lorenz63_step, simulate
 
 
