@@ -304,7 +304,7 @@ def test_jitter_of_few_effective_particles_is_wide():
     particles = torch.tensor([[0.0], [2.0], [50.0], [-70.0]], dtype=torch.float64)
     log_weights = torch.tensor([0.5, 0.5, 1e-300, 1e-300], dtype=torch.float64).log()
     picked, ones = particles[[0, 0, 1, 1]], torch.ones(4, 1, dtype=torch.float64)
-    shift = (1 + particles.var() / 4).sqrt() * 2 ** (-1 / 5)
+    shift = (1 + particles.var() / 8).sqrt() * 2 ** (-1 / 5)
     moved = jitter_copies(picked, particles, log_weights, ones, factor=0.5)
     torch.testing.assert_close(moved - picked, 0.5 * shift * torch.tensor([[0.0], [1.0], [0.0], [1.0]]).double())
     alone = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).log()

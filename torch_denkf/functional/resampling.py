@@ -111,8 +111,9 @@ def jitter_copies(
     the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
     rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
     widens the distribution, less so with more particles. N is the *effective* number of particles. To the weighted
-    covariance comes a share 1 / N² of that of all particles: where one or two have all the weight, which says little
-    about the spread, the kernel is wide, and a filter that has lost the state finds it again.
+    covariance comes a share 1 / N³ of that of all particles: where one or two have all the weight, which says little
+    about the spread, the kernel is wide, and a filter that has lost the state can find it again; where a few dozen
+    share the weight, it is nothing. (The cube was found on Lorenz-63, in ``benchmarks/smoothing``.)
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
@@ -143,7 +144,7 @@ def jitter_copies(
     dim = particles.shape[-1]
     weights, count = log_weights.exp().unsqueeze(-1), effective_sample_size(log_weights)[..., None, None]
     anomalies = particles - (weights * particles).sum(-2, keepdim=True)
-    cov = anomalies.mT @ (weights * anomalies) + ensemble_cov(particles) / count**2
+    cov = anomalies.mT @ (weights * anomalies) + ensemble_cov(particles) / count**3
     width = factor * count ** (-1 / (dim + 4))
     same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
     copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
