@@ -174,6 +174,20 @@ def test_inflation_leaves_the_past_alone(float64):
     assert not torch.allclose(inflated["belief", "ensemble"][:, 1], out["belief", "ensemble"][:, 1])
 
 
+def test_damping_holds_the_inflation_that_goes_back(float64):
+    """One direction that is never read, inflated in each step: the way back multiplies it, unless it is damped."""
+    members = torch.randn(6, 1)
+    members = members - members.mean()
+    beliefs = torch.stack([1.5**t * members for t in range(5)])
+    forecasts = beliefs / 1.5  # the motion keeps them; the analysis only inflates
+    first = [enrts_smooth(beliefs, forecasts, damping=damping)[0] for damping in (1.0, 0.5)]
+    torch.testing.assert_close(first[0], 1.5**4 * members, rtol=1e-9, atol=0)
+    shift = sum(0.5**k * 1.5 ** (k - 1) * 0.5 for k in range(1, 5))  # of each step k, through k damped gains
+    torch.testing.assert_close(first[1], (1 + shift) * members, rtol=1e-9, atol=0)
+    with pytest.raises(ValueError, match="above 0 and at most 1"):
+        enrts_step(members, members, members, damping=0.0)
+
+
 @pytest.mark.parametrize("size", [4, 7])
 def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
     """In state space (fewer dimensions than members) and in the members' space."""
