@@ -44,7 +44,6 @@ setup(
         "dm-control>=1.0.50",
         "opencv-python-headless>=4.10",
         "numpy",
-        "filelock>=3.12",  # one process at a time in a folder
         "safetensors>=0.4",  # weights that are data only
         "lazy_loader>=0.4",  # `import torch_denkf` stays cheap
         "tqdm>=4.60",
@@ -57,6 +56,8 @@ setup(
         # torch_denkf.plots.log_rollout alone: 500 MB.
         "viewer": ["rerun-sdk>=0.23"],
         "examples": ["matplotlib", "tensorboard"],
+        # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
+        "hub": ["huggingface_hub>=1.0"],
         # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
@@ -83,6 +84,7 @@ setup(
             "tyro",
             "pyarrow>=15",
             "av>=14",
+            "huggingface_hub>=1.0",
             "pytest",
             "pytest-xdist",
             "ruff",

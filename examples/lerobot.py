@@ -8,7 +8,10 @@ recorded, they drive the filter's motion, which is learned. The page prints erro
 simpler ways, and leaves a picture and a video in --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
 page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
 
-FIGURES
+Without --root it takes a minute of one core. Unseen episodes, no pictures in one second of four, mean absolute error of
+two joints: 0.024 rad for the filter, 0.096 for the last reading, 0.047 for the filter without a camera, 0.47 for the
+mean pose; the 90 % intervals hold 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
+0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %.
 """
 
 from __future__ import annotations
@@ -123,7 +126,8 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
     # () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = ConstantNoise(0.1 * scale, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step beside their commands, before training
+    wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
         sensor=ImageSensor(
@@ -180,7 +184,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
         return interval_coverage(beliefs["mean"], beliefs["var"], runs["state"], level=0.9).mean()
 
     noises = [module for module in denkf.modules() if isinstance(module, ScaledNoise)]
-    candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
+    candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.4, 2.8, 3.3, 4.0)
     factor = choose_for_coverage(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], coverage)
     print(f"noise times {factor}, chosen on {len(held_out.episodes)} episodes that the sensor has not seen")
 

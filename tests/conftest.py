@@ -3,16 +3,53 @@
 ``pytest tests/filters/test_kalman.py --compiled`` puts all filters through ``torch.compile``.
 """
 
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+
 import pytest
 import torch
 
 from tests.filters.factories import has_compiler
 from torch_denkf.filters import Filter
+from torch_denkf.filters.inductor.libraries import clear_damaged_libraries
+
+# A cache of the tests' own, kept from one run to the next: what a killed run left unfinished harms nobody else.
+COMPILED = Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or f"{tempfile.gettempdir()}/torch_denkf_tests_{os.getuid()}")
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(COMPILED)
+
+
+def pytest_sessionstart():
+    clear_damaged_libraries(COMPILED)
 
 
 @pytest.fixture(autouse=True)
 def seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """Mounts disks of a given size, such as "600k"; skips where that takes rights that the tests do not have."""
+    mounted = []
+
+    def mount(size):
+        folder = tmp_path / f"disk{len(mounted)}"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except FileNotFoundError:
+            pytest.skip("there is no command mount")
+        if done.returncode:
+            pytest.skip(f"only root may mount a small disk: {done.stderr.strip()}")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", "--lazy", str(folder)], check=False)
 
 
 @pytest.fixture

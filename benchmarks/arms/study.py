@@ -18,6 +18,7 @@ from tyro.conf import arg
 from benchmarks.arms.arms import ARMS, NOISE, SIDE, Arm, HoldReading, make_env, make_one, wrap
 from benchmarks.common.tables import head, line
 from torch_denkf import modules as m
+from torch_denkf._files import write_text
 from torch_denkf.filters import DEnKF
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage
@@ -208,6 +209,6 @@ def run_task(study: Study) -> None:
     lines = head("missing", "policy reads", "angles, deg", "velocities, rad/s", "tip to goal, cm", "return", "effort")
     for missing in (0.0, 0.3):
         lines += compare(arm, denkf, missing, study)
-    (study.out / "table.md").write_text("\n".join(lines) + "\n")
+    write_text(study.out / "table.md", "\n".join(lines) + "\n")
     print(f"\n{study.task} from {study.source}, {study.episodes} episodes:\n", *lines, sep="\n")
     print(f"\n{time.perf_counter() - start:.0f} s")

@@ -10,15 +10,14 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from torch_denkf._files import write_text
+
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:
     """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
     if file.exists():
         return
-    file.parent.mkdir(parents=True, exist_ok=True)
-    beside = file.with_name(file.name + ".part")
-    beside.write_text(json.dumps(rows()))
-    beside.replace(file)
+    write_text(file, json.dumps(rows()))
 
 
 def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: str) -> None:

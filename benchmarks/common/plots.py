@@ -10,6 +10,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # after the choice of a back-end without a window
 from matplotlib.axes import Axes
 
+from torch_denkf._files import replacing
+
 BAND = 1.645  # standard deviations either side: 90 % of a Gaussian
 
 
@@ -24,6 +26,6 @@ def draw_band(axis: Axes, seconds, mean, std, truth) -> tuple:
 
 def save(figure, path: Path | str, dpi: int = 100) -> None:
     """Writes a figure and closes it."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
+    with replacing(path) as beside:
+        figure.savefig(beside, dpi=dpi)
     plt.close(figure)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch_denkf._files import replacing, write_text
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -26,8 +28,7 @@ class Columns:
 
     def write(self, rows: Iterable[dict], file: Path) -> None:
         """Writes rows; NaN and what a row lacks stay empty."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open("w", newline="") as stream:
+        with replacing(file) as beside, beside.open("w", newline="") as stream:
             writer = csv.DictWriter(stream, self.names, lineterminator="\n")
             writer.writeheader()
             for row in sorted(rows, key=self.order):
@@ -60,8 +61,7 @@ def write_page(page: str, file: Path | None) -> None:
     """Prints a page, and leaves it in a file if one is given."""
     print("\n" + page)
     if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(page)
+        write_text(file, page)
 
 
 def report(folder: Path, columns: Columns, rows: Sequence[dict], page: str) -> None:

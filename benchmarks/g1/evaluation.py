@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from benchmarks.g1.scores import blackout, scores
 from benchmarks.g1.tables import named
 from benchmarks.g1.targets import Target
 from benchmarks.g1.training import run_filter
+from torch_denkf._files import write_bytes
 from torch_denkf.filters import Filter
 
 TIMED = 100  # rows to time a filter on
@@ -72,5 +74,6 @@ def save_beliefs(
             "reading": reading["sensor", "ensemble"].mean(-2),
         }
         entries |= {f"{condition}_{name}": value.numpy() for name, value in parts.items()}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **entries)
+    memory = io.BytesIO()
+    np.savez_compressed(memory, **entries)
+    write_bytes(file, memory.getbuffer())

@@ -15,6 +15,7 @@ from benchmarks.kitti.streams import find_streams, prepare, spans
 from benchmarks.kitti.study import Study, evaluate_and_draw, make_jobs, prepare_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
 from benchmarks.kitti.training import Budget, load_filter
+from torch_denkf._files import write_text
 from torch_denkf.data import write_drives
 
 
@@ -37,7 +38,7 @@ def table(study: Study) -> None:
     """Trains and tests every filter and sensor on every fold."""
     begun = time.time()
     jobs = make_jobs(study)
-    (study.out / "settings.json").write_text(json.dumps(asdict(study), indent=1, default=str))
+    write_text(study.out / "settings.json", json.dumps(asdict(study), indent=1, default=str))
     run_jobs(jobs, study.processes)
     write_table(study, rows_of(study.out), begun)
 

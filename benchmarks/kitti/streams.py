@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import shutil
-import tempfile
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +14,7 @@ from torchrl.envs.transforms import Transform
 
 from benchmarks.common.jobs import side_by_side
 from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_kitti_drive, with_motion
+from torch_denkf.data.cache import cached
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
@@ -58,15 +56,7 @@ class Stream:
 
     def read(self, cache: Path) -> TensorDict:
         """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
-        folder = cache / f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
-        if not folder.exists():
-            beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
-            self._compute().memmap(beside / "stream")
-            # Renamed when whole: a kill leaves no half stream, and of two processes the first one wins.
-            with contextlib.suppress(OSError):
-                (beside / "stream").rename(folder)
-            shutil.rmtree(beside, ignore_errors=True)
-        return TensorDict.load_memmap(folder)
+        return cached(cache / f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}", self._compute)
 
     def _compute(self) -> TensorDict:
         torch.set_num_threads(1)

@@ -15,8 +15,9 @@ from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import Columns, head, line, report
 from torch_denkf.cli.main import main as denkf
 from torch_denkf.data import list_kitti_drives, write_drives
+from torch_denkf.data.kitti.clock import read_times
 from torch_denkf.data.kitti.drive import choose_camera
-from torch_denkf.data.kitti.files import read_poses, read_times
+from torch_denkf.data.kitti.files import read_poses
 from torch_denkf.metrics import kitti_devkit_error, kitti_endpoint_error
 from torch_denkf.odometry import read_path
 from torch_denkf.vision import KITTI_HEIGHT, poses_to_state
@@ -68,8 +69,8 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
     seconds = time.time() - begun
     path = read_path(out / "path.csv")
     poses = read_poses(root / "poses" / f"{drive}.txt")
-    _, dt = read_times(folder / "times.txt", len(poses))
-    truth = torch.from_numpy(poses_to_state(poses, dt))[path["frame"].squeeze(-1)][:, :3]
+    dt = read_times(folder / "times.txt", len(poses)).dt
+    truth = torch.from_numpy(poses_to_state(poses, dt[1:]))[path["frame"].squeeze(-1)][:, :3]
     believed = path["belief", "mean"][:, :3]
     window = WINDOW if len(truth) > WINDOW else (len(truth) - 1) // 2
     error = kitti_endpoint_error(believed, truth, window=window)

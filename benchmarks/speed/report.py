@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from torch_denkf._files import replacing, write_text
+
 
 def number(value: float | None, digits: int = 2) -> str:
     """A ratio or a time, short; empty where there is none."""
@@ -60,15 +62,14 @@ def picture(rows: list[dict], path: Path) -> None:
     axes.set_xlabel("ours / theirs (black: target; green: met)")
     axes.margins(x=0.12, y=0.01)
     figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as beside:
+        figure.savefig(beside, dpi=120)
     plt.close(figure)
 
 
 def write(rows: list[dict], machine: dict, command: str, seconds: float, results: Path, plot: Path) -> None:
     """Writes speed.json, speed.md and the picture."""
-    results.mkdir(parents=True, exist_ok=True)
-    (results / "speed.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (results / "speed_machine.json").write_text(json.dumps(machine, indent=1) + "\n")
-    (results / "speed.md").write_text(markdown(rows, machine, command, seconds))
+    write_text(results / "speed.json", json.dumps(rows, indent=1) + "\n")
+    write_text(results / "speed_machine.json", json.dumps(machine, indent=1) + "\n")
+    write_text(results / "speed.md", markdown(rows, machine, command, seconds))
     picture(rows, plot)

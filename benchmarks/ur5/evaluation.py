@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import WRIST, Preset
 from benchmarks.ur5.tables import BLACKOUT
 from benchmarks.ur5.training import filter_error, joint_coverage, run_filter
+from torch_denkf._files import write_bytes
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage, state_errors
@@ -141,7 +143,6 @@ def save_beliefs(
     conditions: Sequence[str] = ("clean", "black20"),
 ) -> None:
     """Leaves beliefs and pictures of the first test demos for the plots: ``NAME-CONDITION-DEMO.npz``."""
-    folder.mkdir(parents=True, exist_ok=True)
     for condition in conditions:
         out = run_filter(recipe, model, readings[condition][: len(demos)])
         for row, number in zip(out, demos, strict=True):
@@ -149,8 +150,9 @@ def save_beliefs(
             pixels = data[torch.arange(episode.start, episode.start + episode.length)]["pixels"]
             pixels = (pixels * row["observed"][..., None, None] * 255).round().to(torch.uint8)
             ensemble = row.get(("belief", "ensemble"), row["belief", "mean"].unsqueeze(-2))
+            memory = io.BytesIO()
             np.savez_compressed(
-                folder / f"{name}-{condition}-{number}.npz",
+                memory,
                 pixels=pixels.permute(0, 2, 3, 1).numpy(),
                 truth=row["state"].numpy(),
                 mean=row["belief", "mean"][:, :STATE].numpy(),
@@ -158,3 +160,4 @@ def save_beliefs(
                 ensemble=ensemble[..., :STATE].numpy(),
                 observed=row["observed"].squeeze(-1).numpy(),
             )
+            write_bytes(folder / f"{name}-{condition}-{number}.npz", memory.getbuffer())

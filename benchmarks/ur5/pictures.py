@@ -17,7 +17,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.ticker import MaxNLocator
 
 from benchmarks.common.plots import BAND, draw_band, plt, save
+from torch_denkf._files import replacing
 from torch_denkf.envs import UR5TableEnv
+from torch_denkf.plots._frames import write_mp4
 
 STEP = 0.08  # s
 NAMES = ("J1", "J2", "J3", "J4", "J5", "J6", "J7, gripper", "x", "y", "z")
@@ -132,17 +134,15 @@ def _strip(belief: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, int, 
 
 def _write_video(path: Path | str, frames: Iterable[np.ndarray]) -> None:
     """Writes RGB frames, one a step."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
+        _encode(beside, frames)
+
+
+def _encode(path: Path, frames: Iterable[np.ndarray]) -> None:
     try:
         import av
     except ImportError:  # it comes with the extra [lerobot] only
-        writer = None
-        for frame in frames:
-            if writer is None:
-                code = cv2.VideoWriter_fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(path), code, 1 / STEP, frame.shape[1::-1])
-            writer.write(frame[..., ::-1])
-        writer.release()
+        write_mp4(path, frames, 1 / STEP)
         return
     with av.open(str(path), "w") as container:
         rate = Fraction(1 / STEP).limit_denominator(100)

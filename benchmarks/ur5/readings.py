@@ -6,6 +6,7 @@ head runs on those: afterwards a filter, of any ensemble size, costs no pictures
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.motion import with_rates
 from benchmarks.ur5.sensors import BlackIsMissing
+from torch_denkf._files import write_bytes
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.modules import ImageSensor
 from torch_denkf.transforms import SaltAndPepper
@@ -39,7 +41,7 @@ def read_codes(
     ================ ============= ====================================================================================
     """
     if file.exists():
-        return TensorDict(torch.load(file), batch_size=[len(demos)]).auto_batch_size_(2)
+        return TensorDict(torch.load(file, weights_only=True), batch_size=[len(demos)]).auto_batch_size_(2)
     by_number = {episode.demo: episode for episode in data.episodes}
     check, sensor = BlackIsMissing(), sensor.eval()
     sequences = []
@@ -56,10 +58,9 @@ def read_codes(
         sequences.append(torch.cat(parts))
     codes = torch.stack(sequences)
     codes["motion"] = with_rates(codes["state"])
-    file.parent.mkdir(parents=True, exist_ok=True)
-    beside = file.with_name(file.name + ".part")
-    torch.save(codes.to_dict(), beside)
-    beside.replace(file)
+    memory = io.BytesIO()
+    torch.save(codes.to_dict(), memory)
+    write_bytes(file, memory.getbuffer())
     return codes
 
 

@@ -9,11 +9,12 @@ from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf
 from tests.filters.two_readings_for_tests import parts_of_reading
-from torch_denkf.filters import Filter
+from torch_denkf.filters import Filter, KalmanFilter
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
+    KalmanAnalysis,
     PairObservation,
     Select,
     UnicycleMotion,
@@ -86,6 +87,17 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
     close(out, exact, [MEAN, VAR])
     likelihood = sum(out[key] for key in filter.log_likelihood_keys)
     torch.testing.assert_close(likelihood[:, 1:], exact["info", "log_likelihood"][:, 1:])
+
+
+def test_a_step_on_entries_sees_a_replaced_module():
+    """Forecast variance 2, reading 1: the mean is 2 / (2 + R)."""
+    one = torch.ones(1, 1)
+    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    entries = {MEAN: torch.zeros(1), ("belief", "cov"): one, "observation": torch.ones(1)}
+    before = filter.take_step(dict(entries), torch.Size([]))[MEAN]
+    filter.module["analysis"] = KalmanAnalysis(one, 2 * one)
+    after = filter.take_step(dict(entries), torch.Size([]))[MEAN]
+    torch.testing.assert_close(torch.cat([before, after]), torch.tensor([2 / 3, 1 / 2]))
 
 
 def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):

@@ -99,7 +99,7 @@ def test_gradient_through_a_trainable_center(float64):
 
 
 def test_bad_arguments():
-    with pytest.raises(ValueError, match="non-negative"):
+    with pytest.raises(ValueError, match=r"std, .* must be finite and at least 0; got -1.0 at \[0\]"):
         GaussianPrior([0.0], [-1.0])
     with pytest.raises(ValueError, match="differ in shape"):
         GaussianPrior([0.0, 0.0], [1.0])

@@ -77,7 +77,7 @@ def test_prior_around_a_state(float64, batch):
     assert td["belief", "mean"].dtype == torch.float64
     assert td["belief", "cov"].equal(torch.tensor([[0.0, 0.0], [0.0, 9.0]]).expand(*batch, 2, 2))
     assert td["belief", "var"].equal(torch.tensor([0.0, 9.0]).expand(*batch, 2))
-    with pytest.raises(ValueError, match="non-negative"):
+    with pytest.raises(ValueError, match=r"std, .* must be finite and at least 0; got -1.0 at \[0\]"):
         GaussianAround([-1.0])
 
 

@@ -35,7 +35,7 @@ def test_gradients_and_other_keys(float64):
 
 
 def test_errors():
-    with pytest.raises(ValueError, match="positive standard deviation"):
+    with pytest.raises(ValueError, match=r"std, a standard deviation, must be finite and above 0; got 0.0 at \[1\]"):
         MemberGain([0.1, 0.0])
     with pytest.raises(ValueError, match=r"made for samples \[\*B, 32, 1\]"):
         MemberGain([0.1])(TensorDict({("sensor", "ensemble"): torch.zeros(8, 1)}))

@@ -59,7 +59,7 @@ def test_gradient_at_the_start(float64, r):
 
 @pytest.mark.parametrize(("r", "floor"), [(0.0, None), (0.5, 0.25), (0.5, 0.3), (0.5, -0.001)])
 def test_bad_r_or_floor(r, floor):
-    with pytest.raises(ValueError, match="0 <= floor < r"):
+    with pytest.raises(ValueError, match=r"(r|floor) of DiagonalNoise.* must be finite and (above|at least) 0; got"):
         DiagonalNoise(2, r=r, floor=floor)
 
 
@@ -79,8 +79,7 @@ def test_constant_trains_the_logarithm(float64):
 @pytest.mark.parametrize("r", [0.1, [0.1, -1e-9], [-1.0], [float("nan")]])
 @pytest.mark.parametrize("trainable", [True, False])
 def test_constant_bad_r(r, trainable):
-    kind = "positive" if trainable else "non-negative"
-    with pytest.raises(ValueError, match=f"one {kind}.* standard deviation a dimension"):
+    with pytest.raises(ValueError, match=r"r(, a standard deviation,)? must be .*; got (\[\]|-|nan)"):
         ConstantNoise(r, trainable=trainable)
 
 
@@ -98,7 +97,7 @@ def test_constant_without_noise_in_some_dimensions(float64):
         rtol=1e-14,
         atol=0,
     )
-    with pytest.raises(ValueError, match="one positive"):
+    with pytest.raises(ValueError, match=r"r, a trainable .* must be finite and above 0; got 0.0 at \[0\]"):
         ConstantNoise([0.0, 2.0], trainable=True)
 
 
@@ -135,5 +134,5 @@ def test_scaled_noise_keeps_the_gain_and_scales_the_covariance(float64):
 
 def test_a_scale_is_in_no_state_dict_and_not_negative():
     assert list(ScaledNoise(DiagonalNoise(2)).state_dict()) == [f"module.{k}" for k in DiagonalNoise(2).state_dict()]
-    with pytest.raises(ValueError, match="not negative; got -1"):
+    with pytest.raises(ValueError, match="factor must be finite and at least 0; got -1"):
         ScaledNoise(ConstantNoise([1.0]), -1.0)

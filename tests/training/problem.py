@@ -10,7 +10,6 @@ from tests.filters.factories import OBS, A, M, S, toy_denkf
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage
-from torch_denkf.training import checkpoint as checkpoint_module
 from torch_denkf.training.logs import RunLogs
 
 
@@ -94,4 +93,4 @@ def _watch(killer):
         log(self, values, step)
         killer.at("log")
 
-    checkpoint_module.os.replace, RunLogs.log = watched_replace, watched_log
+    os.replace, RunLogs.log = watched_replace, watched_log

@@ -1,5 +1,7 @@
 """Damage done to real files by hand."""
 
+import zipfile
+
 import pytest
 import torch
 
@@ -68,3 +70,12 @@ def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
         write_checkpoint(file, {"update": 8})
     monkeypatch.undo()
     assert read_checkpoint(file)["update"] == 7
+
+
+def test_compressed_parts_are_refused_before_they_are_unpacked(tmp_path):
+    """torch stores its parts as they are; compressed ones could become a thousand times as large."""
+    file = tmp_path / "bomb.pt"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(10_000_000))
+    with pytest.raises(ValueError, match=r"bomb\.pt cannot be read as a checkpoint \(its parts are compressed"):
+        read_checkpoint(file)

@@ -130,6 +130,45 @@ def test_stages_may_be_added_after_the_end(tmp_path):
     assert three["end_to_end"]["metrics"]["mse"] <= two["filter"]["metrics"]["mse"]
 
 
+WAITS = """
+import sys
+from pathlib import Path
+from tests.training.problem import make_trainer
+trainer = make_trainer(Path(sys.argv[1]), updates=2)
+trainer.register_op("pre_optim_steps", lambda: (print("ready", flush=True), sys.stdin.readline()))
+trainer.fit()
+"""
+
+
+def test_a_second_trainer_is_refused_and_a_killed_one_is_not_in_the_way(tmp_path):
+    make_trainer(tmp_path / "alone", updates=2).fit()
+    command = [sys.executable, "-c", WAITS, str(tmp_path / "run")]
+    first = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout.readline() == "ready\n"
+    match = rf"cannot use .*run: another process is training in it \(process {first.pid}\); wait for it"
+    with pytest.raises(OSError, match=match):
+        make_trainer(tmp_path / "run", updates=2).fit()
+    first.kill()
+    first.wait()
+    make_trainer(tmp_path / "run", updates=2).fit()
+    assert csv_files(tmp_path / "run") == csv_files(tmp_path / "alone")
+    assert not [file for file in (tmp_path / "run").iterdir() if file.name.startswith(".")]
+
+
+@pytest.mark.parametrize("resume", [True, False])
+def test_what_cannot_be_made_again_is_moved_and_not_deleted(tmp_path, resume, caplog):
+    make_trainer(tmp_path, updates=2).fit()
+    before = {file.name: file.read_bytes() for file in tmp_path.glob("best_*.pt")}
+    logs = csv_files(tmp_path)
+    for number in (1, 2):
+        (tmp_path / "last.pt").unlink()
+        make_trainer(tmp_path, updates=2, seed=1).fit(resume=resume)
+        assert f"they are now in {tmp_path / f'earlier-{number}'}" in caplog.text
+    assert {file.name: file.read_bytes() for file in (tmp_path / "earlier-1").glob("best_*.pt")} == before
+    assert csv_files(tmp_path / "earlier-1") == logs
+    assert len(before) == len(list((tmp_path / "earlier-2").glob("best_*.pt"))) == 3
+
+
 def test_a_finished_training_that_is_started_again_says_so(tmp_path, caplog):
     make_trainer(tmp_path).fit()
     assert not caplog.messages

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
 from torch_denkf.cli._command import Command, say
 from torch_denkf.vision.camera import KITTI_HEIGHT
@@ -85,7 +86,8 @@ def _run(args: argparse.Namespace) -> None:
     spans = [NamedSpan(_NAMES[failure.kind], failure.first, failure.last) for failure in failures]
     args.out.mkdir(parents=True, exist_ok=True)
     title = "Where is the car? One camera, which fails three times"
-    drive_picture(tracked, shown, spans, title).savefig(args.out / "demo.png", dpi=90)
+    with replacing(args.out / "demo.png") as beside:
+        drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)
     with progress_bar("drawing", None, unit=" frames", every=3) as bar:
         drive_animation(
             args.out / "demo.gif", tracked, shown, spans, title=title, every=args.every, progress=bar.update

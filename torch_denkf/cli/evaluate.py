@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from torch_denkf._files import write_text
 from torch_denkf.cli._command import Command, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
@@ -66,9 +67,8 @@ def _run(args: argparse.Namespace) -> None:
     table = markdown_table(rows)
     say(table)
     if args.out is not None:
-        args.out.mkdir(parents=True, exist_ok=True)
         write_rows(rows, args.out / "evaluation.csv")
-        (args.out / "evaluation.md").write_text(f"`{args.command_line}`\n\n{table}")
+        write_text(args.out / "evaluation.md", f"`{args.command_line}`\n\n{table}")
         say(f"{args.out / 'evaluation.csv'}, {args.out / 'evaluation.md'}")
 
 

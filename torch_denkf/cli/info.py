@@ -72,13 +72,13 @@ def _compiler() -> str:
 
 
 def _cache() -> str:
-    from torch_denkf.data.cache import _cache_directory
+    from torch_denkf.data.cache import usual_folder
 
-    folder = _cache_directory()
+    folder = usual_folder()
     if not folder.is_dir():
         return f"{folder} (not there yet)"
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    return f"{folder}, {size / 1e6:.1f} MB; may be deleted at any time"
+    return f"{folder}, {size / 1e6:.1f} MB; may be deleted at any time: denkf cache"
 
 
 def _extra(name: str) -> str:

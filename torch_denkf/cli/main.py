@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": ("evaluate", "errors of a trained filter on drives with known poses"),
     "odometry": ("odometry", "the path of a car from its camera's images or video"),
     "plot": ("plot", "draw a path and its uncertainty"),
+    "cache": ("cache", "list, check or clear what is kept of earlier runs"),
     "collect-ur5": ("collect_ur5", "collect demonstrations of the UR5 table"),
 }
 

@@ -15,6 +15,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torch_denkf._files import replacing
 from torch_denkf.cli._command import Command, say
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
 def _save(axes: Axes, file: Path) -> None:
     figure = axes.get_figure(root=True)
     assert figure is not None
-    figure.savefig(file, dpi=120)
+    with replacing(file) as beside:
+        figure.savefig(beside, dpi=120)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,17 +1,36 @@
-"""Memory-mapped TensorDicts that were costly to make, kept on disk from one run to the next."""
+"""TensorDicts that were costly to make, kept on disk from one run to the next, and memory-mapped from there."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import logging
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tensordict import TensorDict
 
+from torch_denkf._files import clear_errors, sync
+from torch_denkf._lock import remove_locked, take_lock
+from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, reserve_entry, seal_entry, write_entry
 
-def _cache_directory() -> Path:
+__all__ = ["cache_folder", "cached", "cached_in_place", "entries_of", "forget", "stamp", "sweep", "usual_folder"]
+
+_LOG = logging.getLogger("torch_denkf")
+_WRITING, _LOCK = ".writing-", "lock"
+_TRIES = 3  # to open what was just written: another process may clear the cache at that moment
+_UNLOCKED = 3600.0  # s without a change, after which a half entry without a lock is a dead process's
+_EARLIER = re.compile(r".+-[0-9a-f]{16,20}")  # entries of versions that had no manifest
+
+
+def usual_folder() -> Path:
+    """Where the cache is, if nothing else is said: ``$TORCH_DENKF_CACHE``, or ``~/.cache/torch_denkf``."""
     return Path(os.environ.get("TORCH_DENKF_CACHE") or Path.home() / ".cache" / "torch_denkf").expanduser()
 
 
@@ -19,7 +38,7 @@ def cache_folder(cache: str | Path | bool | None) -> Path | None:
     """The folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
     if cache is None or cache is False:
         return None
-    return _cache_directory() if cache is True else Path(cache).expanduser()
+    return usual_folder() if cache is True else Path(cache).expanduser()
 
 
 def stamp(file: Path) -> tuple[int, int]:
@@ -31,49 +50,183 @@ def stamp(file: Path) -> tuple[int, int]:
     return (status.st_mtime_ns, status.st_size)
 
 
-def _cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Load a cache entry, or read it into memory and store it."""
-    stored = _load(entry)
-    return _store(entry, read().memmap) if stored is None else stored
+def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
+    """Opens a cache entry; where there is none, or a damaged one, reads its content anew and stores it.
 
-
-def _cached_in_place(entry: Path, write: Callable[[Path], object]) -> TensorDict:
-    """Load a cache entry, or have it written into the folder that is passed, for what is too large for memory.
+    Args:
+        entry: folder of the entry.
+        read: returns the content, tensors in memory.
 
     Raises:
-        OSError: if the cache cannot be written.
+        OSError: if the cache cannot be written; names the entry and the free space.
     """
     stored = _load(entry)
-    return _store(entry, write) if stored is None else stored
+    if stored is not None:
+        return stored
+    _check_writable(entry)  # before hours of work
+    content = read()
+    with _writing(entry) as folder:
+        write_entry(folder, content)
+    return content if (stored := _load(entry)) is None else stored  # it may be gone again
+
+
+def cached_in_place(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> TensorDict:
+    """As :func:`cached`, for what is too large for memory.
+
+    Args:
+        entry: folder of the entry.
+        fill: is called with a function that turns a TensorDict of the right shapes and dtypes into zeros on the disk,
+            and fills those.
+
+    Raises:
+        OSError: if the cache cannot be written; names the entry and the free space.
+    """
+    for _ in range(_TRIES):
+        stored = _load(entry)
+        if stored is not None:
+            return stored
+        _fill(entry, fill)
+    return open_entry(entry)
+
+
+def _fill(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> None:
+    with _writing(entry) as folder:
+        made: list[TensorDict] = []
+
+        def allocate(like: TensorDict) -> TensorDict:
+            made.append(reserve_entry(folder, like))
+            return made[0]
+
+        fill(allocate)
+        seal_entry(folder, made[0])
+
+
+def entries_of(folder: Path) -> list[Path]:
+    """The entries in a folder, sound or not, by name; what is not the cache's is left out."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.is_dir() and (is_entry(path) or _is_earlier(path)))
+
+
+def forget(entry: Path) -> None:
+    """Removes an entry. Who has it open keeps it."""
+    with _errors_of(entry), _beside(entry) as aside, contextlib.suppress(FileNotFoundError):
+        entry.rename(aside)
+
+
+def sweep(folder: Path) -> int:
+    """Removes what killed processes left half written in a cache.
+
+    Returns:
+        How many entries that were.
+    """
+    swept = 0
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder):
+            if name.startswith(_WRITING):
+                with contextlib.suppress(OSError):
+                    swept += _sweep(folder / name)
+    return swept
+
+
+def _sweep(left: Path) -> bool:
+    """Removes a half entry whose process is gone."""
+    with contextlib.suppress(OSError):
+        left.rmdir()  # an empty one: its process was killed at the first or at the last moment
+        return True
+    held, locks = None, (left / _LOCK).exists()
+    try:
+        held = take_lock(left / _LOCK, create=False)
+    except OSError:
+        locks = False
+    if held is None and (
+        locks or time.time() - max(path.stat().st_mtime for path in (left, *left.rglob("*"))) < _UNLOCKED
+    ):
+        return False
+    _remove(left, held)
+    return True
+
+
+def _remove(left: Path, held: int | None) -> None:
+    """Removes a half entry, its lock last: whatever a kill leaves of it is known as dead."""
+    remove_locked(left, _LOCK)
+    if held is not None:
+        os.close(held)
+
+
+def _is_earlier(folder: Path) -> bool:
+    return bool(_EARLIER.fullmatch(folder.name)) and (folder / "meta.json").is_file()
 
 
 def _load(entry: Path) -> TensorDict | None:
-    if entry.is_dir():
-        try:
-            return TensorDict.load_memmap(entry)
-        except (OSError, RuntimeError, KeyError, ValueError):  # damaged from outside: make it anew
-            shutil.rmtree(entry, ignore_errors=True)
-    return None
-
-
-def _store(entry: Path, write: Callable[[Path], object]) -> TensorDict:
-    """Write an entry beside its place and rename it, so that one that exists is complete."""
+    sweep(entry.parent)
     try:
+        return open_entry(entry)
+    except FileNotFoundError:
+        return None
+    except DamagedEntry as damage:
+        _LOG.warning("the cache entry %s is damaged, and is made anew: %s", entry, damage)
+        _set_aside(entry)
+        return None
+
+
+def _set_aside(entry: Path) -> None:
+    """Removes a damaged entry, but not the sound one that another process may have put in its place meanwhile."""
+    with _errors_of(entry), _beside(entry) as aside, contextlib.suppress(DamagedEntry, FileNotFoundError):
+        entry.rename(aside)
+        open_entry(aside)
+        with contextlib.suppress(OSError):  # there is one again
+            aside.rename(entry)
+
+
+def _check_writable(entry: Path) -> None:
+    with _errors_of(entry):
         entry.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=entry.parent))
-    except OSError as error:
-        raise OSError(
-            f"cannot write the cache at {entry.parent} ({error}); pass cache=FOLDER or cache=None, or set "
-            "TORCH_DENKF_CACHE"
-        ) from error
+        if not os.access(entry.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(entry.parent))
+
+
+@contextmanager
+def _writing(entry: Path) -> Iterator[Path]:
+    """A folder to write to beside an entry, which is renamed when it is complete: an entry that exists is complete."""
+    with _errors_of(entry), _beside(entry) as beside:
+        yield beside
+        try:
+            beside.rename(entry)
+            sync(entry.parent)
+        except OSError:
+            if not entry.is_dir():  # otherwise another process was faster, with the same content
+                raise
+
+
+@contextmanager
+def _beside(entry: Path) -> Iterator[Path]:
+    """A place beside an entry; what is there at the end goes, or is swept once this process is gone."""
+    entry.parent.mkdir(parents=True, exist_ok=True)
+    folder, held = _claim(entry.parent)
     try:
-        write(beside / "entry")
-        if not entry.is_dir():
-            try:
-                (beside / "entry").rename(entry)
-            except OSError:
-                if not entry.is_dir():  # otherwise another process was faster, with the same content
-                    raise
+        yield folder / "entry"
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return TensorDict.load_memmap(entry)
+        _remove(folder, held)
+
+
+def _claim(parent: Path) -> tuple[Path, int | None]:
+    """A new folder to write to, and its lock; None on a file system without locks, where its age says if it is dead."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
+        try:
+            held = take_lock(folder / _LOCK)
+        except FileNotFoundError:  # swept while it was empty
+            continue
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            return folder, None
+        if held is not None:
+            return folder, held
+
+
+def _errors_of(entry: Path):
+    cure = "pass cache=FOLDER or cache=None, or set TORCH_DENKF_CACHE"
+    return clear_errors(entry, cure, beside=entry.parent, name=f"the cache at {entry}")

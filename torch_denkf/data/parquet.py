@@ -10,6 +10,9 @@ from torch_denkf.data.video import EXTRA
 
 __all__ = ["read_parquet"]
 
+MOST_ROWS = 10**8
+MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more than so many times the file
+
 
 def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
     """Columns of a parquet file, or all, as a pyarrow table.
@@ -17,7 +20,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the file.
-        ValueError: if it is damaged, or lacks a column.
+        ValueError: if it is damaged, lacks a column, or announces far more than a file of its size holds.
     """
     try:
         import pyarrow as arrow
@@ -32,6 +35,21 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
             missing = sorted(set(columns or ()) - set(there))
             if missing:
                 raise ValueError(f"{file} lacks the columns {missing}; it has {there}")
+            _refuse_bombs(file, opened.metadata)
             return opened.read(None if columns is None else list(columns))
     except (arrow.ArrowException, OSError) as error:
         raise ValueError(f"{file} is no complete parquet file ({error}); download or copy it anew") from error
+
+
+def _refuse_bombs(file: Path, metadata: Any) -> None:
+    """Before anything is unpacked.
+
+    Raises:
+        ValueError: for a small file that announces a huge table.
+    """
+    size = sum(metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups))
+    if metadata.num_rows > MOST_ROWS or size > max(MOST_BYTES, MOST_RATIO * file.stat().st_size):
+        raise ValueError(
+            f"{file} has {file.stat().st_size} bytes and announces {metadata.num_rows} rows of together {size} bytes; "
+            "that much is not unpacked: download or copy it anew"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,16 +13,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_denkf._files import clear_errors, reserve
+
 __all__ = [
     "JoinedPictures",
     "check_size",
     "decode_picture",
     "float_pictures",
+    "is_bomb",
     "image_store",
     "scaled",
     "text_of_size",
     "unnamed_file",
 ]
+
+
+MOST_PIXELS = 10**8  # of one picture
+CURE = "pass cache=FOLDER, or cache=None for memory"
 
 
 def check_size(size: Sequence[int]) -> tuple[int, int]:
@@ -55,20 +63,42 @@ def decode_picture(data: bytes) -> np.ndarray | None:
     # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
     ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
     complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete else None
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete and not is_bomb(data) else None
     return None if pixels is None else pixels[..., ::-1]
+
+
+def is_bomb(data: bytes) -> bool:
+    r"""Whether a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
+
+    Examples:
+        >>> is_bomb(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (30000).to_bytes(4) + (30000).to_bytes(4))
+        True
+    """
+    height = width = 0
+    if data.startswith(b"\x89PNG"):
+        width, height = int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+    at = 2 if data.startswith(b"\xff\xd8") else len(data)
+    while at + 9 < len(data) and data[at] == 0xFF:  # JPEG: segments, of which a "start of frame" has the size
+        if 0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in (0xC4, 0xC8, 0xCC):
+            height, width = int.from_bytes(data[at + 5 : at + 7]), int.from_bytes(data[at + 7 : at + 9])
+            break
+        at += 2 + int.from_bytes(data[at + 2 : at + 4])
+    return height * width > MOST_PIXELS
 
 
 def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
     """Zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
 
     Raises:
-        OSError: if the folder cannot be written to.
+        OSError: if the folder cannot be written to, or has not enough space.
     """
     if folder is None:
         return np.zeros((rows, 3, *size), np.uint8)
-    with unnamed_file(folder) as file:
-        return np.memmap(file, np.uint8, "w+", shape=(rows, 3, *size))
+    shape = (rows, 3, *size)
+    name = f"{math.prod(shape) / 1e6:.1f} MB of pictures to {folder}"
+    with unnamed_file(folder) as file, clear_errors(folder / "pictures", CURE, name=name):
+        reserve(file, math.prod(shape))
+        return np.memmap(file, np.uint8, "r+", shape=shape)
 
 
 def unnamed_file(folder: Path) -> IO[bytes]:
@@ -77,11 +107,9 @@ def unnamed_file(folder: Path) -> IO[bytes]:
     Raises:
         OSError: if the folder cannot be written to.
     """
-    try:
+    with clear_errors(folder / "file", CURE, name=f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryFile(dir=folder)
-    except OSError as error:
-        raise OSError(f"cannot write to {folder} ({error}); pass cache=FOLDER, or cache=None for memory") from error
 
 
 class JoinedPictures:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
+from torch_denkf._files import replacing
 from torch_denkf.data.kitti.files import write_poses
 from torch_denkf.vision.poses import state_to_poses
 
@@ -48,6 +49,7 @@ def write_trajectory(
     Raises:
         ValueError: for another layout, for shapes that do not fit, for values that are not finite, and for TUM files
             without increasing times.
+        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
 
     Example:
         >>> import tempfile, torch
@@ -64,7 +66,6 @@ def write_trajectory(
         raise ValueError(f"row {row} of the trajectory is not finite; leave such rows out")
     file = Path(file)
     if layout == "kitti":
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_poses(file, poses)
         return file
     if times is None:
@@ -72,8 +73,8 @@ def write_trajectory(
     seconds = _array(times).reshape(-1)
     if len(seconds) != len(poses) or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
         raise ValueError(f"times must be {len(poses)} increasing seconds, one a pose; got {len(seconds)}")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(file, np.column_stack([seconds, poses[:, :, 3], _quaternions(poses[:, :, :3])]) + 0.0, fmt="%.9f")
+    with replacing(file) as beside:
+        np.savetxt(beside, np.column_stack([seconds, poses[:, :, 3], _quaternions(poses[:, :, :3])]) + 0.0, fmt="%.9f")
     return file
 
 

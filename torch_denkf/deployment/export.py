@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,11 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
+from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
-from torch_denkf.filters.inductor import need_compiler
+from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler
 from torch_denkf.modules._base import flat_noise
 
 
@@ -39,8 +42,14 @@ def export_step(
 ) -> Path:
     """Writes one step of a filter as a package with static shapes that loads without torch_denkf's training code.
 
+    A package holds native code, or a graph that torch unpickles: who loads it runs it. Hand it on, and take it, as you
+    would a program.
+
     Everything random is drawn inside, from torch's generator, unless ``example`` holds the noise (see
     :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs.
+
+    A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
+    returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
 
     Args:
         filter: trained; its device is the package's.
@@ -58,6 +67,7 @@ def export_step(
         KeyError: if an entry that the step reads is missing.
         ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
         RuntimeError: if there is no C++ compiler.
+        OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
         >>> import tempfile
@@ -82,7 +92,8 @@ def export_step(
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
     written = list(filter.out_keys)
-    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys)]))
+    counted = [key for key in written if filter.reject and key == REJECTED]
+    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys), *counted]))
     unknown = [key for key in out_keys if key not in written]
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {written}")
@@ -102,12 +113,15 @@ def export_step(
             program = torch.export.export(step, values)
     finally:
         filter.train(was_training)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    package = io.BytesIO()  # torch's own writer ends the process where the disk is full
     if compiled:
+        clear_damaged_libraries()
         options = {"aot_inductor.metadata": {SIGNATURE: json.dumps(signature)}}
-        torch._inductor.aoti_compile_and_package(program, package_path=str(path), inductor_configs=options)
+        with clear_full_cache():
+            torch._inductor.aoti_compile_and_package(program, package_path=package, inductor_configs=options)
     else:
-        torch.export.save(program, path, extra_files={SIGNATURE: json.dumps(signature)})
+        torch.export.save(program, package, extra_files={SIGNATURE: json.dumps(signature)})
+    write_bytes(path, package.getbuffer())
     return path
 
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
 import torch_denkf
+from torch_denkf._files import replacing
 
 __all__ = ["load_folder", "read_folder_config", "save_folder"]
 
@@ -46,7 +46,7 @@ def save_folder(
         The folder.
 
     Raises:
-        OSError: if the folder cannot be written to.
+        OSError: if the folder cannot be written to, or the disk is full; a model in it is then as it was.
         TypeError: if settings or training hold what JSON does not know.
 
     Example:
@@ -60,15 +60,12 @@ def save_folder(
     config = {"format": FORMAT, "builder": builder, "settings": dict(settings), "sha256": ""}
     config |= {"versions": versions, "training": dict(training or {})}
     json.dumps(config)  # before anything is written
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{WEIGHTS}.part"
     # Copies: safetensors refuses tensors that share memory.
-    save_file({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()}, part)
-    part.chmod(0o644)  # safetensors leaves files that only their owner reads
-    config["sha256"] = _sha256(part)
-    (folder / f"{CONFIG}.part").write_text(json.dumps(config, indent=1) + "\n")
-    for name in (WEIGHTS, CONFIG):  # written whole or not at all
-        os.replace(folder / f"{name}.part", folder / name)
+    weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
+    config["sha256"] = hashlib.sha256(weights).hexdigest()
+    with replacing(folder / WEIGHTS) as part, replacing(folder / CONFIG) as part_of_config:
+        part.write_bytes(weights)
+        part_of_config.write_text(json.dumps(config, indent=1) + "\n")
     return folder
 
 

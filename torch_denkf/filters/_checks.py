@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters._steps import previous_key
-from torch_denkf.filters._structure import Structure
+from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
+from torch_denkf.filters._structure import Structure, previous_key
 from torch_denkf.modules._base import Entries, random_parts
 
 if TYPE_CHECKING:
@@ -56,8 +56,9 @@ def check_inputs(
         if key not in entries and key not in without and previous_key(key) not in entries
     ]
     if missing:
-        modules = (*structure.frames, structure.transition, *structure.update)
-        readers = [type(m).__name__ for _, m in modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))]
+        readers = [
+            type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
+        ]
         present = ", ".join(sorted(map(str, tensordict.keys(True, True)))) or "nothing"
         raise KeyError(
             f"{', '.join(readers) or name} reads {', '.join(map(repr, missing))}, which the tensordict lacks. It holds "
@@ -66,17 +67,30 @@ def check_inputs(
         )
 
 
-def refuse_non_finite(structure: Structure, entries: Entries, written: Entries) -> None:
-    """Raises a ``ValueError`` where the new belief is not finite; the message names the input that is not."""
-    if all(torch.isfinite(written[key]).all() for key in structure.carry if key in written):
+def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, reject: bool) -> None:
+    """Raises a ``ValueError`` where a reading or the new belief is not finite; the message names the input that is not.
+
+    Args:
+        structure: the filter's.
+        entries: what the step read.
+        written: what it wrote.
+        reject: whether readings that are not finite were rejected, and are no mistake.
+    """
+    finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
+    absurd = [] if reject else rejected_keys(structure.guards, entries)
+    if finite and not absurd:
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
-    why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+    if absurd and not set(absurd) & set(bad):
+        why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
+    else:
+        why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+    state = "to be trusted" if finite else "finite"
     raise ValueError(
-        f"The new belief is not finite, because of {why}. The tensordict was left as it is. Hide what is broken or "
+        f"The new belief is not {state}, because of {why}. The tensordict was left as it is. Hide what is broken or "
         f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
-        "predict(...); check_finite=False switches this off."
+        "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
 
 
@@ -94,7 +108,7 @@ def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool
 def refuse_unknown_noise(filter: Filter, noise: Entries) -> None:
     """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
     structure = filter.structure
-    modules = (*structure.frames, structure.transition, *structure.update, ("initial", filter.initial))
+    modules = (*structure.modules, ("initial", filter.initial))
     places = {place for name, module in modules for place, _ in random_parts(module, name)}
     unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
     if unknown:

@@ -30,6 +30,8 @@ class CompiledSteps:
     """
 
     def __init__(self, chunk: int, options: Mapping[str, Any]):
+        if chunk < 0:
+            raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
         if options.get("backend", "inductor") == "inductor":
             from torch_denkf.filters.inductor import need_compiler
 
@@ -44,7 +46,7 @@ class CompiledSteps:
         """What one step writes; ``entries`` hold its noise."""
         keys = tuple(entries)
         device = next(iter(entries.values())).device
-        writes = (*steps.structure.frame_keys, *steps.structure.step_keys)
+        writes = (*steps.structure.frame_keys, *steps.step_keys)
         make = partial(_step, steps, keys, writes, batch_size)
         values = self._function(("step", keys, batch_size), steps, device, make)(*entries.values())
         if self._overwrites(device):
@@ -84,14 +86,18 @@ class CompiledSteps:
                 carry, values = (tuple(value.clone() for value in part) for part in (carry, values))
             outputs.append(values)
             begin += length
+        if len(outputs) == 1:
+            return dict(zip(keep, outputs[0], strict=True))
         columns = zip(*outputs, strict=True)
         return {key: torch.cat(values, time) for key, values in zip(keep, columns, strict=True)}
 
     def _function(self, kind: tuple, steps: Steps, device: torch.device, make: Callable[[], Callable]) -> Callable:
-        structure = steps.structure
-        modules = (*structure.frames, structure.transition, *structure.update)  # a part may be replaced
-        kind = (*kind, modules, steps.update_at_reset, steps.ceiling, device)
+        kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
+            if self.options.get("backend", "inductor") == "inductor":
+                from torch_denkf.filters.inductor import clear_damaged_libraries
+
+                clear_damaged_libraries()
             function = make()
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
@@ -116,7 +122,8 @@ class CompiledSteps:
 
 def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        entries, call = dict(zip(keys, values, strict=True)), Call(batch)
+        call = Call(batch)
+        entries = steps.usable(dict(zip(keys, values, strict=True)), call)
         written = steps.frames(entries, call)
         written.update(steps.advance({**entries, **written}, call))
         return tuple(written[key] for key in writes)

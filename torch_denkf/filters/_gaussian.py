@@ -9,7 +9,8 @@ from typing import Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -17,8 +18,8 @@ __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 class GaussianOptions(FilterOptions, total=False):
     """What the filters with a mean, a covariance and a learned sensor take beside their models.
 
-    They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-    ``check_finite`` of :class:`Filter`.
+    They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+    ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict import unravel_key
+from tensordict import TensorDictBase, unravel_key
 
+from torch_denkf.filters._entries import write
 from torch_denkf.filters._said import say_eager
 from torch_denkf.filters._structure import Placed
 from torch_denkf.modules._base import Entries, SubModel, flat_noise, random_parts
@@ -15,7 +16,16 @@ from torch_denkf.modules._base import Entries, SubModel, flat_noise, random_part
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["draw_noise"]
+__all__ = ["draw_noise", "write_noise"]
+
+
+def write_noise(filter: Filter, tensordict: TensorDictBase, generator: torch.Generator | None) -> TensorDictBase:
+    """See :meth:`Filter.draw_noise`."""
+    entries, size = filter.entries_of(tensordict), tensordict.batch_size
+    modules = (*filter.structure.modules, ("initial", filter.initial))
+    drawn = draw_noise(filter, entries, size, modules, time=len(size) > 0, generator=generator, as_far_as_known=True)
+    write(tensordict, drawn or {})
+    return tensordict
 
 
 def draw_noise(

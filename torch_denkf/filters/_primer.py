@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torch_denkf.filters._steps import previous_key
+from torch_denkf.filters._structure import KNOWN, previous_key
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
@@ -86,5 +86,5 @@ def belief_primer(filter: Filter) -> TensorDictPrimer:
     for key in filter.carry_keys:
         value = belief.get(key)
         primers[previous_key(key)] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-    primers["previous", "known"] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
+    primers[KNOWN] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
     return LastAction({key: previous_key(key) for key in filter.structure.controls}, primers=primers)

@@ -6,24 +6,26 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
+from torch_denkf.filters._ceiling import look_at_ceiling
 from torch_denkf.filters._checks import check_inputs, refuse_missing_actions
+from torch_denkf.filters._entries import write
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters._said import say_ignored_mask
-from torch_denkf.filters._steps import Steps, blank, previous_key
-from torch_denkf.filters._structure import Structure
+from torch_denkf.filters._slices import as_rows, starts_of
+from torch_denkf.filters._steps import Steps, blank
+from torch_denkf.filters._structure import KNOWN, Structure, previous_key
 from torch_denkf.filters._summaries import summaries
 from torch_denkf.modules._base import Call, Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["Rows", "filter_rows"]
-
-_KNOWN = ("previous", "known")
+__all__ = ["Rows", "filter_rows", "filter_sequence", "stepped"]
 
 
 class Rows(NamedTuple):
@@ -50,6 +52,44 @@ class Rows(NamedTuple):
     keep: tuple[NestedKey, ...]
 
 
+def filter_sequence(
+    filter: Filter, tensordict: TensorDictBase, detach_every: int | None, keep: Sequence[NestedKey] | None
+) -> TensorDictBase:
+    """See :meth:`Filter.sequence`."""
+    size = tensordict.batch_size
+    if not size or not size[-1]:
+        raise ValueError(
+            "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
+            f"batch_size {list(size)}."
+        )
+    filter.structure  # noqa: B018 - sorts the modules anew where one has been replaced
+    keep = list(filter.out_keys) if keep is None else [unravel_key(key) for key in keep]
+    unknown = [key for key in keep if key not in filter.out_keys]
+    if unknown:
+        raise ValueError(f"keep names {unknown}; the filter writes {list(filter.out_keys)}.")
+    new = starts_of(tensordict, filter.init_key)
+    rows, new = as_rows(tensordict, new)
+    outputs = filter_rows(filter, rows, new, detach_every, keep)
+    if filter.compiled is not None:
+        look_at_ceiling(filter, outputs)
+    if rows is not tensordict:
+        outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
+    write(tensordict, {key: outputs[key] for key in keep})
+    return tensordict
+
+
+def stepped(filter: Filter, tensordict: TensorDictBase) -> Tensor:
+    """See :meth:`Filter.stepped`."""
+    size = tensordict.batch_size
+    new, first = starts_of(tensordict, filter.init_key), torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+    first[..., 0] = True
+    new = first if new is None else first | new.reshape(size)
+    if all(tensordict.get(previous_key(key), None) is not None for key in filter.structure.carry):
+        known = tensordict.get(KNOWN, None)  # a policy's data: every element with a belief before it is a step
+        return torch.ones_like(new) if known is None else known.reshape(size)
+    return ~new
+
+
 def filter_rows(
     filter: Filter, rows: TensorDictBase, new: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
 ) -> Entries:
@@ -66,6 +106,7 @@ def filter_rows(
     entries, call = filter.entries_of(rows), Call(size, time=True)
     check_inputs(filter, entries, rows, carry=False)
     say_ignored_mask(filter, rows)
+    entries = filter.steps().usable(entries, call)
     with set_recurrent_mode(True):  # for modules that are not this package's
         frames = filter.steps().frames(entries, call)
     entries.update(frames)
@@ -86,7 +127,7 @@ def filter_rows(
         starts = filter.initial_belief(entries, call)
     steps = filter.steps(filter.update_at_reset and not stored)
 
-    reads = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys)
+    reads = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys, REJECTED)
     inputs = {key: entries[key] for key in reads if key in entries}
     inputs.update({key: value for key, value in entries.items() if key[0] == "noise"})
     inputs.update({key: entries[previous_key(key)] for key in structure.controls if previous_key(key) in entries})
@@ -94,7 +135,7 @@ def filter_rows(
     drawn = draw_noise(filter, {**entries, **starts}, size, (structure.transition, *structure.update), time=True)
     inputs.update(drawn or {})
     shifted = tuple(key for key in structure.controls if previous_key(key) not in entries)
-    step_keys = tuple(key for key in keep if key in structure.step_keys)
+    step_keys = tuple(key for key in keep if key in steps.step_keys)
     todo = Rows(size, inputs, shifted, begins, starts, resumed, detach_every, step_keys)
     compiled = filter.compiled if drawn is not None and not resumed else None
     with set_recurrent_mode(False):
@@ -116,7 +157,7 @@ def _beginnings(structure: Structure, entries: Entries, new: Tensor | None, size
     """Which elements of a policy's data start anew, and what the others resume from where a slice begins."""
     refuse_missing_actions(structure, entries, resumed=True)
     new = _or_first(new, size, entries[previous_key(structure.carry[0])].device)
-    known = entries.get(_KNOWN, torch.ones_like(new))
+    known = entries.get(KNOWN, torch.ones_like(new))
     resumes = {previous_key(key): entries[previous_key(key)] for key in structure.carry}
     return ~known, {**resumes, ("previous", "resumes"): new & known}
 

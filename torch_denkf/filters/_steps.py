@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from math import sqrt
 from typing import NamedTuple
 
 import torch
@@ -12,13 +11,12 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
-from torch_denkf.filters._structure import Placed, Structure
+from torch_denkf.filters._ceiling import hold_variances
+from torch_denkf.filters._rejection import REJECTED, usable
+from torch_denkf.filters._structure import Placed, Structure, previous_key
 from torch_denkf.modules._base import Call, Entries, SubModel, named_modules_of, run_module
 
-__all__ = ["Steps", "blank", "previous_key", "where_rows"]
-
-#: The mean is held within so many of the largest standard deviations that a variance ceiling allows.
-_FARTHEST = 1000.0
+__all__ = ["Steps", "blank", "where_rows"]
 
 
 def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -33,13 +31,24 @@ class Steps(NamedTuple):
         structure: its modules.
         update_at_reset: whether an initial belief is updated with its frame.
         ceiling: largest variance of the belief; ``None`` for any.
-        say: told the key of a variance that is held at the ceiling.
+        say: told which variance is held at the ceiling.
+        reject: whether readings that cannot be true count as not observed.
     """
 
     structure: Structure
     update_at_reset: bool
     ceiling: float | None
     say: Callable[[NestedKey], None]
+    reject: bool = False
+
+    @property
+    def step_keys(self) -> tuple[NestedKey, ...]:
+        """What transition and update write, and how many readings were rejected."""
+        return (*self.structure.step_keys, REJECTED) if self.reject else self.structure.step_keys
+
+    def usable(self, entries: Entries, call: Call) -> Entries:
+        """What the modules may read: without readings that cannot be true, if they are to be rejected."""
+        return usable(self.structure.guards, entries, call.batch_size) if self.reject else entries
 
     def run(
         self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
@@ -140,7 +149,9 @@ class Steps(NamedTuple):
             for key in structure.belief:
                 written[key] = where_rows(reset, start[key], written[key])
         if self.ceiling is not None:
-            self._limit(written, self.ceiling)
+            hold_variances(written, structure.belief, self.ceiling, self.say)
+        if self.reject:
+            written[REJECTED] = entries[REJECTED]
         return written
 
     def roll(
@@ -184,43 +195,6 @@ class Steps(NamedTuple):
             return carry
         return {key: where_rows(resumes, row[previous_key(key)], value) for key, value in carry.items()}
 
-    # ------------------------------------------------------------------------------------------ a belief that explodes
-
-    def variance_keys(self) -> list[NestedKey]:
-        """The variances among the belief's entries."""
-        return [key for key in self.structure.belief if key[-1] == "var"]
-
-    def _limit(self, written: Entries, ceiling: float) -> None:
-        """Holds the variances at the ceiling, in place of the entries; the correlations stay."""
-        for key in self.variance_keys():
-            variance = written.get(key)
-            if variance is None:
-                continue
-            exceeded = _exceeds(variance, ceiling)
-            if exceeded is False:
-                continue
-            if exceeded:
-                self.say(key)
-            prefix, farthest = key[:-1], _FARTHEST * sqrt(ceiling)
-            mean_key = (*prefix, "mean")
-            mean = written.get(mean_key)
-            if mean is None:
-                continue
-            factor = (variance / ceiling).clamp(min=1).rsqrt()
-            held = mean.clamp(-farthest, farthest)
-            written[key] = variance * factor.square()
-            written[mean_key] = held
-            cov = written.get((*prefix, "cov"))
-            if cov is not None:
-                written[*prefix, "cov"] = cov * factor.unsqueeze(-1) * factor.unsqueeze(-2)
-            ensemble = written.get((*prefix, "ensemble"))
-            if ensemble is not None:
-                deviations = (ensemble - mean.unsqueeze(-2)) * factor.unsqueeze(-2)
-                limited = held.unsqueeze(-2) + deviations
-                # Where nothing is held, nothing moves, not even by rounding.
-                same = ((factor == 1) & (held == mean)).unsqueeze(-2)
-                written[*prefix, "ensemble"] = torch.where(same, ensemble, limited)
-
 
 def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
     """Zero for what a step writes, and a belief that starts does not have: innovations and the like.
@@ -232,24 +206,9 @@ def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
     """
     structure = steps.structure
     at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
-    for key in structure.beside if steps.update_at_reset else structure.step_keys:
+    for key in structure.beside if steps.update_at_reset else steps.step_keys:
         if key in written and key not in at_start:
             written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
-
-
-def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
-    """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
-    if torch.compiler.is_compiling() or variance.is_cuda:
-        return None
-    try:
-        return bool((variance > ceiling).any())
-    except RuntimeError:  # under vmap a number has no value
-        return None
-
-
-def previous_key(key: NestedKey) -> NestedKey:
-    """Where a policy's filter finds what was ``key`` one step before."""
-    return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:

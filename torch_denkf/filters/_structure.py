@@ -9,19 +9,35 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
-from torch_denkf.modules._base import SubModel, reads
+from torch_denkf.filters._rejection import Guard, guards_of
+from torch_denkf.modules._base import SubModel, in_sequences, reads, reads_of, writes
 
-__all__ = ["Placed", "Structure", "submodels"]
+__all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
 
+#: Whether a policy has a belief before this element.
+KNOWN = ("previous", "known")
 _SUMMARIES = ("mean", "var", "cov")
+
+
+def previous_key(key: NestedKey) -> tuple[str, ...]:
+    """Where a policy's filter finds what was ``key`` one step before."""
+    return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
 def submodels(module: torch.nn.Module) -> list[SubModel]:
     """Returns the sub-models inside ``module``, also those inside others."""
     return [part for part in module.modules() if isinstance(part, SubModel)]
+
+
+def all_modules(sequence: TensorDictSequential) -> Iterator[TensorDictModuleBase]:
+    """The modules of a filter, and those of the plain sequences among them."""
+    for module in sequence._modules["module"]._modules.values():
+        yield module
+        if type(module) is TensorDictSequential:
+            yield from all_modules(module)
 
 
 class Structure(NamedTuple):
@@ -41,6 +57,7 @@ class Structure(NamedTuple):
         beside: what else the transition writes.
         observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
         readings: raw entries that the analyses' readings are made of.
+        guards: what a mask hides, of those readings.
         unmasked: modules of the update that take in a reading and read no mask.
         own_info: new names for diagnostics that several analyses would write under one.
         totals: sums of those over the analyses.
@@ -62,12 +79,29 @@ class Structure(NamedTuple):
     beside: tuple[NestedKey, ...]
     observation_dims: dict[NestedKey, int]
     readings: tuple[NestedKey, ...]
+    guards: tuple[Guard, ...]
     unmasked: tuple[Placed, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
     totals: dict[NestedKey, tuple[NestedKey, ...]]
     likelihoods: tuple[NestedKey, ...]
     frame_keys: tuple[NestedKey, ...]
     step_keys: tuple[NestedKey, ...]
+
+    @property
+    def modules(self) -> tuple[Placed, ...]:
+        """All modules, in the order in which they run."""
+        return (*self.frames, self.transition, *self.update)
+
+    def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
+        """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
+        keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), KNOWN]
+        keys += [*map(previous_key, self.controls), *self.belief, init_key, *self.optional]
+        return list(dict.fromkeys(keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """All that a filter writes."""
+        return [*self.frame_keys, *self.step_keys]
 
     @classmethod
     def of(
@@ -84,7 +118,7 @@ class Structure(NamedTuple):
                 what the forecast is.
         """
         provided = [unravel_key(key) for key in initial.out_keys]
-        needed, optional = _inputs(modules)
+        needed, optional = reads_of(module for _, module in modules)
         carry = [key for key in (*needed, *optional) if key in provided]
         if not carry:
             raise ValueError(
@@ -100,9 +134,9 @@ class Structure(NamedTuple):
                 steps.append((place, module))
                 dependent.update(map(unravel_key, module.out_keys))
         _refuse_overwriting([*frames, *steps])
-        _refuse_nesting([*needed, *optional], [key for _, module in modules for key in _out(module)])
+        _refuse_nesting([*needed, *optional], [key for _, module in modules for key in writes(module)])
         own_info, totals = _apart(steps)
-        written = [own_info.get(place, {}).get(key, key) for place, module in steps for key in _out(module)]
+        written = [own_info.get(place, {}).get(key, key) for place, module in steps for key in writes(module)]
         step_keys = tuple(dict.fromkeys([*written, *totals]))
         still = [key for key in carry if key not in step_keys]
         if still:
@@ -113,7 +147,7 @@ class Structure(NamedTuple):
         for key in step_keys:  # a summary that the analysis writes and the initial belief does not
             if key not in belief and key[-1] in _SUMMARIES and any(key[:-1] == other[:-1] for other in carry):
                 belief.append(key)
-        forecast_of = _forecasts(carry, _out(steps[0][1]), forecast_keys)
+        forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
         return cls(
             frames=tuple(frames),
             transition=steps[0],
@@ -125,34 +159,17 @@ class Structure(NamedTuple):
             carry=tuple(carry),
             belief=tuple(belief),
             forecast_of=forecast_of,
-            beside=tuple(key for key in _out(steps[0][1]) if key not in forecast_of.values()),
+            beside=tuple(key for key in writes(steps[0][1]) if key not in forecast_of.values()),
             observation_dims=_observation_dims([*frames, *steps[1:]]),
             readings=tuple(_readings(frames, steps[1:], needed)),
+            guards=_guards(frames, steps[1:], needed, initial),
             unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
             totals=totals,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
-            frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in _out(module))),
+            frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,
         )
-
-
-def _out(module: TensorDictModuleBase) -> list[NestedKey]:
-    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
-    return list(dict.fromkeys(unravel_key(key) for part in _in_sequences(module) for key in part.out_keys))
-
-
-def _inputs(modules: Sequence[Placed]) -> tuple[list[NestedKey], list[NestedKey]]:
-    """What all modules together must find and may use."""
-    needed: dict[NestedKey, None] = {}
-    optional: dict[NestedKey, None] = {}
-    made: set[NestedKey] = set()
-    for _, module in modules:
-        must, may = reads(module)
-        needed.update((key, None) for key in must if key not in made)
-        optional.update((key, None) for key in may if key not in made)
-        made.update(_out(module))
-    return list(needed), [key for key in optional if key not in needed]
 
 
 def _forecasts(
@@ -206,10 +223,26 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
         for part in submodels(module):
             found.update(dict.fromkeys(map(unravel_key, getattr(part, "reading_keys", ()))))
     for _, module in reversed([*frames, *update]):
-        if not found.keys().isdisjoint(_out(module)):
+        if not found.keys().isdisjoint(writes(module)):
             found.update(dict.fromkeys(reads(module)[0]))
-    made_by_steps = {key for _, module in update for key in _out(module)}
+    made_by_steps = {key for _, module in update for key in writes(module)}
     return [key for key in found if key in needed and key not in made_by_steps]
+
+
+def _guards(
+    frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey], initial: TensorDictModuleBase
+) -> tuple[Guard, ...]:
+    """What each mask hides, of the entries from outside that the readings are made of."""
+    parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
+    made_by_steps = {key for _, module in update for key in writes(module)}
+    sources: dict[NestedKey, list[NestedKey]] = {}
+    for key in {unravel_key(key) for part in parts for key in getattr(part, "reading_keys", ())}:
+        found = {key: None}
+        for _, module in reversed([*frames, *update]):
+            if not found.keys().isdisjoint(writes(module)):
+                found.update(dict.fromkeys(reads(module)[0]))
+        sources[key] = [source for source in found if source in needed and source not in made_by_steps]
+    return guards_of(parts, sources)
 
 
 def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[Placed]:
@@ -217,11 +250,11 @@ def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[P
 
     They say what their reading is, or they write the belief and read an entry that no step makes.
     """
-    made = {*carry, *(key for _, module in steps for key in _out(module))}
+    made = {*carry, *(key for _, module in steps for key in writes(module))}
     for place, module in steps[1:]:
-        for part in _in_sequences(module):
+        for part in in_sequences(module):
             must, may = reads(part)
-            updates = not made.issuperset(must) and not set(carry).isdisjoint(_out(part))
+            updates = not made.issuperset(must) and not set(carry).isdisjoint(writes(part))
             if not may and (updates or len(getattr(part, "reading_keys", ())) > 0):
                 yield place, part
 
@@ -230,12 +263,12 @@ def _refuse_overwriting(modules: Sequence[Placed]) -> None:
     """Raises where all that a module writes is written again before anybody has read it."""
     for index, (place, module) in enumerate(modules):
         info = getattr(module, "info_key", None)
-        unread = {key for key in _out(module) if info is None or key[0] != info}
+        unread = {key for key in writes(module) if info is None or key[0] != info}
         used = False
         for other_place, other in modules[index + 1 :]:
             must, may = reads(other)
             used = used or not unread.isdisjoint((*must, *may))
-            lost = unread.intersection(_out(other))
+            lost = unread.intersection(writes(other))
             if lost and not used:
                 raise ValueError(
                     f"{other_place!r} ({type(other).__name__}) writes {sorted(map(str, lost))} over what {place!r} "
@@ -258,7 +291,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
     """Names of their own for the diagnostics of several analyses, and what to sum up."""
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
-        for part in _in_sequences(module):
+        for part in in_sequences(module):
             info = getattr(part, "info_key", None)
             if info is not None:
                 writers.setdefault(info, []).append((place, part))
@@ -274,7 +307,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
                 "would be overwritten: give each its own info_key."
             )
         for place, module in placed:
-            keys = [key for key in _out(module) if key[0] == info]
+            keys = [key for key in writes(module) if key[0] == info]
             own_info[place] = {key: (info, place, *key[1:]) for key in keys}
             for key in keys:
                 if key[-1] in ("nis", "log_likelihood"):
@@ -286,17 +319,8 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     """The log-likelihoods that together are that of all readings."""
     found = []
     for place, module in steps:
-        for part in _in_sequences(module):
-            for key in _out(part):
+        for part in in_sequences(module):
+            for key in writes(part):
                 if key[0] == getattr(part, "info_key", None) and key[-1] == "log_likelihood":
                     found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))
-
-
-def _in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
-    """The module, or those of a plain sequence."""
-    if type(module) is TensorDictSequential:
-        for inner in module.module.children():
-            yield from _in_sequences(inner)
-    else:
-        yield module

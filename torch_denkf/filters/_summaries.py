@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 
+from torch_denkf.filters._entries import write
 from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var, weighted_mean, weighted_var
 from torch_denkf.modules._base import Entries
 
-__all__ = ["summaries"]
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["summaries", "summarise"]
 
 _OF_ENSEMBLE = {"mean": ensemble_mean, "var": ensemble_var, "cov": ensemble_cov}
 _OF_PARTICLES = {"mean": weighted_mean, "var": weighted_var}
+
+
+def summarise(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
+    """See :meth:`Filter.summarise`."""
+    carry = {key: tensordict.get(key) for key in filter.structure.carry}
+    write(tensordict, summaries(carry, filter.structure.belief))
+    return tensordict
 
 
 def summaries(entries: Entries, keys: Iterable[NestedKey]) -> Entries:

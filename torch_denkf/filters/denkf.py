@@ -11,7 +11,8 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
@@ -48,8 +49,8 @@ class DEnKF(Filter):
         angles: components of the observation that are angles in radians, for the default ``analysis``.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: if it is not clear where the reading is.

@@ -9,8 +9,11 @@ from typing import Any, Unpack
 import torch
 from tensordict import NestedKey
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf._checks import check_covariance, check_shape, check_square, check_values
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["KalmanFilter"]
 
@@ -33,7 +36,10 @@ class KalmanFilter(Filter):
         observation_key: readings ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
-            ``update_at_reset``, ``variance_ceiling`` and ``check_finite`` of :class:`Filter`.
+            ``update_at_reset``, ``variance_ceiling``, ``check_finite`` and ``reject`` of :class:`Filter`.
+
+    Raises:
+        ValueError: if the shapes do not fit, a number is not finite, or Q, R or ``cov`` is no covariance.
 
     Example:
         >>> from tensordict import TensorDict
@@ -59,6 +65,25 @@ class KalmanFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
+        f, q, h, r, m, p = map(as_floating, (transition, transition_noise, observation, observation_noise, mean, cov))
+        check_square("transition", f)
+        size, readings = len(f), len(h) if h.ndim else 0
+        check_shape("observation", h, (readings, size), "[O, S]")
+        check_shape("mean", m, (size,), "[S]")
+        for name, value in {"transition": f, "observation": h, "mean": m}.items():
+            check_values(name, value)
+        check_covariance("transition_noise", q, size)
+        check_covariance("cov", p, size)
+        if r.ndim == 2:
+            check_covariance("observation_noise", r, readings, "[O] or [O, O]")
+        else:
+            check_shape("observation_noise", r, (readings,), "[O]")
+            check_values("observation_noise", r, least=0, cure="These are variances")
+        if control is not None:
+            b = as_floating(control)
+            check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
+            check_values("control", b)
+        check_dims("angles", angles, readings)
         action: dict[str, Any] = {}
         if control is not None:
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}

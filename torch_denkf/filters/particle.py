@@ -9,7 +9,8 @@ from typing import Literal, Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters.base import Filter, FilterOptions
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
     GaussianLikelihood,
     NoisyTransition,
@@ -53,8 +54,8 @@ class ParticleFilter(Filter):
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         angles: components of the observation that are angles in radians, for the default likelihood.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
-        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling`` and
-            ``check_finite`` of :class:`Filter`.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: on an unknown ``resampling``.

@@ -10,6 +10,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import refuse_other_beliefs
+from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules.kalman import MomentPrior
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
@@ -46,7 +47,8 @@ class LSTMFilter(Filter):
         init_key: see :class:`Filter`.
         update_at_reset: see :class:`Filter`; not with ``dt``, as there is no motion into the first frame.
         **kwargs: passed on to :class:`~torch_denkf.modules.LSTMUpdate`: ``extra_keys`` and ``extra_features``,
-            ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``.
+            ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
         ValueError: if a vehicle's state does not have five dimensions, or it lacks ``initial``, or has
@@ -90,6 +92,7 @@ class LSTMFilter(Filter):
                 f"state_dim=5 and initial=GaussianAround(...), and not update_at_reset; got state_dim={state_dim}, "
                 f"initial={initial}, update_at_reset={update_at_reset}."
             )
+        options = {name: kwargs.pop(name) for name in FilterOptions.__annotations__ if name in kwargs}
         update = LSTMUpdate(
             2 if vehicle else state_dim,
             features=features,
@@ -116,4 +119,5 @@ class LSTMFilter(Filter):
             control_keys=control_keys,
             init_key=init_key,
             update_at_reset=update_at_reset,
+            **options,
         )

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._small_system import LARGEST, solve_written_out
 from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
@@ -218,6 +218,8 @@ def _log_det(factor: Tensor) -> Tensor:
 
 def _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space) -> None:
     check_ensemble("forecast", forecast, min_size=2)
+    check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
+    check_mask("observed", observed)
     if predicted.ndim < 2:
         raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
     batch, size, dim = forecast.shape[:-2], forecast.shape[-2], predicted.shape[-1]
@@ -244,8 +246,6 @@ def _check(forecast, predicted, observation, noise, scheme, observed, perturbati
     if observed is not None:
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
         check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
-        if observed.dtype != torch.bool:
-            raise ValueError(f"observed must be boolean, got {observed.dtype}; pass observed.bool()")
     if perturbation is not None:
         if scheme != "perturbed":
             raise ValueError(f"perturbation is for scheme 'perturbed', not {scheme!r}; leave it out")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_shape
+from torch_denkf._checks import check_mask, check_one_dtype, check_shape
 from torch_denkf.functional._small_system import LARGEST, gain_written_out
 from torch_denkf.functional.linalg import cholesky
 
@@ -58,6 +58,8 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
     """
     _check_moments(mean, cov)
     dim = mean.shape[-1]
+    check_one_dtype(mean=mean, cov=cov, transition=transition)
+    _check_noise(mean, noise)
     _check_matrix("transition", transition, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
     _check_matrix("noise", noise, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
     return _apply(transition, mean), transition @ cov @ transition.mT + noise
@@ -100,6 +102,9 @@ def kalman_update(
         (tensor([1.]), tensor([[0.5000]]))
     """
     _check_moments(mean, cov)
+    check_one_dtype(mean=mean, cov=cov, observation=observation, observation_matrix=observation_matrix)
+    _check_noise(mean, noise)
+    check_mask("observed", observed)
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
     check_shape("observation", observation, (*batch, dim), "[*B, O]")
     _check_matrix("observation_matrix", observation_matrix, batch, (dim, state_dim), "[O, S] or [*B, O, S]")
@@ -151,6 +156,7 @@ def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
         tensor(-1.8379)
     """
     _check_moments(mean, cov)
+    check_one_dtype(mean=mean, cov=cov, value=value)
     check_shape("value", value, mean.shape, "[*B, S], as mean,")
     nis, log_det = _whiten(value - mean, cholesky(cov))
     return -0.5 * (nis + log_det + mean.shape[-1] * math.log(2 * math.pi)).squeeze(-1)
@@ -187,6 +193,12 @@ def _check_moments(mean: Tensor, cov: Tensor) -> None:
     if mean.ndim < 1:
         raise ValueError("mean must be [*B, S], got a scalar; add the dimension with unsqueeze")
     check_shape("cov", cov, (*mean.shape, mean.shape[-1]), "[*B, S, S]")
+
+
+def _check_noise(mean: Tensor, noise: Tensor) -> None:
+    """Noise is only added: one of lower precision will do."""
+    if torch.promote_types(mean.dtype, noise.dtype) != mean.dtype:
+        check_one_dtype(mean=mean, noise=noise)
 
 
 def _check_matrix(name: str, matrix: Tensor, batch: torch.Size, shape: tuple[int, int], layout: str) -> None:

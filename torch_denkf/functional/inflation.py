@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_shape
 
 
 def inflate(ensemble: Tensor, factor: float | Tensor) -> Tensor:

@@ -84,11 +84,16 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
     dim = cov.shape[-1]
-    std = cov.diagonal(dim1=-2, dim2=-1).detach().clamp(min=0).sqrt()
+    variance = cov.diagonal(dim1=-2, dim2=-1).detach()
+    std = variance.clamp(min=0).sqrt()
     inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
     ridge = 10 * dim * torch.finfo(cov.dtype).eps
     diagonal = torch.where(std > 0, ridge, 1 + ridge).diag_embed()
-    return (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge), std, inverse
+    # A variance of less than zero is not taken for one of zero, unless it is round-off beside the largest.
+    negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
+    std, inverse = torch.where(negative, torch.nan, std), torch.where(negative, torch.nan, inverse)
+    correlation = (cov * inverse.unsqueeze(-1) * inverse.unsqueeze(-2) + diagonal) / (1 + ridge)
+    return correlation, std, inverse
 
 
 def inverse_square_root(matrix: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.linalg import cholesky, inverse_square_root
 
 
@@ -195,6 +195,8 @@ def letkf(
         tensor([2., 0.])
     """
     check_ensemble("forecast", forecast, min_size=2)
+    check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
+    check_mask("observed", observed)
     batch, (size, dim), count = forecast.shape[:-2], forecast.shape[-2:], predicted.shape[-1]
     check_shape("predicted", predicted, (*batch, size, count), "[*B, E, O]")
     check_shape("observation", observation, (*batch, count), "[*B, O]")

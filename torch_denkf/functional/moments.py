@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble
+from torch_denkf._checks import check_ensemble
 
 
 def ensemble_mean(ensemble: Tensor) -> Tensor:

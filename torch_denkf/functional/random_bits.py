@@ -24,7 +24,7 @@ def representable_rate(rate: float) -> float:
         rate: wanted drop probability in [0, 1).
 
     Raises:
-        ValueError: if ``rate`` is outside [0, 1).
+        ValueError: if ``rate`` is outside [0, 1), or so small that no byte can express it.
 
     Example:
         >>> representable_rate(0.1)
@@ -32,6 +32,11 @@ def representable_rate(rate: float) -> float:
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"rate is the probability of dropping a unit and lies in [0, 1); got {rate}.")
+    if 0 < rate < 1 / 512:
+        raise ValueError(
+            f"rate is rounded to a multiple of 1/256, so that {rate} would drop no unit at all; pass 0 for that, or at "
+            "least 0.002."
+        )
     return min(round(rate * 256), 255) / 256
 
 

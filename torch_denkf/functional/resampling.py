@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_shape
+from torch_denkf._checks import check_shape
 from torch_denkf.functional.linalg import semidefinite_root
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import check_particles
@@ -48,7 +48,8 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
         uniform: numbers in [0, 1): ``[*B, 1]`` for systematic, ``[*B, E]`` for stratified resampling.
 
     Returns:
-        The particles that were picked, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``.
+        The particles that were picked, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``. These are NaN
+        where a weight was, so that it is not lost.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -60,8 +61,10 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
         tensor([2., 2.])
     """
     check_particles(particles, log_weights)
-    index = _pick(log_weights.detach().exp(), uniform)
-    return _take(particles.detach(), index), torch.full_like(log_weights, -math.log(log_weights.shape[-1])).detach()
+    probability = log_weights.detach().exp()
+    index = _pick(probability, uniform)
+    equal = torch.full_like(probability, -math.log(log_weights.shape[-1]))
+    return _take(particles.detach(), index), torch.where(probability.sum(-1, keepdim=True) > 0, equal, torch.nan)
 
 
 def soft_resample(
@@ -99,7 +102,8 @@ def soft_resample(
     index = _pick(proposal.detach(), uniform)
     # Picked first, then their logarithm: a particle that was picked has a positive probability.
     ratio = log_weights.gather(-1, index) - proposal.gather(-1, index).log()
-    return _take(particles, index), ratio.log_softmax(-1)
+    known = proposal.detach().sum(-1, keepdim=True) > 0
+    return _take(particles, index), torch.where(known, ratio.log_softmax(-1), torch.nan)
 
 
 def jitter_copies(
@@ -165,7 +169,8 @@ def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
     cumulative = cumulative / cumulative[..., -1:]
     below_one = 1 - torch.finfo(probability.dtype).eps / 2
     position = ((rank + uniform.to(probability.dtype)) / size).clamp(max=below_one)
-    return torch.searchsorted(cumulative, position.contiguous(), right=True)
+    # Where a weight is NaN, no position is found: the index stays inside, and the weights tell.
+    return torch.searchsorted(cumulative, position.contiguous(), right=True).clamp(max=size - 1)
 
 
 def _take(particles: Tensor, index: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_shape
 
 
 def crps_ensemble(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tensor:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_shape
 from torch_denkf.functional.linalg import cholesky, semidefinite_solve
 from torch_denkf.functional.moments import ensemble_anomalies
 from torch_denkf.functional.smoothing import check_lag

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_shape
+from torch_denkf._checks import check_shape
 from torch_denkf.functional.smoothing import check_lag
 
 

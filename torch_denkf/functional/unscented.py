@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional.angles import wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate, _check_moments, solve_for_gain
 from torch_denkf.functional.linalg import semidefinite_root
@@ -92,6 +92,7 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
         tensor([ 0.,  2., -2.])
     """
     _check_moments(mean, cov)
+    check_one_dtype(mean=mean, cov=cov)
     columns = math.sqrt(_spread(mean.shape[-1], alpha, kappa)) * semidefinite_root(cov).mT
     center = mean.unsqueeze(-2)
     return torch.cat([center, center + columns, center - columns], -2)
@@ -184,6 +185,8 @@ def unscented_update(
         >>> update.mean, update.cov
         (tensor([1.0000]), tensor([[0.5000]]))
     """
+    check_one_dtype(points=points, predicted=predicted, observation=observation, noise=noise)
+    check_mask("observed", observed)
     expected, deviations = _deviations(predicted, weights, angles)
     check_ensemble("points", points)
     batch, dim = expected.shape[:-1], expected.shape[-1]

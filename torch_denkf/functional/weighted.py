@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_one_dtype, check_shape
 from torch_denkf.functional.gaussian import solve_for_gain
 
 
@@ -133,3 +133,4 @@ def check_particles(particles: Tensor, log_weights: Tensor, min_size: int = 1) -
     """Raise ``ValueError`` unless these are particles ``[*B, E, S]`` and their log-weights ``[*B, E]``."""
     check_ensemble("particles", particles, min_size)
     check_shape("log_weights", log_weights, particles.shape[:-1], "[*B, E]")
+    check_one_dtype(particles=particles, log_weights=log_weights)

@@ -213,14 +213,14 @@ class SubModel(TensorDictModule):
         """What :meth:`on_entries` gives.
 
         Raises:
-            TypeError: if entries and parameters differ in precision.
+            TypeError: if entries and parameters differ in precision, or a mask is not boolean.
         """
         if torch.compiler.is_compiling():
             return self.on_entries(entries, call)
         try:
             return self.on_entries(entries, call)
-        except RuntimeError as error:
-            self._explain_precision(error, entries)
+        except (RuntimeError, TypeError, ValueError) as error:
+            self._explain_dtypes(error, entries)
             raise
 
     def _noise(self, entries: Entries, values: Sequence[Tensor | None], call: Call) -> Noise:
@@ -250,7 +250,15 @@ class SubModel(TensorDictModule):
                 )
         return given
 
-    def _explain_precision(self, error: RuntimeError, entries: Entries) -> None:
+    def _explain_dtypes(self, error: Exception, entries: Entries) -> None:
+        if "bool" in str(error):
+            for key in self.optional_keys:  # masks, and counts of steps
+                mask = entries.get(key)
+                if mask is not None and mask.dtype not in (torch.bool, torch.int64):
+                    raise TypeError(
+                        f"{type(self).__name__} reads the mask {key!r}, which must be boolean, True where observed; "
+                        f"got {mask.dtype}. Convert it with .bool()."
+                    ) from error
         own = {p.dtype for p in (*self.parameters(), *self.buffers()) if p.is_floating_point()}
         values = {key: entries.get(key) for key in (*self.in_keys, *self.optional_keys)}
         given = {key: v.dtype for key, v in values.items() if v is not None and v.is_floating_point()}
@@ -319,15 +327,34 @@ def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey
         may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
         must = [key for key in map(unravel_key, module.in_keys) if key not in may]
         return list(dict.fromkeys(must)), list(dict.fromkeys(may))
+    return reads_of(part for _, part in named_modules_of(module))
+
+
+def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], list[NestedKey]]:
+    """What modules must find that run one after the other, and what they use where it is there."""
     needed: dict[NestedKey, None] = {}
     optional: dict[NestedKey, None] = {}
     made: set[NestedKey] = set()
-    for _, part in named_modules_of(module):
-        must, may = reads(part)
+    for module in modules:
+        must, may = reads(module)
         needed.update((key, None) for key in must if key not in made)
         optional.update((key, None) for key in may if key not in made)
-        made.update(map(unravel_key, part.out_keys))
+        made.update(writes(module))
     return list(needed), [key for key in optional if key not in needed]
+
+
+def writes(module: TensorDictModuleBase) -> list[NestedKey]:
+    """What a module writes; of a plain sequence what its modules write now, one of which may have been replaced."""
+    return list(dict.fromkeys(unravel_key(key) for part in in_sequences(module) for key in part.out_keys))
+
+
+def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
+    """The module, or those of a plain sequence."""
+    if type(module) is TensorDictSequential:
+        for _, part in named_modules_of(module):
+            yield from in_sequences(part)
+    else:
+        yield module
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypedDict
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
+from torch_denkf._checks import check_number
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
 
@@ -55,7 +57,12 @@ class EnsembleUpdate(SubModel):
         observed_key: likewise.
         belief_key: likewise.
         info_key: likewise.
+
+    Raises:
+        ValueError: if ``inflation`` is not positive, or ``relaxation`` is outside [0, 1].
     """
+
+    reads_components = True
 
     def __init__(
         self,
@@ -81,5 +88,9 @@ class EnsembleUpdate(SubModel):
             [*moments, *diagnostics, *[(belief_key, "cov")] * covariance],
             optional_keys=[observed_key],
         )
+        check_number("inflation", inflation, above=0)
+        check_number("relaxation", relaxation, least=0, most=1)
+        check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
+        self.observed_key = unravel_key(observed_key)

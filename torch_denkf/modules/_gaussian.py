@@ -10,8 +10,10 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_number
 from torch_denkf.functional import GaussianUpdate, mean_observation
 from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
+from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
 _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
@@ -153,6 +155,8 @@ class GaussianAnalysis(SubModel):
         KeyError: if an entry is missing.
     """
 
+    reads_components = True
+
     def __init__(
         self,
         observation: TensorDictModuleBase,
@@ -174,6 +178,8 @@ class GaussianAnalysis(SubModel):
         out_keys = [(belief_key, name) for name in ("mean", "cov", "var")]
         out_keys += [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(observation, in_keys + further, out_keys, optional_keys=[observed_key, *optional])
+        check_number("inflation", inflation, above=0)
+        check_dims("angles", angles)
         self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
         self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)

@@ -8,6 +8,7 @@ from typing import Literal, Unpack
 import torch
 from tensordict import unravel_key
 
+from torch_denkf._checks import check_values
 from torch_denkf.functional import (
     Analysis,
     align_angles,
@@ -41,7 +42,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         **keys: see :class:`EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned observations, not one reading.
 
     Raises:
-        ValueError: on an unknown scheme.
+        ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and
+            factors of ``taper`` that are not finite.
         KeyError: if an entry is missing.
 
     Example:
@@ -75,6 +77,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         )
         self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
+            if factors is not None:
+                check_values(name.replace("_", "'s "), factors)
             self.register_buffer(name, factors, persistent=False)
 
     @property

@@ -6,12 +6,19 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant
+from torch_denkf.modules._tensors import (
+    as_floating,
+    as_standard_deviations,
+    check_dims,
+    mean_of_members,
+    register_location,
+)
 
 __all__ = ["AroundState", "FromSensor", "GaussianPrior"]
 
@@ -28,9 +35,8 @@ class _InitialEnsemble(SubModel):
         optional_keys: Sequence[NestedKey] = (),
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
-        std = as_floating(std)
-        if std.ndim != 1 or not (std >= 0).all():
-            raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
+        std = as_standard_deviations("std", std)
+        check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
 
@@ -80,6 +86,7 @@ class GaussianPrior(_InitialEnsemble):
         mean = as_floating(mean)
         if mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
+        check_values("mean", mean)
         self.register_buffer("mean", mean)
 
     def compute(self, *, noise, batch_size):
@@ -147,6 +154,8 @@ class FromSensor(_InitialEnsemble):
         tensor([5., 0.])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         dims: Sequence[int],
@@ -160,9 +169,11 @@ class FromSensor(_InitialEnsemble):
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
         super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
-        register_constant(self, "mean", mean)
+        register_location(self, "mean", mean)
+        check_dims("dims", dims, self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
         self.observation_dim = self.input_dim = len(self.dims)
+        self.reading_keys, self.observed_key = self.in_keys, unravel_key(observed_key)
 
     def on_entries(self, entries, call):
         """The belief; without its reading the prior."""

@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules.sensor import StochasticSensor
 from torch_denkf.modules.stochastic import StochasticMLP
 from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
@@ -142,6 +143,10 @@ class FlowSensor(StochasticSensor):
         encoding_key: NestedKey | None = ("sensor", "encoding"),
         observed_key: NestedKey = "observed",
     ):
+        check_number("dt", dt, above=0)
+        check_count("ensemble_size", ensemble_size)
+        check_count("features", features)
+        check_number("trunk_dropout", trunk_dropout, least=0, below=1)
         trunk = _MotionTrunk(features, trunk_dropout)
         head = StochasticMLP(trunk.out_features, 2, num_cells, layer=layer, rate=rate, output_gain=0.1)
         super().__init__(

@@ -9,10 +9,11 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
 from torch_denkf.modules._base import Call, Entries, SubModel, run_module
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
-from torch_denkf.modules._tensors import as_floating, register_constant
+from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
 
@@ -25,6 +26,9 @@ class MomentPrior(SubModel):
         cov: ``[S, S]``.
         belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
 
+    Raises:
+        ValueError: if the shapes do not fit, a number is not finite, or ``cov`` is no covariance.
+
     Example:
         >>> from tensordict import TensorDict
         >>> MomentPrior(torch.zeros(2), torch.eye(2))(TensorDict({}, [3]))["belief", "cov"].shape
@@ -35,7 +39,11 @@ class MomentPrior(SubModel):
         super().__init__(nn.Identity(), [], [(belief_key, name) for name in ("mean", "cov", "var")])
         register_constant(self, "mean", mean)
         register_constant(self, "cov", cov)
+        if self.mean.ndim != 1:
+            raise ValueError(f"mean must be [S], got {list(self.mean.shape)}")
         self.state_dim = self.mean.numel()
+        check_values("mean", self.mean)
+        check_covariance("cov", self.cov, self.state_dim)
 
     def compute(self, *, batch_size):
         """The belief."""
@@ -69,9 +77,7 @@ class GaussianAround(SubModel):
         self, std: Sequence[float] | torch.Tensor, *, state_key: NestedKey = "state", belief_key: str = "belief"
     ):
         super().__init__(nn.Identity(), [state_key], [(belief_key, name) for name in ("mean", "cov", "var")])
-        std = as_floating(std)
-        if std.ndim != 1 or not (std >= 0).all():
-            raise ValueError(f"std holds one non-negative standard deviation a state dimension; got {std}.")
+        std = as_standard_deviations("std", std)
         self.register_buffer("std", std)
         self.state_dim = std.numel()
 
@@ -93,6 +99,9 @@ class LinearTransition(SubModel):
         action_key: entry ``[*B, A]``, with ``control``.
         belief_key: prefix of ``mean`` and ``cov`` of the last analysis.
         forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
+
+    Raises:
+        ValueError: if the shapes do not fit, a number is not finite, or ``noise`` is no covariance.
 
     Example:
         >>> from tensordict import TensorDict
@@ -122,10 +131,17 @@ class LinearTransition(SubModel):
         self.action_key = unravel_key(action_key)
         register_constant(self, "matrix", matrix, trainable=trainable)
         register_constant(self, "control", control, trainable=trainable)
+        check_square("matrix", self.matrix)
+        check_values("matrix", self.matrix)
+        if self.control is not None:
+            size = self.control.shape[-1] if self.control.ndim else 0
+            check_shape("control", self.control, (len(self.matrix), size), "[S, A]")
+            check_values("control", self.control)
         if isinstance(noise, nn.Module):
             self.noise = noise
         else:
             register_constant(self, "noise", noise)
+            check_covariance("noise", self.noise, len(self.matrix))
 
     def parts(self):
         """The noise, if it is a module."""
@@ -168,6 +184,10 @@ class KalmanAnalysis(SubModel):
         belief_key: prefix of ``mean``, ``cov`` and ``var``.
         info_key: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
 
+    Raises:
+        ValueError: if the shapes do not fit, a number is not finite, ``noise`` is no covariance, or ``inflation`` is
+            not positive.
+
     Example:
         >>> from tensordict import TensorDict
         >>> td = TensorDict({
@@ -177,6 +197,8 @@ class KalmanAnalysis(SubModel):
         >>> KalmanAnalysis(torch.eye(1), torch.ones(1))(td)["belief", "mean"]
         tensor([0.5000])
     """
+
+    reads_components = True
 
     def __init__(
         self,
@@ -204,7 +226,17 @@ class KalmanAnalysis(SubModel):
         self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
         register_constant(self, "matrix", matrix, trainable=trainable)
         register_constant(self, "noise", noise)
-        self.reading_keys = self.in_keys[2:]
+        check_number("inflation", inflation, above=0)
+        if self.matrix.ndim != 2:
+            raise ValueError(f"matrix must be [O, S], got {list(self.matrix.shape)}")
+        check_values("matrix", self.matrix)
+        check_dims("angles", self.angles, len(self.matrix))
+        if self.noise is not None and self.noise.ndim == 2:
+            check_covariance("noise", self.noise, len(self.matrix), "[O] or [O, O]")
+        elif self.noise is not None:
+            check_shape("noise", self.noise, (len(self.matrix),), "[O]")
+            check_values("noise", self.noise, least=0, cure="These are variances")
+        self.reading_keys, self.observed_key = self.in_keys[2:], unravel_key(observed_key)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""

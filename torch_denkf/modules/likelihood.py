@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from torch import nn
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import mean_observation, wrap_angles
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, mean_of_members
+from torch_denkf.modules._tensors import as_floating, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
@@ -50,6 +51,8 @@ class GaussianLikelihood(SubModel):
         tensor([-1.4189, -0.9189])
     """
 
+    reads_components = True
+
     def __init__(
         self,
         *,
@@ -65,7 +68,7 @@ class GaussianLikelihood(SubModel):
         )
 
         self.angles = list(angles)
-        self.reading_keys = self.in_keys[1:]
+        self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
 
     def without_reading(self, predicted, *_):
         """The log-likelihoods where there is no reading: zero."""
@@ -168,6 +171,9 @@ class LearnedLikelihood(SubModel):
             raise ValueError("with a reading_key the network sees the innovation, which has no loc; pass scale alone.")
         if angles and reading_key is None:
             raise ValueError("angles are those of an innovation, which needs a reading_key.")
+        check_count("encoding_dim", encoding_dim)
+        check_count("observation_dim", observation_dim)
+        check_dims("angles", angles, observation_dim)
         if network is None:
             network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
         in_keys = [key for key in (encoding_key, predicted_key, reading_key) if key is not None]
@@ -175,8 +181,10 @@ class LearnedLikelihood(SubModel):
         self.bound, self.observation_dim = bound, observation_dim
         self.angles = list(angles)
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
+        self.observed_key = unravel_key(observed_key)
         for name, value, default in (("loc", loc, 0.0), ("scale", scale, 1.0)):
             value = as_floating(default if value is None else value)
+            check_values(name, value, above=0 if name == "scale" else None)
             self.register_buffer(name, value.expand(observation_dim).clone())
 
     def without_reading(self, encoding, predicted, *_):

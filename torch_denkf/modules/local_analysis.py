@@ -8,6 +8,7 @@ from typing import Unpack
 
 import torch
 
+from torch_denkf._checks import check_values
 from torch_denkf.functional import (
     Neighbours,
     align_angles,
@@ -82,6 +83,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
+        check_values("near's taper", near.taper, least=0)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile

@@ -11,6 +11,7 @@ from torch import nn
 
 from torch_denkf.functional import semidefinite_root, weighted_mean
 from torch_denkf.modules._base import Call, Entries, SubModel, reads, run_module
+from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["NoisyTransition"]
 
@@ -78,6 +79,7 @@ class NoisyTransition(SubModel):
         )
         self.log_weight_key = unravel_key(log_weight_key)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
+        check_dims("dims", dims or ())
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):

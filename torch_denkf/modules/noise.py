@@ -9,8 +9,15 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number, check_values
 from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant, variance_and_floor
+from torch_denkf.modules._tensors import (
+    as_standard_deviations,
+    mean_of_members,
+    register_location,
+    register_scale,
+    variance_and_floor,
+)
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise", "MemberGain"]
@@ -61,6 +68,7 @@ class DiagonalNoise(SubModel):
         in_key: NestedKey = ("sensor", "ensemble"),
         out_key: NestedKey = ("sensor", "noise"),
     ):
+        check_count("observation_dim", observation_dim)
         in_features = observation_dim if in_features is None else in_features
         network = StochasticMLP(in_features, observation_dim, num_cells, layer="none", output_gain=0.0)
         super().__init__(network, [in_key], [out_key])
@@ -68,8 +76,8 @@ class DiagonalNoise(SubModel):
         variance, floor = variance_and_floor("DiagonalNoise", observation_dim, r, floor)
         self.register_buffer("variance", variance)
         self.register_buffer("floor", floor)
-        register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
-        register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
+        register_location(self, "loc", torch.zeros(in_features) if loc is None else loc)
+        register_scale(self, "scale", torch.ones(in_features) if scale is None else scale)
 
     def compute(self, features, *, batch_size):
         """The variances."""
@@ -106,10 +114,9 @@ class ConstantNoise(SubModel):
         out_key: NestedKey = ("sensor", "noise"),
     ):
         super().__init__(nn.Identity(), [in_key], [out_key])
-        r = as_floating(r)
-        if r.ndim != 1 or not (r >= 0).all() or (trainable and not (r > 0).all()):
-            what = "positive (it is trainable)" if trainable else "non-negative"
-            raise ValueError(f"ConstantNoise needs one {what} standard deviation a dimension; got r = {r}.")
+        r = as_standard_deviations("r", r)
+        if trainable:
+            check_values("r, a trainable standard deviation,", r, above=0)
         self.observation_dim = r.numel()
         log_variance = 2 * r.log()
         if trainable:
@@ -148,8 +155,7 @@ class ScaledNoise(SubModel):
     """
 
     def __init__(self, noise: TensorDictModuleBase, factor: float = 1.0):
-        if factor < 0:
-            raise ValueError(f"ScaledNoise needs a factor that is not negative; got {factor}.")
+        check_number("factor", factor, least=0)
         needed, optional = reads(noise)
         super().__init__(noise, needed, noise.out_keys, optional_keys=optional)
         self.factor = factor
@@ -203,9 +209,9 @@ class MemberGain(SubModel):
         out_key: NestedKey | None = None,
     ):
         super().__init__(nn.Identity(), [in_key], [in_key if out_key is None else out_key])
-        std = as_floating(std)
-        if std.ndim != 1 or not (std > 0).all():
-            raise ValueError(f"MemberGain needs one positive standard deviation a dimension; got {std}.")
+        std = as_standard_deviations("std", std)
+        check_values("std, a standard deviation,", std, above=0)
+        check_count("ensemble_size", ensemble_size, least=2)
         self.log_std = nn.Parameter(std.log())
         generator = torch.Generator().manual_seed(seed)
         levels = (torch.arange(ensemble_size, dtype=std.dtype) + 0.5) / ensemble_size

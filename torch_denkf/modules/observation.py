@@ -8,8 +8,9 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf._checks import check_values
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 
 __all__ = ["LearnedObservation", "LinearObservation", "Select"]
@@ -63,8 +64,8 @@ class LearnedObservation(MemberNetwork):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(network, [in_key], [out_key])
-        register_constant(self, "loc", loc)
-        register_constant(self, "scale", scale)
+        register_location(self, "loc", loc)
+        register_scale(self, "scale", scale)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns the mean network's observation of states ``[*, S]``, as ``[*, O]``."""
@@ -102,6 +103,7 @@ class Select(_Observation):
         out_key: NestedKey = ("forecast", "observation"),
     ):
         super().__init__(nn.Identity(), in_key, out_key)
+        check_dims("dims", dims)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
@@ -133,6 +135,9 @@ class LinearObservation(_Observation):
     ):
         super().__init__(nn.Identity(), in_key, out_key)
         register_constant(self, "matrix", matrix)
+        if self.matrix.ndim != 2:
+            raise ValueError(f"matrix must be [O, S], got {list(self.matrix.shape)}")
+        check_values("matrix", self.matrix)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns ``H x`` of states ``[*, S]``."""

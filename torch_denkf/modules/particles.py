@@ -19,6 +19,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import (
     align_angles,
     effective_sample_size,
@@ -104,7 +105,7 @@ class ResampledTransition(SubModel):
         out_past_key: the new past ``[*B, E, L, S]``.
 
     Raises:
-        ValueError: on an unknown ``scheme``, or one that has no use for ``jitter`` or ``past_key``.
+        ValueError: on an unknown ``scheme``, one without use for ``jitter`` or ``past_key``, or numbers out of range.
         KeyError: if an entry is missing.
 
     Example:
@@ -134,6 +135,12 @@ class ResampledTransition(SubModel):
     ):
         if scheme not in ("systematic", "soft", "transport", None):
             raise ValueError(f'scheme is "systematic", "soft", "transport" or None; got {scheme!r}.')
+        check_number("alpha", alpha, least=0, most=1)
+        check_number("epsilon", epsilon, above=0)
+        check_count("iterations", iterations)
+        if ess_threshold is not None:
+            check_number("ess_threshold", ess_threshold, least=0, most=1, cure="It is a share of E")
+        check_number("jitter", jitter, least=0)
         if jitter and (scheme not in ("systematic", "soft") or jitter < 0):
             raise ValueError(
                 f'jitter moves the copies apart that "systematic" and "soft" resampling make, 0 or more; got {jitter} '
@@ -251,7 +258,8 @@ class ParticleAnalysis(SubModel):
     r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
 
     Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
-    errors. Where nothing is observed the weights stay, exactly.
+    errors. Where nothing is observed the weights stay, exactly, and so they do where no particle can explain the
+    reading: the log-likelihood is then minus infinity.
 
     Args:
         likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
@@ -301,6 +309,7 @@ class ParticleAnalysis(SubModel):
             + [(info_key, name) for name in diagnostics],
             optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
+        check_number("tempering", tempering, above=0)
         self.tempering, self.info_key = tempering, info_key
         self.angles: list[int] = [] if likelihood is None else likelihood.angles
         self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
@@ -314,8 +323,9 @@ class ParticleAnalysis(SubModel):
         """The belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
-        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed.
-        seen = (log_likelihood != 0).any(-1, keepdim=True)
+        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed. Where no
+        # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
+        seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
         return (
             particles,
@@ -323,7 +333,7 @@ class ParticleAnalysis(SubModel):
             weighted_mean(particles, log_weights),
             weighted_var(particles, log_weights),
             effective_sample_size(log_weights).unsqueeze(-1),
-            torch.where(seen, total, torch.zeros_like(total)),
+            torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
             *(self._innovation(prior, *of_reading) if of_reading else ()),
         )
 

@@ -15,12 +15,20 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import unicycle_jacobians
 from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules._tensors import as_floating, mean_of_members, register_constant, variance_and_floor
+from torch_denkf.modules._tensors import (
+    as_floating,
+    mean_of_members,
+    register_constant,
+    register_location,
+    register_scale,
+    variance_and_floor,
+)
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.unicycle import keys_of_dt
+from torch_denkf.modules.unicycle import check_dt, keys_of_dt
 
 __all__ = ["CholeskyNoise", "MappedNoise", "UnicycleNoise", "as_process_noise"]
 
@@ -106,6 +114,7 @@ class CholeskyNoise(SubModel):
         in_key: NestedKey = _BELIEF_MEAN,
         out_key: NestedKey = _FORECAST_NOISE,
     ):
+        check_count("dim", dim)
         in_features, size = dim if in_features is None else in_features, dim * (dim + 1) // 2
         network = (
             nn.Identity() if constant else StochasticMLP(in_features, size, num_cells, layer="none", output_gain=0.0)
@@ -117,8 +126,8 @@ class CholeskyNoise(SubModel):
             self.raw = nn.Parameter(torch.zeros(size, dtype=variance.dtype))
         self.register_buffer("std", variance.sqrt())
         self.register_buffer("floor", floor)
-        register_constant(self, "loc", torch.zeros(in_features) if loc is None else loc)
-        register_constant(self, "scale", torch.ones(in_features) if scale is None else scale)
+        register_location(self, "loc", torch.zeros(in_features) if loc is None else loc)
+        register_scale(self, "scale", torch.ones(in_features) if scale is None else scale)
         self.register_buffer("rows", torch.tril_indices(dim, dim), persistent=False)
 
     def compute(self, features, *, batch_size):
@@ -188,6 +197,9 @@ class MappedNoise(_MappedNoise):
     def __init__(self, noise: TensorDictModuleBase, matrix: torch.Tensor):
         super().__init__(noise, [])
         register_constant(self, "matrix", matrix)
+        if self.matrix.ndim != 2:
+            raise ValueError(f"matrix must be [S, N], got {list(self.matrix.shape)}")
+        check_values("matrix", self.matrix)
 
     def _matrix(self, entries):
         return self.matrix
@@ -229,6 +241,7 @@ class UnicycleNoise(_MappedNoise):
         belief_key: NestedKey = _BELIEF_MEAN,
         forecast_key: NestedKey = ("forecast", "mean"),
     ):
+        check_dt(dt)
         super().__init__(noise, [belief_key, forecast_key, *keys_of_dt(dt)])
         self.belief_key, self.forecast_key, self.dt = unravel_key(belief_key), unravel_key(forecast_key), dt
 

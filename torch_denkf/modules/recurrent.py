@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
+from torch_denkf._checks import check_count, check_number, check_values
 from torch_denkf.functional import unicycle_jacobians, unicycle_move
 from torch_denkf.modules._base import SubModel, reads, run_module
 from torch_denkf.modules._tensors import as_floating, mean_of_members
-from torch_denkf.modules.unicycle import keys_of_dt
+from torch_denkf.modules.unicycle import check_dt, keys_of_dt
 
 __all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
 
@@ -46,6 +47,8 @@ class WithMemory(SubModel):
     def __init__(
         self, initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_key: str = "belief"
     ):
+        check_count("hidden_size", hidden_size)
+        check_count("num_layers", num_layers)
         out_keys = [(belief_key, name) for name in _MEMORY]
         needed, optional = reads(initial)
         super().__init__(initial, needed, [*initial.out_keys, *out_keys], optional_keys=optional)
@@ -170,6 +173,10 @@ class LSTMUpdate(SubModel):
         if encoding_key is None and observation_key is None:
             raise ValueError("An LSTM needs something to read: give encoding_key and features, or observation_key.")
         in_size = features + observation_dim + (observation_dim or 1) + extra_features
+        for name, size in (("state_dim", state_dim), ("hidden_size", hidden_size), ("num_layers", num_layers)):
+            check_count(name, size)
+        check_number("floor", floor, least=0)
+        check_number("inflation", inflation, above=0)
         cells = [LSTMCell(hidden_size if layer else in_size, hidden_size) for layer in range(num_layers)]
         heads = {"mean": nn.Linear(hidden_size, state_dim), "var": nn.Linear(hidden_size, state_dim)}
         nn.init.zeros_(heads["var"].weight)
@@ -184,7 +191,8 @@ class LSTMUpdate(SubModel):
         self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
         self.in_size, self.num_layers, self.hidden_size = in_size, num_layers, hidden_size
         self.floor, self.inflation, self.observation_dim = floor, inflation, observation_dim or None
-        self.reading_keys = inputs
+        self.reading_keys, self.observed_key = inputs, unravel_key(observed_key)
+        self.reads_components = encoding_key is None
         for name, value, size, default in (
             ("loc", loc, state_dim, 0.0),
             ("scale", scale, state_dim, 1.0),
@@ -192,6 +200,7 @@ class LSTMUpdate(SubModel):
             ("observation_scale", observation_scale, observation_dim, 1.0),
         ):
             value = as_floating(default if value is None else value)
+            check_values(name, value, above=0 if name.endswith("scale") else None)
             self.register_buffer(name, value.expand(size).clone())
         self.feature_sizes = [size for size in (features, observation_dim) if size]
 
@@ -283,6 +292,7 @@ class UnicyclePose(SubModel):
         forecast_key: str = "forecast",
         belief_key: str = "belief",
     ):
+        check_dt(dt)
         in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS] + keys_of_dt(dt)
         super().__init__(nn.Identity(), in_keys, [(belief_key, name) for name in (*_MOMENTS, "var")])
         self.dt = dt

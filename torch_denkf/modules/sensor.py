@@ -10,8 +10,9 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf._checks import check_count, check_values
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import as_floating, register_constant
+from torch_denkf.modules._tensors import as_floating, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -83,8 +84,9 @@ class _Sensor(StochasticSensor):
             optional_keys=[observed_key],
         )
         self.ensemble_size, self.event_ndim, self.observation_dim = ensemble_size, event_ndim, head.out_features
-        register_constant(self, "loc", 0.0 if loc is None else loc)
-        register_constant(self, "scale", 1.0 if scale is None else scale)
+        check_count("ensemble_size", ensemble_size)
+        register_location(self, "loc", 0.0 if loc is None else loc)
+        register_scale(self, "scale", 1.0 if scale is None else scale)
 
     def _prepare(self, measurement: torch.Tensor) -> torch.Tensor:
         return measurement
@@ -192,6 +194,7 @@ class ImageSensor(_Sensor):
         self._frame_bytes = activation_bytes(trunk, torch.zeros(1, *image_shape))
         for name, value, default in (("pixel_loc", pixel_loc, 0.0), ("pixel_scale", pixel_scale, 1.0)):
             channels = as_floating(default if value is None else value)
+            check_values(name, channels, above=0 if name == "pixel_scale" else None)
             self.register_buffer(name, channels.expand(image_shape[0]).clone()[:, None, None])
         self.standardise = pixel_loc is not None or pixel_scale is not None
         self._looked = False

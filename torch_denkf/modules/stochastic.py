@@ -23,6 +23,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.random_bits import dropout_factor, random_bytes, random_signs, representable_rate
 
@@ -55,6 +56,8 @@ class FlipoutLinear(nn.Module):
 
     def __init__(self, in_features: int, out_features: int, *, posterior_std=0.05, prior_std: float = 1.0):
         super().__init__()
+        check_number("posterior_std", posterior_std, above=0)
+        check_number("prior_std", prior_std, above=0)
         self.in_features, self.out_features = in_features, out_features
         self.prior_std = prior_std
         mean = nn.Linear(in_features, out_features)
@@ -117,7 +120,7 @@ class StochasticMLP(nn.Module):
         all rows, or ``[*B, P]`` with ``x`` ``[*B, E, in_features]``.
 
     Raises:
-        ValueError: if ``layer`` is none of the three.
+        ValueError: if ``layer`` is none of the three, or a number is out of range.
 
     Example:
         >>> net = StochasticMLP(5, 2)
@@ -141,6 +144,11 @@ class StochasticMLP(nn.Module):
         super().__init__()
         if layer not in ("dropout", "flipout", "none"):
             raise ValueError(f'layer is "dropout", "flipout" or "none"; got {layer!r}.')
+        for name, size in (("in_features", in_features), ("out_features", out_features)):
+            check_count(name, size)
+        for size in num_cells:
+            check_count("num_cells", size, cure=f"It holds the widths of the hidden layers: {list(num_cells)}")
+        check_number("output_gain", output_gain)
         self.layer, self.rate = layer, representable_rate(rate)
         self.sample = True
         sizes = [in_features, *num_cells, out_features]

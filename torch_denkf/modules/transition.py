@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["LearnedTransition", "MemberNetwork"]
@@ -86,10 +86,10 @@ class LearnedTransition(MemberNetwork):
         in_keys = [in_key] if action_key is None else [in_key, action_key]
         super().__init__(network, in_keys, [out_key])
         self.residual, self.action_key = residual, action_key
-        register_constant(self, "loc", loc)
-        register_constant(self, "scale", scale)
-        register_constant(self, "action_loc", action_loc)
-        register_constant(self, "action_scale", action_scale)
+        register_location(self, "loc", loc)
+        register_scale(self, "scale", scale)
+        register_location(self, "action_loc", action_loc)
+        register_scale(self, "action_scale", action_scale)
 
     def compute(self, state, action=None, *, noise):
         """The forecast ensemble."""

@@ -7,6 +7,7 @@ from typing import Unpack
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf._checks import check_number
 from torch_denkf.functional.unscented import (
     UnscentedWeights,
     sigma_points,
@@ -77,6 +78,8 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         **keys: Unpack[GaussianTransitionKeys],
     ):
         super().__init__(transition, process_noise, **keys)
+        for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+            check_number(name, value, above=0 if name == "alpha" else None)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _forecast(self, entries, mean, cov, call, wanted):
@@ -120,6 +123,8 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         **options: Unpack[GaussianAnalysisOptions],
     ):
         super().__init__(observation, **options)
+        for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+            check_number(name, value, above=0 if name == "alpha" else None)
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _update(self, entries, mean, cov, observation, noise, call):

@@ -8,9 +8,10 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf._checks import check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.pairs import within_pair
 from torch_denkf.modules.transition import MemberNetwork
 
@@ -43,7 +44,8 @@ class UnicycleTransition(MemberNetwork):
         out_key: forecast ensemble ``[*B, E, 5]``.
 
     Raises:
-        ValueError: if the state does not have five dimensions.
+        ValueError: if ``dt`` or ``scale`` is not positive, ``loc`` is not finite, or the state does not have five
+            dimensions.
 
     Example:
         >>> from tensordict import TensorDict
@@ -65,12 +67,13 @@ class UnicycleTransition(MemberNetwork):
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
+        check_dt(dt)
         histories = [] if history_key is None else [history_key]
         super().__init__(velocity, [in_key, *histories, *keys_of_dt(dt)], [out_key])
         self.dt, self.drift = dt, drift
         self.raw_trend = None if history_key is None else nn.Parameter(torch.full((2,), -2.0))
-        register_constant(self, "loc", loc)
-        register_constant(self, "scale", scale)
+        register_location(self, "loc", loc)
+        register_scale(self, "scale", scale)
 
     def compute(self, state, *others, noise):
         """The forecast ensemble."""
@@ -141,6 +144,7 @@ class UnicycleMotion(SubModel):
         steps_key: NestedKey = "steps",
         smooth: bool = False,
     ):
+        check_dt(dt)
         if smooth and history_key is None:
             raise ValueError("UnicycleMotion(smooth=True) corrects a history; pass its history_key.")
         histories = [] if history_key is None else [history_key]
@@ -177,6 +181,21 @@ class UnicycleMotion(SubModel):
 def keys_of_dt(dt: float | NestedKey) -> list[NestedKey]:
     """The key of the time step, if it is no number."""
     return [] if isinstance(dt, (int, float)) else [dt]
+
+
+def check_dt(dt: float | NestedKey) -> None:
+    """Raises unless a time step is a positive number, or a key.
+
+    Raises:
+        ValueError: if it is a number that is not positive.
+        TypeError: if it is neither.
+    """
+    if not isinstance(dt, (str, tuple)):
+        check_number("dt", dt, least=0, cure="It is the time step in seconds, or the key of one")
+        if not isinstance(dt, (int, float)):
+            raise TypeError(
+                f"dt must be a number of seconds or a key, got {dt!r} ({type(dt).__name__}); pass float(dt)"
+            )
 
 
 def for_members(dt: float | torch.Tensor) -> float | torch.Tensor:

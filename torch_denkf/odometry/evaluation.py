@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
 from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_devkit_error, kitti_endpoint_error
 from torch_denkf.odometry.car import VELOCITIES, CarFilter
@@ -203,7 +204,7 @@ def _line(title: str, rows: Sequence[dict[str, Any]]) -> str:
 
 def write_rows(rows: Sequence[dict[str, Any]], file: str | Path) -> None:
     """Writes rows of :func:`evaluate_car_filter` as CSV, with ``COLUMNS``; what a row lacks stays empty."""
-    with Path(file).open("w", newline="") as stream:
+    with replacing(file) as beside, beside.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from torch_denkf.data.kitti.files import read_calibration
+from torch_denkf.data.pictures import is_bomb
 
 __all__ = ["FrameSource", "read_camera", "read_frames", "read_times"]
 
@@ -125,7 +126,8 @@ class FrameSource:
             yield from (image for _, image in self._video())
             return
         for file in self._files:
-            image = None if file is None else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_ANYCOLOR)
+            data = np.zeros(0, np.uint8) if file is None else np.fromfile(file, np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if len(data) and not is_bomb(data.tobytes()) else None
             if file is not None and image is None:
                 warnings.warn(f"{file} cannot be read as an image; its frame counts as missing", stacklevel=2)
             yield image

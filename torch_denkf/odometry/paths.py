@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._files import clear_errors, sync
 from torch_denkf.functional import ensemble_cov
 from torch_denkf.odometry.tracking import TrackedBelief
 
@@ -23,7 +26,9 @@ PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name
 def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
     """Writes beliefs to a CSV file as they come, and hands them on.
 
-    What was written is there when the work is broken off. Numbers have nine digits, which float32 needs to be exact.
+    Rows are in ``FILE.part`` while they come, each when its belief does. That file takes the place of ``file`` at the
+    end, or when the work is broken off: what was written is there, and what was there before is not lost to a full
+    disk. Numbers have nine digits, which float32 needs to be exact.
 
     Args:
         beliefs: from :func:`torch_denkf.odometry.track`.
@@ -33,7 +38,7 @@ def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[T
         The beliefs.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
 
     Example:
         >>> import tempfile
@@ -45,17 +50,33 @@ def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[T
         tensor([[4., 4., 4., 4., 4.]], dtype=torch.float64)
     """
     file = Path(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(PATH_COLUMNS)
-        for belief in beliefs:
-            covariance = float(ensemble_cov(belief.ensemble[:, :2])[0, 1])
-            numbers = [*belief.mean.tolist(), *belief.var.sqrt().tolist(), covariance]
-            time = f"{belief.time:.9g}"
-            writer.writerow([belief.frame, time, int(belief.observed), *(f"{value:.9g}" for value in numbers)])
-            stream.flush()
-            yield belief
+    part, sound = file.with_name(f"{file.name}.part"), False
+    with clear_errors(file, beside=part):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with part.open("w", newline="") as stream:
+                writer = csv.writer(stream)
+                writer.writerow(PATH_COLUMNS)
+                for belief in beliefs:
+                    sound = False
+                    writer.writerow(_row(belief))
+                    stream.flush()
+                    sound = True
+                    yield belief
+            sound = True
+        finally:
+            if sound:
+                sync(part)
+                os.replace(part, file)
+                sync(file.parent)
+            else:
+                part.unlink(missing_ok=True)
+
+
+def _row(belief: TrackedBelief) -> list[Any]:
+    covariance = float(ensemble_cov(belief.ensemble[:, :2])[0, 1])
+    numbers = [*belief.mean.tolist(), *belief.var.sqrt().tolist(), covariance]
+    return [belief.frame, f"{belief.time:.9g}", int(belief.observed), *(f"{value:.9g}" for value in numbers)]
 
 
 def read_path(file: str | Path) -> TensorDict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -38,12 +39,12 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes ``[H, W, 3]`` RGB frames as MPEG-4 with OpenCV.
 
     Raises:
-        OSError: if OpenCV cannot open the file.
+        OSError: if OpenCV cannot write the file; it does not say why.
         ValueError: without frames, and for frames of several sizes.
     """
     import cv2
 
-    writer = None
+    writer, written = None, 0
     try:
         for frame in _of_one_size(frames):
             height, width = frame.shape[:2]
@@ -53,9 +54,16 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
                 if not writer.isOpened():
                     raise OSError(f"OpenCV cannot write {file}; pass a .gif, or look at the folder's permissions")
             writer.write(np.ascontiguousarray(frame[..., ::-1]))
+            written += 1
     finally:
         if writer is not None:
             writer.release()
+    # OpenCV passes over what it cannot write: a full disk shows when the file is read.
+    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    whole = capture.isOpened() and round(capture.get(cv2.CAP_PROP_FRAME_COUNT)) >= written
+    capture.release()
+    if not whole:
+        raise OSError(errno.EIO, "OpenCV could not write all frames")
 
 
 def write_gif(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:

@@ -86,12 +86,15 @@ class Scene:
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def _shrink_labels(self) -> None:
-        """Makes the bands' names fit beside their Axes."""
+        """Makes the bands' names fit beside their Axes, all of one size."""
         self.figure.draw_without_rendering()
-        for axes in self.bands:
-            label = axes.yaxis.label
-            room = axes.get_window_extent().height / max(label.get_window_extent().height, 1)
-            label.set_fontsize(label.get_fontsize() * min(1.0, room))
+        labels = [axes.yaxis.label for axes in self.bands]
+        needed = [label.get_window_extent().height for label in labels]
+        room = [
+            axes.get_window_extent().height / max(height, 1.0) for axes, height in zip(self.bands, needed, strict=True)
+        ]
+        for label in labels:
+            label.set_fontsize(float(label.get_fontsize()) * min(1.0, *room))
 
     def _picture(self) -> np.ndarray:
         self.canvas.draw()

@@ -11,6 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from torch_denkf._files import replacing
 from torch_denkf.plots._axes import times_of
 from torch_denkf.plots._belief import Truth, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
@@ -38,7 +39,7 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         ImportError: for a GIF without pillow; the message names the extra.
         ValueError: for another ending, without frames, for frames of several sizes or other shapes, and for ``fps``
             out of range.
-        OSError: if the file cannot be written.
+        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
 
     Example:
         >>> import tempfile
@@ -52,8 +53,8 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         raise ValueError(f"a video ends with .mp4 or .gif; got {file.name!r}")
     if not fps > 0 or (file.suffix.lower() == ".gif" and fps > 50):
         raise ValueError(f"fps must be positive, and at most 50 for a GIF; got {fps}")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    writers[file.suffix.lower()](file, (as_picture(frame) for frame in frames), fps)
+    with replacing(file) as beside:
+        writers[file.suffix.lower()](beside, (as_picture(frame) for frame in frames), fps)
     return file
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from torch_denkf._files import write_text
 from torch_denkf.deployment.folder import CONFIG, load_folder, save_folder
 from torch_denkf.filters import Filter
 from torch_denkf.pretrained.models import BUILDERS
@@ -109,5 +110,5 @@ def save_pretrained(
         )
     folder = save_folder(model, folder, builder=builder, settings=settings, training=training)
     if card is not None:
-        (folder / "card.md").write_text(card)
+        write_text(folder / "card.md", card)
     return folder

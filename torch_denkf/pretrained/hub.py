@@ -1,4 +1,4 @@
-"""Filters on the Hugging Face Hub, where ``huggingface_hub`` is installed: ``pip install huggingface_hub``."""
+"""Filters on the Hugging Face Hub, where ``huggingface_hub`` is installed: ``pip install 'torch_denkf[hub]'``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ except ImportError:
 
         def __new__(cls, *_: Any, **__: Any):
             """Says what is missing."""
-            raise ImportError(f"{cls.__name__} needs huggingface_hub: pip install huggingface_hub")
+            raise ImportError(f"{cls.__name__} needs huggingface_hub: pip install 'torch_denkf[hub]'")
 
         from_pretrained = classmethod(__new__)
 
@@ -29,7 +29,7 @@ except ImportError:
 __all__ = ["HubFilter"]
 
 
-class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):  # type: ignore[call-arg]
+class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):
     """A filter with ``push_to_hub``, ``save_pretrained`` and ``from_pretrained`` of ``huggingface_hub``'s mixin.
 
     The files are those of :func:`~torch_denkf.pretrained.save_pretrained`: data only, with a checksum.

@@ -141,6 +141,7 @@ def options_of(filter: Filter) -> dict:
         "forecast_keys": filter.forecast_keys,
         "variance_ceiling": filter.variance_ceiling,
         "check_finite": filter.check_finite,
+        "reject": filter.reject,
     }
 
 

@@ -9,7 +9,7 @@ from tensordict import unravel_key
 from torch import Tensor
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters._steps import previous_key
+from torch_denkf.filters._structure import previous_key
 from torch_denkf.functional import backward_smooth, cholesky, weighted_mean
 from torch_denkf.modules import NoisyTransition, ResampledTransition
 from torch_denkf.modules._base import Call, Entries, run_module

@@ -5,13 +5,15 @@ torchrl's own ``Checkpoint`` has neither checksums nor a sync with the disk, and
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from torch_denkf._files import write_bytes
 
 __all__ = ["read_checkpoint", "write_checkpoint"]
 
@@ -22,8 +24,11 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
     """Writes ``content`` beside ``file`` and then puts it in its place: a kill leaves the old file or the new one.
 
     Args:
-        file: path; its folder exists.
+        file: path; its folder is made.
         content: tensors, state dicts and plain values, nested as you like.
+
+    Raises:
+        OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -32,13 +37,9 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
         >>> read_checkpoint(file)["model"]
         {'weight': tensor([1.])}
     """
-    file = Path(file)
-    beside = file.with_name(file.name + ".part")
-    with beside.open("wb") as stream:
-        torch.save({"format": _FORMAT, **content}, stream)
-        stream.flush()
-        os.fsync(stream.fileno())  # else a power failure could put an empty file in the place of a good one
-    os.replace(beside, file)
+    memory = io.BytesIO()  # torch.save to a disk that is full fails with another error, or ends the process
+    torch.save({"format": _FORMAT, **content}, memory)
+    write_bytes(file, memory.getbuffer())
 
 
 def read_checkpoint(file: Path | str) -> dict[str, Any]:
@@ -57,6 +58,8 @@ def read_checkpoint(file: Path | str) -> dict[str, Any]:
     cure = "move it away to start anew, or restore it from a copy"
     try:
         with zipfile.ZipFile(file) as archive:  # torch.load does not look at the checksums
+            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                raise ValueError("its parts are compressed, and could be of any size; torch stores them as they are")
             damaged = archive.testzip()
         content = torch.load(file, map_location="cpu", weights_only=True) if damaged is None else None
     except Exception as error:  # zipfile, torch and pickle have a dozen kinds for a file cut short

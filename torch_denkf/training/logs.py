@@ -9,6 +9,8 @@ from pathlib import Path
 from torchrl.record.loggers import CSVLogger, TensorboardLogger
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._files import clear_errors
+
 __all__ = ["RunLogs"]
 
 _KINDS = {
@@ -64,21 +66,35 @@ class RunLogs:
         self._own = [_KINDS[name][0](exp_name=name, log_dir=str(self.folder)) for name in names]
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Writes scalars."""
+        """Writes scalars.
+
+        Raises:
+            OSError: if they cannot be written, as on a full disk; names the folder and the free space.
+        """
+        with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
+            self._log(values, step)
+
+    def files(self) -> list[Path]:
+        """The files that the loggers made here write."""
+        return [file for file, _ in self._files()]
+
+    def _log(self, values: Mapping[str, float], step: int) -> None:
         for logger in (*self._own, *(logger for logger in self._wanted if not isinstance(logger, str))):
             logger.log_metrics(dict(values), step=step)
 
     def mark(self) -> dict[str, int]:
         """The sizes of all files in bytes, as they are now."""
-        for logger in self._own:
-            logger.flush()
+        with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
+            for logger in self._own:
+                logger.flush()
         return {name: file.stat().st_size for file, name in self._files()}
 
     def close(self) -> None:
         """Closes the loggers made here."""
-        for logger in self._own:
-            logger.close()
-        self._own = []
+        own, self._own = self._own, []
+        with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
+            for logger in own:
+                logger.close()
 
     def _files(self) -> list[tuple[Path, str]]:
         # Only what these loggers write: the folder may hold files of other people.

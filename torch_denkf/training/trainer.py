@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,9 +13,11 @@ from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.record.loggers.common import Logger
 
+from torch_denkf._lock import locked
 from torch_denkf._progress import progress_bar
 from torch_denkf.training.checkpoint import check_settings, read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
+from torch_denkf.training.earlier import set_aside
 from torch_denkf.training.hooks import HookPoints
 from torch_denkf.training.logs import RunLogs
 from torch_denkf.training.stage import Stage, only_trainable
@@ -40,7 +43,8 @@ class FilterTrainer(HookPoints):
     CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
     outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
-    logger ``"torch_denkf"`` says so.
+    logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an earlier run left is not overwritten: it
+    is moved to ``out/earlier-1``. One process at a time trains in ``out``.
 
     **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
     another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
@@ -143,7 +147,7 @@ class FilterTrainer(HookPoints):
         """Trains to the end; where a checkpoint is, from there.
 
         Args:
-            resume: ``False`` removes what an earlier run left in ``out`` and starts anew.
+            resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and starts anew.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
@@ -151,8 +155,15 @@ class FilterTrainer(HookPoints):
 
         Raises:
             ValueError: if the checkpoint is damaged, or of another training; the message names the file.
+            OSError: if another process trains in ``out``, or if it cannot be written to; names the folder and the
+                process, or the file and the free space.
             FloatingPointError: if too many updates in a row are not finite; names stage and update.
         """
+        alone = locked(self.out, ".training", "is training in it") if self.processes.is_main else nullcontext()
+        with alone:
+            return self._fit(resume)
+
+    def _fit(self, resume: bool) -> dict[str, dict[str, Any]]:
         state = self.processes.share(self._open(resume) if self.processes.is_main else {})
         self._load_model(state["model"], str(self.last_checkpoint))
         self._results, self._best = state["results"], state["best"]
@@ -285,8 +296,11 @@ class FilterTrainer(HookPoints):
                     self.out,
                 )
             return state
-        for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
-            file.unlink(missing_ok=True)
+        if self.last_checkpoint.exists():  # the caller wants to start anew
+            for file in (self.last_checkpoint, *self.out.glob("best_*.pt")):
+                file.unlink(missing_ok=True)
+        else:
+            set_aside(self.out, [*self.out.glob("best_*.pt"), *self._logs.files()])
         self._logs.open({})
         state = {"stage": 0, "update": 0, "updates": None, "results": {}, "best": None, "last_metrics": {}, "hooks": {}}
         return {**state, "model": self._model_on_cpu()}

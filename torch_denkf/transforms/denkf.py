@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 
@@ -14,8 +15,10 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters._one_step import first_belief
+from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
-from torch_denkf.filters.base import where_rows
+from torch_denkf.filters._steps import where_rows
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
@@ -58,11 +61,14 @@ class DEnKFTransform(Transform):
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
-        check_finite: whether a non-finite observation, forecast or belief raises. Costs one synchronisation a step.
-        packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step`: at B=1 ten
-            times as fast as the filter itself, with the parameters that it had when it was exported, for environments
-            of the batch size of the export, and not inside a worker, because it cannot be pickled. Resets and specs
-            come from ``filter``.
+        check_finite: whether a reading or a belief that is not finite raises, and a reading larger than 1e18. Costs two
+            synchronisations a step. ``False`` instead counts such readings as not observed in an environment, see
+            ``reject`` of
+            :class:`~torch_denkf.filters.Filter`; ``diagnostics=[("info", "rejected")]`` keeps their number.
+        packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
+            load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
+            parameters of its export, is for environments of the batch size of the export, and not for use inside a
+            worker, because it cannot be pickled. Resets and specs come from ``filter``.
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``, or cannot be
@@ -105,9 +111,11 @@ class DEnKFTransform(Transform):
         if lag is not None:
             filter = FixedLag(filter, lag)
         self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
-        unknown = [key for key in self._keep if key not in filter.out_keys]
+        self._reject = filter.reject or not check_finite
+        written = [*filter.out_keys, *([REJECTED] if self._reject else [])]
+        unknown = [key for key in self._keep if key not in written]
         if unknown:
-            raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(filter.out_keys)}.")
+            raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {written}.")
         structure = filter.structure
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
         dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var", "age")]
@@ -123,6 +131,12 @@ class DEnKFTransform(Transform):
             raise ValueError("A packaged step records no graph; leave out packaged=, or no_grad=False.")
         self._packaged = None
         if packaged is not None:
+            if self._reject and ".".join(REJECTED) not in packaged.outputs:
+                warnings.warn(
+                    "The packaged step rejects no readings: one NaN spoils the belief until the next reset. Export it "
+                    "from a filter with reject=True, or leave check_finite on.",
+                    stacklevel=2,
+                )
             self._packaged = PackagedRun(
                 packaged,
                 carry={key: self._names[key] for key in filter.carry_keys},
@@ -141,8 +155,8 @@ class DEnKFTransform(Transform):
         if self._packaged is not None:
             kept = self._packaged(tensordict, next_tensordict)
             if kept is not None:  # otherwise what follows says what is missing
-                if self.check_finite and not all(torch.isfinite(kept[key]).all() for key in self.filter.carry_keys):
-                    self._assert_finite({**_present(next_tensordict, self.in_keys), **kept})
+                if self.check_finite:
+                    self._assert_finite({**_present(next_tensordict, (*self.in_keys, *self._optional)), **kept})
                 return self._emit(kept, next_tensordict)
         entries = {}
         for key in self.filter.carry_keys:
@@ -162,7 +176,7 @@ class DEnKFTransform(Transform):
                 entries[key] = value
         say_ignored_mask(self.filter, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
-            written = self.filter.take_step(entries, next_tensordict.batch_size)
+            written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
         if self.check_finite:
             self._assert_finite({**entries, **written})
         return self._emit(written, next_tensordict)
@@ -175,7 +189,7 @@ class DEnKFTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
-            start = self.filter.initialise(tensordict_reset.copy())
+            start = first_belief(self.filter, tensordict_reset.copy(), reject=self._reject)
             if any(start.get(key, None) is None for key in self._keep):
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
                 template = self._trial(start.copy())
@@ -188,7 +202,8 @@ class DEnKFTransform(Transform):
                 start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
             start = self.filter.summarise(start)
         if self.check_finite:
-            self._assert_finite(_present(start, (*self.in_keys, *self.filter.carry_keys)))
+            entries = _present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys))
+            self._assert_finite(entries, used=self.filter.update_at_reset)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(key))
         return tensordict_reset
@@ -209,7 +224,7 @@ class DEnKFTransform(Transform):
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
-        return self.filter.take_step(self.filter.entries_of(row), row.batch_size)
+        return self.filter.take_step(self.filter.entries_of(row), row.batch_size, reject=self._reject)
 
     def _copy(self, source: TensorDictBase, target: dict | TensorDictBase, keys, owner: str) -> None:
         for key in keys:
@@ -225,16 +240,22 @@ class DEnKFTransform(Transform):
             else:
                 target.set(key, value)
 
-    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor]) -> None:
-        if all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys):
+    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
+        """Raises where the belief is not finite, or a reading that was ``used`` is not."""
+        finite = all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys)
+        absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
+        if finite and not absurd:
             return
         given = {key: entries[key] for key in self.in_keys if key in entries}
         inputs = [key for key, value in given.items() if not torch.isfinite(value).all()]
-        if inputs:
+        if inputs or absurd:
+            what = (
+                f"NaN or infinity in {inputs}" if inputs else f"a reading of more than {LARGEST_READING:g} in {absurd}"
+            )
             raise ValueError(
-                f"The belief became non-finite because of NaN or infinity in {inputs}. Where a frame is missing or "
-                f"broken, set {self._optional} to False for it (it is then not read), or repair it in a transform "
-                "before DEnKFTransform."
+                f"The belief became {'not to be trusted' if finite else 'non-finite'} because of {what}. Where a frame "
+                f"is missing or broken, set {self._optional} to False for it (it is then not read), or repair it in a "
+                "transform before DEnKFTransform. With check_finite=False such readings count as missing."
             )
         raise ValueError(
             f"The belief became non-finite although all of {self.in_keys} are finite: the filter diverged. Look at "

@@ -13,12 +13,12 @@ __all__ = ["KITTI_DT", "poses_to_state", "state_to_poses"]
 KITTI_DT = 0.103  # s, the nominal frame time of KITTI's odometry benchmark
 
 
-def poses_to_state(poses: np.ndarray, dt: float) -> np.ndarray:
+def poses_to_state(poses: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
     """Planar state of camera poses, with backward differences.
 
     Args:
         poses: camera-to-world matrices, ``[N, 3, 4]``, in m.
-        dt: time between rows, in s.
+        dt: time between rows, in s: one for all, or ``[N - 1]``.
 
     Returns:
         ``[N, 5]`` float64: x (camera z) and y (minus camera x) in m, θ in rad, left-positive and unwrapped, v in m/s,

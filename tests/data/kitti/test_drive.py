@@ -4,7 +4,6 @@ import math
 import os
 import shutil
 import warnings
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from tensordict import MemoryMappedTensor
 
 import torch_denkf.data.kitti.drive as module
 from tests.real_data import KITTI
-from torch_denkf.data import list_kitti_drives, read_kitti_drive
+from torch_denkf.data import cache_entry, list_kitti_drives, read_kitti_drive
 from torch_denkf.data.kitti.files import read_calibration, read_poses
 from torch_denkf.metrics import dead_reckoning
 from torch_denkf.vision.poses import poses_to_state, state_to_poses
@@ -216,7 +215,8 @@ def test_times_are_nominal_without_a_file(tmp_path):
     torch.testing.assert_close(drive["dt"], torch.full((6, 1), 0.103))
     torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 1 / 0.103))
     (tmp_path / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n0.3\n0.4\n9.0\n")
-    drive = read_kitti_drive(tmp_path, "00", cache=None)
+    with pytest.warns(UserWarning, match=r"times.txt: 1 gaps, the longest of 8.6 s before line 6"):
+        drive = read_kitti_drive(tmp_path, "00", cache=None)
     torch.testing.assert_close(drive["dt"][0], torch.tensor([0.1]))  # the median: one jump does not count
     assert drive["time"][-1] == 9.0
 
@@ -243,23 +243,22 @@ def test_the_cache(tmp_path, monkeypatch):
     assert changed["state"][1, 0] == 2
     # A damaged entry is made anew, and nothing else is left behind.
     for entry in cache.iterdir():
-        (entry / "meta.json").write_text("{")
+        (entry / cache_entry.MANIFEST).write_text("{")
     assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
     assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
-    assert not [entry for entry in root.rglob("*") if "memmap" in entry.name]
+    assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
     assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], MemoryMappedTensor)
 
 
 def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):
     root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
 
-    def killed(self, prefix, **kwargs):
-        Path(prefix).mkdir()
-        (Path(prefix) / "image.memmap").write_bytes(b"half")
+    def killed(folder, content):
+        (folder / "image.bin").write_bytes(b"half")
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(module.TensorDict, "memmap", killed)
+        patch.setattr(cache_entry, "seal_entry", killed)
         with pytest.raises(KeyboardInterrupt):
             read_kitti_drive(root, "00", cache=cache)
     assert list(cache.iterdir()) == []
@@ -316,7 +315,7 @@ def test_errors_name_the_file(tmp_path):
     times.write_text("0\n0.1\n")
     fails(ValueError, r"times.txt has 2 times, but there are 6 posed frames")
     times.write_text("0\n" * 6)
-    fails(ValueError, r"times.txt: the median difference of its times is 0.0 s")
+    fails(ValueError, r"times.txt:2: the time 0 s does not increase, nor do 4 others of 6")
     make(tmp_path)
     calibration = tmp_path / "sequences/00/calib.txt"
     calibration.write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 1 2\n")

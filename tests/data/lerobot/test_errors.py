@@ -1,7 +1,9 @@
 """Recordings that lack something, are damaged, or contradict themselves: errors and warnings name the place."""
 
 import json
+import shutil
 from functools import partial
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -22,6 +24,8 @@ from tests.data.lerobot.lerobot_folder import (
     write_video,
 )
 from torch_denkf.data import LeRobotReplay
+from torch_denkf.data import parquet as parquet_reader
+from torch_denkf.data.pictures import decode_picture
 
 open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 CAMERA = "observation.images.top"
@@ -199,7 +203,12 @@ def test_slices_and_caches(tmp_path):
         )
     assert len(open_all(tmp_path, batch_size=10, slice_len=5, strict_length=False).sample()) > 0
     (tmp_path / "file").write_text("")
-    fails(OSError, r"cannot write to .*file.* pass cache=FOLDER, or cache=None", tmp_path, cache=tmp_path / "file/x")
+    fails(
+        OSError,
+        r"cannot write the cache at .*file.* pass cache=FOLDER or cache=None",
+        tmp_path,
+        cache=tmp_path / "file/x",
+    )
 
 
 def test_damage_in_av1(tmp_path):
@@ -233,3 +242,59 @@ def test_cv2_reads_in_colour(tmp_path):
     pixels = open_all(tmp_path)[:]["pixels"] * 255
     assert (pixels[0].round() == 77).all()
     assert (pixels[1].mean((1, 2)).round() == torch.tensor([3.0, 2, 1])).all()
+
+
+@pytest.mark.parametrize("key", ["data_path", "video_path"])
+@pytest.mark.parametrize("version", [2, 3])
+def test_paths_that_lead_out_of_the_data_set_are_refused(tmp_path, version, key):
+    root, elsewhere = tmp_path / "robot", tmp_path / "elsewhere"
+    write_version_2(root, [4, 4]) if version == 2 else write_version_3(root, [[4, 4]])
+    open_all(root)
+    shutil.copytree(root, elsewhere)
+    file = root / "meta/info.json"
+    info = json.loads(file.read_text())
+    for prefix in ("../elsewhere/", f"{elsewhere}/", "data/../../elsewhere/"):
+        file.write_text(json.dumps({**info, key: prefix + info[key]}))
+        fails(ValueError, rf"info.json: '{key}', '{prefix}.*', leads out of .*; such a file is not read", root)
+    for template in ("{x}", "{0}", "{episode_index:99999999d}", "{", 7):
+        file.write_text(json.dumps({**info, key: template}))
+        fails(ValueError, rf"info.json is malformed: '{key}'", root)
+    file.write_text(json.dumps({**info, key: f"{root}/{info[key]}"}))  # absolute, but inside
+    assert len(open_all(root)) == 8
+
+
+def test_images_and_cameras_outside_of_the_data_set_are_refused(tmp_path):
+    root = tmp_path / "robot"
+    write_version_2(root, [4, 4], images="path")
+    assert len(open_all(root)) == 8
+    file = root / "data/chunk-000/episode_000001.parquet"
+    secret = tmp_path / "secret.png"
+    cv2.imwrite(str(secret), np.zeros((*SIZE, 3), np.uint8))
+    for path in ("../secret.png", str(secret)):
+        paths = pa.array([{"bytes": None, "path": path}] * 4, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+        edit_table(file, **{CAMERA: paths})
+        fails(ValueError, r"frame 0 of episode 1 in .*robot names a file outside of the data set, '.*secret.png'", root)
+    write_info(root, "v2.1", False, cameras=("../../secret",))
+    fails(ValueError, r"info.json, by the name of a camera, names a file outside of the data set", root)
+
+
+def test_bombs_are_refused_before_they_are_unpacked(tmp_path):
+    write_version_2(tmp_path, [4, 4], images="bytes")
+    episodes = tmp_path / "meta/episodes.jsonl"
+    text = episodes.read_text()
+    episodes.write_text('{"episode_index": 0, "length": 1000000000000}\n')
+    fails(ValueError, r"announces 1000000000000 rows, more than the 100000000 that are read", tmp_path)
+    episodes.write_text(text)
+    file = tmp_path / "data/chunk-000/episode_000000.parquet"
+    with patch.object(parquet_reader, "MOST_BYTES", 1000), patch.object(parquet_reader, "MOST_RATIO", 0.01):
+        fails(ValueError, r"episode_000000.parquet has \d+ bytes and announces 4 rows of together \d+ bytes", tmp_path)
+    picture = bytearray(png(np.zeros((*SIZE, 3), np.uint8)))
+    picture[16:24] = (30000).to_bytes(4) + (30000).to_bytes(4)
+    edit_table(file, **{CAMERA: pa.array([{"bytes": bytes(picture), "path": None}] * 4)})
+    fails(ValueError, r"shows none of the 4 frames of episode 0", tmp_path)
+    _, jpeg = cv2.imencode(".jpg", np.zeros((*SIZE, 3), np.uint8))
+    assert decode_picture(jpeg.tobytes()).shape == (*SIZE, 3)
+    data = bytearray(jpeg.tobytes())
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = (30000).to_bytes(2) * 2
+    assert decode_picture(bytes(data)) is None

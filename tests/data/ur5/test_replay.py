@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tensordict import MemoryMappedTensor
 from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
@@ -131,7 +132,7 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "read_demo", count)
     first = UR5ExperienceReplay(folder, split="all", cache=place)
     assert len(decoded) == 1 + 4  # the first one also tells the size
-    assert type(first._frames["pixels"]).__name__ == "MemoryMappedTensor"
+    assert isinstance(first._frames["pixels"], MemoryMappedTensor)
     decoded.clear()
     for split in ("all", "train"):
         again = UR5ExperienceReplay(folder, split=split, cache=place)

@@ -298,7 +298,7 @@ def test_the_command(tmp_path, capsys, unbroken):
     assert re.match(r"error: .*seed 3 instead of 4", capsys.readouterr().err)
     (tmp_path / "file").touch()
     assert main(["--out", str(tmp_path / "file"), "--no-pixels"]) == 2
-    assert "cannot collect into" in capsys.readouterr().err
+    assert "cannot use" in capsys.readouterr().err
     assert main(["--out", str(tmp_path / "none"), "--verify"]) == 2
     assert "no demos in" in capsys.readouterr().err
 

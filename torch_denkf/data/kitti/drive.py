@@ -26,15 +26,16 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data.cache import _cached, cache_folder, stamp
-from torch_denkf.data.kitti.files import read_calibration, read_poses, read_times, scale_calibration
-from torch_denkf.data.pictures import check_size, text_of_size
+from torch_denkf.data.cache import cache_folder, cached, stamp
+from torch_denkf.data.kitti.clock import read_times
+from torch_denkf.data.kitti.files import read_calibration, read_poses, scale_calibration
+from torch_denkf.data.pictures import check_size, is_bomb, text_of_size
 from torch_denkf.vision.poses import poses_to_state
 
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
-_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 3  # part of the cache's key: raise it when what is stored changes
 _END_OF_PNG = b"IEND\xaeB`\x82"
 
 
@@ -74,23 +75,26 @@ def read_kitti_drive(
     """Read one drive: images of one size, and the planar state in Kloss et al.'s convention.
 
     Row k is frame ``first + k``, from the first to the last frame that has both an image and a pose. Frames that lack
-    an image, or whose file is damaged (a warning names it), keep their row.
+    an image, or whose file is damaged (a warning names it), keep their row. So do frames whose time does not increase,
+    which count as missing; a warning counts them, as it does gaps.
 
     ================= ========== ================================================================================
     key               shape      content
     ================= ========== ================================================================================
     ``image``         [N,C,H,W]  uint8, RGB or grey; zeros where the frame is missing
-    ``frame_valid``   [N,1]      bool: there is an image
+    ``frame_valid``   [N,1]      bool: there is an image, of a time that is right
     ``state``         [N,5]      float32: x m (forward at frame 0), y m (left), θ rad (to the left, unwrapped),
                                  v m/s, θ_dot rad/s
     ``time``          [N,1]      float64, s
-    ``dt``            [N,1]      float32, s: the drive's median frame time, the same in all rows
+    ``dt``            [N,1]      float32, s: the drive's median frame time; in a row after a gap the time since the
+                                 row before
     ``frame``         [N,1]      int64, the frame's number
     ``calibration``   [N,4]      float32: fx, fy, cx, cy in pixels of ``size``, the same in all rows
     ================= ========== ================================================================================
 
     v and θ_dot of row t are **backward** differences, the motion from frame t-1 to t: the image pair (t-1, t) shows
     exactly them. The first pose of the file has none and takes that of the next. v is signed: negative in reverse.
+    After a gap both are means over it, and no image pair reaches over it.
 
     Reading a drive anew decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
     folder, the options, and the names, times and sizes of all files read. Old entries may be deleted at any time.
@@ -113,8 +117,9 @@ def read_kitti_drive(
 
     Raises:
         FileNotFoundError: without the sequence's folder, images, poses or calibration.
-        ValueError: for malformed rows, images without any pose, drives none of whose images can be read, drives whose
-            images differ in size, and sizes that are not positive.
+        ValueError: for malformed rows, matrices that are no rotations, focal lengths that are not positive, times more
+            than a tenth of which do not increase, images of other names, images without any pose, drives none of whose
+            images can be read, drives whose images differ in size, and sizes that are not positive.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -131,6 +136,13 @@ def read_kitti_drive(
     if not files:
         raise FileNotFoundError(f"no images FFFFFF.png in {folder / camera}; pass another camera, or download them")
 
+    odd = [file for number, file in files.items() if file.name != f"{number:06d}.png"]
+    if odd:
+        raise ValueError(
+            f"{odd[0]} is not named as a frame, FFFFFF.png, nor are {len(odd) - 1} others; if it is frame "
+            f"{int(odd[0].stem)}, rename it to {int(odd[0].stem):06d}.png"
+        )
+
     def read() -> TensorDict:
         return _read(folder, poses, camera, files, (height, width), colour, progress)
 
@@ -141,7 +153,7 @@ def read_kitti_drive(
     key = [_FORMAT, str(root), sequence, camera, height, width, colour]
     key += [(path.name, *stamp(path)) for path in [*texts, *files.values()]]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
-    return _cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
+    return cached(directory / f"{sequence}-{camera}-{height}x{width}-{digest}", read)
 
 
 def choose_camera(folder: Path, camera: str | None) -> str:
@@ -191,8 +203,10 @@ def _read(
         )
     first, last = min(numbers), max(numbers)
     rows = last - first + 1
-    times, dt = read_times(folder / "times.txt", last + 1)
-    state = poses_to_state(poses, dt)[first : last + 1]
+    clock = read_times(folder / "times.txt", last + 1)
+    dt = clock.dt[first:].copy()
+    dt[0] = clock.median
+    state = poses_to_state(poses[: last + 1], clock.dt[1:])[first:]
     if colour is None:
         colour = _is_colour(files[number] for number in numbers)
     image = np.zeros((rows, 3 if colour else 1, *size), dtype=np.uint8)
@@ -217,7 +231,8 @@ def _read(
                         f"{files[number]} is {text_of_size(shape)}, but {first_file} is {text_of_size(native)}; the "
                         "images of a drive have one size, that of its calibration: scale this one or take it away"
                     )
-                image[number - first], valid[number - first] = pixels, True
+                if clock.sound[number]:
+                    image[number - first], valid[number - first] = pixels, True
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)  # without it, thousands of images would still be decoded
             raise
@@ -229,8 +244,8 @@ def _read(
             "image": torch.from_numpy(image),
             "frame_valid": torch.from_numpy(valid),
             "state": torch.from_numpy(state).float(),
-            "time": torch.from_numpy(times[first:, None].copy()),
-            "dt": torch.full((rows, 1), dt, dtype=torch.float32),
+            "time": torch.from_numpy(clock.times[first:, None].copy()),
+            "dt": torch.from_numpy(dt[:, None]).float(),
             "frame": torch.arange(first, last + 1).unsqueeze(-1),
             "calibration": torch.from_numpy(calibration).float().repeat(rows, 1),
         },
@@ -241,7 +256,7 @@ def _read(
 def _decode(file: Path, flags: int) -> np.ndarray | None:
     data = file.read_bytes()
     # OpenCV would fill the rest of a truncated file or complain on stderr: look for the end first.
-    if _END_OF_PNG not in data[-64:]:
+    if _END_OF_PNG not in data[-64:] or is_bomb(data):
         return None
     return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 

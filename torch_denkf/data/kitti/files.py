@@ -11,7 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from torch_denkf.vision.poses import KITTI_DT
+from torch_denkf._checks import read_lines
+from torch_denkf._files import replacing
+
+FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart
+ROTATION = 0.01  # how far R R^T may be from I: files of two digits pass
 
 
 def read_poses(file: Path) -> np.ndarray:
@@ -25,7 +29,8 @@ def read_poses(file: Path) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: naming file and line, where a row is not twelve finite numbers.
+        ValueError: naming file and line, where a row is not twelve finite numbers, its first three columns are no
+            rotation, or its position is farther than 1000 km from the origin.
     """
     if not file.is_file():
         raise FileNotFoundError(
@@ -33,11 +38,43 @@ def read_poses(file: Path) -> np.ndarray:
             "(sequences 00 to 10 have them) or write the file: a 3x4 camera-to-world matrix a row"
         )
     rows = []
-    for number, line in enumerate(file.read_text().rstrip().splitlines(), start=1):
+    lines = read_lines(file)
+    while lines and not lines[-1].strip():
+        lines.pop()
+    for number, line in enumerate(lines, start=1):
         rows.append(_numbers(line.split(), 12, f"{file}:{number}", "a 3x4 camera-to-world matrix, row by row"))
     if not rows:
         raise ValueError(f"{file} is empty; expected a row of 12 numbers for each frame")
-    return np.stack(rows).reshape(-1, 3, 4)
+    poses = np.stack(rows).reshape(-1, 3, 4)
+    _check_poses(file, poses)
+    return poses
+
+
+def _check_poses(file: Path, poses: np.ndarray) -> None:
+    far = np.abs(poses[:, :, 3]).max(-1)
+    if (far > FARTHEST).any():
+        row = int(np.flatnonzero(far > FARTHEST)[0])
+        raise ValueError(
+            f"{file}:{row + 1}: the position {far[row]:g} m is farther than {FARTHEST:g} m from the origin; write "
+            "metres, and subtract the first position"
+        )
+    large = np.abs(poses[:, :, :3]).max((1, 2)) > 2  # their squares may overflow
+    rotations = np.where(large[:, None, None], 0, poses[:, :, :3])
+    away = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    turned = np.linalg.det(rotations)
+    wrong = np.flatnonzero(large | (away > ROTATION) | (turned < 0))
+    if len(wrong):
+        row = int(wrong[0])
+        what = (
+            f"is mirrored (its determinant is {turned[row]:.3g})"
+            if away[row] <= ROTATION
+            else f"is no rotation: {' '.join(f'{value:g}' for value in poses[row, :, :3].ravel())}"
+        )
+        raise ValueError(
+            f"{file}:{row + 1}: the matrix R {what}, in {len(wrong)} of {len(poses)} rows; a row is [R | t], camera to "
+            "world, row by row, with R R^T = I and determinant 1. Take drives without poses out of the folder, or "
+            "orthonormalise R"
+        )
 
 
 def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> np.ndarray:
@@ -54,33 +91,8 @@ def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> n
 
 def write_poses(file: Path, poses: np.ndarray) -> None:
     """Write camera-to-world matrices ``[N, 3, 4]``, in metres, to a pose file."""
-    np.savetxt(file, poses.reshape(len(poses), 12), fmt="%.9e")
-
-
-def read_times(file: Path, rows: int) -> tuple[np.ndarray, float]:
-    """Read the frames' times, or make nominal ones where there is no file.
-
-    Args:
-        file: ``sequences/NN/times.txt``.
-        rows: how many frames need a time.
-
-    Returns:
-        Times in s, ``[rows]``, and the frame time dt in s: the median difference, 0.103 where there is no file.
-
-    Raises:
-        ValueError: if the file has fewer rows, or if its times do not increase.
-    """
-    if not file.is_file():
-        return KITTI_DT * np.arange(rows), KITTI_DT
-    lines = file.read_text().rstrip().splitlines()
-    if len(lines) < rows:
-        raise ValueError(f"{file} has {len(lines)} times, but there are {rows} posed frames; add the missing rows")
-    numbers = [_numbers(line.split(), 1, f"{file}:{n}", "seconds") for n, line in enumerate(lines, start=1)]
-    times = np.concatenate(numbers)
-    dt = float(np.median(np.diff(times))) if len(times) > 1 else KITTI_DT
-    if dt <= 0:
-        raise ValueError(f"{file}: the median difference of its times is {dt} s; expected increasing seconds")
-    return times[:rows], dt
+    with replacing(file) as beside:
+        np.savetxt(beside, poses.reshape(len(poses), 12), fmt="%.9e")
 
 
 def read_calibration(file: Path, camera: str) -> np.ndarray:
@@ -95,15 +107,20 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: where the camera's row is missing or malformed.
+        ValueError: where the camera's row is missing or malformed, or a focal length is not positive.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no calibration at {file}; expected rows 'P0: ...' to 'P3: ...' of 12 numbers")
     key = f"P{camera.removeprefix('image_')}:"
-    for number, line in enumerate(file.read_text().splitlines(), start=1):
+    for number, line in enumerate(read_lines(file), start=1):
         words = line.split()
         if words and words[0] == key:
             matrix = _numbers(words[1:], 12, f"{file}:{number}", "a 3x4 projection matrix, row by row")
+            if min(matrix[0], matrix[5]) <= 0:
+                raise ValueError(
+                    f"{file}:{number}: the focal lengths fx and fy must be positive pixels, got {matrix[0]:g} and "
+                    f"{matrix[5]:g}; they are the first and the sixth number of {key!r}"
+                )
             return matrix[[0, 5, 2, 6]]
     raise ValueError(f"{file} has no row {key!r}, the projection of {camera}; add it or choose another camera")
 

@@ -6,6 +6,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf.data.kitti.clock import GAP
+
 __all__ = ["bridge_gaps", "steps_between"]
 
 
@@ -28,6 +30,8 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
     Raises:
         ValueError: if ``longest`` is not positive.
 
+    No pair reaches over a gap in the drive's times, which shows in its ``"dt"``.
+
     Examples:
         >>> drive = TensorDict({"frame_valid": torch.tensor([1, 1, 0, 0, 1, 1, 0, 0, 0, 1]).bool().unsqueeze(-1)}, [10])
         >>> bridge_gaps(drive)["steps"].flatten().tolist()
@@ -35,7 +39,22 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
     """
     if longest < 1:
         raise ValueError(f"longest counts the steps between the frames of a pair, at least 1; got {longest}")
-    return drive.copy().set("steps", steps_between(drive["frame_valid"].squeeze(-1), longest).unsqueeze(-1))
+    steps = steps_between(drive["frame_valid"].squeeze(-1), longest)
+    after = after_gap(drive)
+    if after is not None:
+        begun = after.cumsum(0)  # the stretch of each row; a pair lies in one
+        row = torch.arange(len(begun), device=begun.device)
+        steps = torch.where(begun[row - steps] == begun, steps, 0)
+    return drive.copy().set("steps", steps.unsqueeze(-1))
+
+
+def after_gap(drive: TensorDictBase) -> Tensor | None:
+    """Rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    dt = drive.get("dt", None)
+    if dt is None or not dt.numel():
+        return None
+    after = (dt > GAP * dt.median()).squeeze(-1)
+    return after if bool(after.any()) else None
 
 
 def steps_between(valid: Tensor, longest: int) -> Tensor:
@@ -60,4 +79,6 @@ def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
     if "steps" in drive:
         return drive["steps"][index]
     before = drive["frame_valid"][(index - 1).clamp_min(0)]
-    return (drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)).long()
+    pairs = drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)
+    after = after_gap(drive)
+    return (pairs if after is None else pairs & ~after[index].unsqueeze(-1)).long()

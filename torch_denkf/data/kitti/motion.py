@@ -9,8 +9,8 @@ import cv2
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_denkf.data.cache import _cached, cache_folder
-from torch_denkf.data.kitti.gaps import steps_at
+from torch_denkf.data.cache import cache_folder, cached
+from torch_denkf.data.kitti.gaps import after_gap, steps_at
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
 
 __all__ = ["with_motion"]
@@ -74,7 +74,10 @@ def with_motion(
         digest = hashlib.blake2b(f"{_FORMAT} {height} {tuple(drive['image'].shape)}".encode(), digest_size=10)
         for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
             digest.update(drive[key].contiguous().numpy().data)
-        motion = _cached(directory / f"motion-{digest.hexdigest()}", compute)
+        after = after_gap(drive)
+        if after is not None:
+            digest.update(after.contiguous().numpy().data)
+        motion = cached(directory / f"motion-{digest.hexdigest()}", compute)
     drive = drive.copy() if keep_images else drive.exclude("image")
     return drive.update({"flow": motion["flow"], "road": motion["road"]})
 

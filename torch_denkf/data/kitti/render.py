@@ -19,6 +19,7 @@ from torch_denkf.data.kitti.altitude import steady_altitude
 from torch_denkf.data.kitti.files import read_poses
 from torch_denkf.data.kitti.writer import FORMAT, Job, write
 from torch_denkf.simulation.street.camera import KITTI_FOCAL, Camera
+from torch_denkf.simulation.street.path import check_length
 from torch_denkf.simulation.street.random_drive import hilly_poses, random_drive
 from torch_denkf.simulation.street.roadside import roadside_scene
 from torch_denkf.vision.poses import state_to_poses
@@ -73,8 +74,8 @@ def render_drives(
 
     Raises:
         FileNotFoundError: if there are no pose files, or not those that are named.
-        ValueError: for malformed pose rows (naming file and line), fewer than two frames, a name that is not a plain
-            folder name, and options out of range.
+        ValueError: for malformed pose rows (naming file and line), drives of more than 50 km, fewer than two frames, a
+            name that is not a plain folder name, and options out of range.
         FileExistsError: if there is another drive of that name.
         OSError: if ``out`` cannot be written to.
 
@@ -107,6 +108,7 @@ def render_drives(
         tracks = {name: steady_altitude(read_poses(folder / f"{name}.txt")[:frames]) for name in names}
         for name in names:
             _check([name], len(tracks[name]))
+            check_length(f"{folder / name}.txt", tracks[name][:, :, 3])
     jobs = []
     for name, track in tracks.items():
         options = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -17,6 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from torch_denkf._files import clear_errors, sync
+from torch_denkf._lock import remove_locked, take_lock
 from torch_denkf.data.kitti.files import write_poses
 from torch_denkf.simulation.street.camera import Camera
 from torch_denkf.simulation.street.renderer import Renderer
@@ -28,7 +31,8 @@ MARKER = "drive.json"
 STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
 REPORTED = 40  # frames after which the only process says how far it is
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
-ABANDONED = 600.0  # s without a new image, after which a half drive is a killed run's
+LOCK = ".writing"  # in a half drive: its process holds the lock
+ABANDONED = 600.0  # s without a new image, after which a half drive without a lock is a killed run's
 
 
 @dataclass
@@ -104,21 +108,33 @@ class Job:
             grain = rng.standard_normal(picture.shape, dtype=np.float32) * np.float32(GRAIN)
             picture = np.clip(picture + grain + np.float32(0.5), 0, 255).astype(np.uint8)
             file = folder / f"{number:06d}.png"
-            if not cv2.imwrite(str(file), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-                raise OSError(f"cannot write {file}; is the disk full?")
+            _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            with clear_errors(self.target / self.folder / file.name, beside=self.beside):
+                file.write_bytes(data.tobytes())
 
     def finish(self) -> None:
-        """Write the text files and rename: a drive that is there is complete."""
+        """Write the text files and rename: a drive that is there is complete.
+
+        After a power failure an image may be missing all the same: its reader says so. To wait for thousands of
+        images to be on the disk would take as long as to draw them.
+        """
+        with clear_errors(self.target, beside=self.beside):
+            self._finish()
+
+    def _finish(self) -> None:
         camera, beside = self.camera, self.beside
         row = f"{camera.fx:.9e} 0 {camera.cx:.9e} 0 0 {camera.fy:.9e} {camera.cy:.9e} 0 0 0 1 0"
         (beside / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
         (beside / "times.txt").write_text("".join(f"{KITTI_DT * k:.6e}\n" for k in range(len(self.poses))))
         (beside / MARKER).write_text(json.dumps(self.options))
-        write_poses(beside / "poses.txt", self.poses)
-        os.replace(beside / "poses.txt", self.root / "poses" / f"{self.name}.txt")
+        for name in ("calib.txt", "times.txt", MARKER):
+            sync(beside / name)
+        write_poses(self.root / "poses" / f"{self.name}.txt", self.poses)
         if self.target.exists():
             shutil.rmtree(self.target)
         beside.rename(self.target)
+        (self.target / LOCK).unlink(missing_ok=True)
+        sync(self.target.parent)
 
 
 def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None = None) -> None:
@@ -134,13 +150,15 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
     """
     if not jobs:
         return
-    root = jobs[0].root
+    root, held = jobs[0].root, []
     try:
         for folder in (root / "sequences", root / "poses"):
             folder.mkdir(parents=True, exist_ok=True)
         for job in jobs:
             _sweep(root, job.name)
             job.beside.mkdir()
+            with contextlib.suppress(OSError):  # a file system without locks
+                held.append(take_lock(job.beside / LOCK))
     except OSError as error:
         raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
     stretch = min(STRETCH, REPORTED) if processes == 1 else STRETCH
@@ -180,7 +198,10 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
     finally:
         _last.clear()
         for job in jobs:
-            shutil.rmtree(job.beside, ignore_errors=True)
+            remove_locked(job.beside, LOCK)
+        for lock in held:
+            if lock is not None:
+                os.close(lock)
 
 
 _last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
@@ -196,6 +217,17 @@ def _draw(job: Job, start: int, stop: int) -> None:
 def _sweep(root: Path, name: str) -> None:
     """Remove what killed runs left of a drive."""
     for folder in root.glob(f".{name}-????????"):
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # an empty one: its process was killed at the first or at the last moment
+            continue
+        lock = folder / LOCK
+        if lock.exists():
+            with contextlib.suppress(OSError):
+                held = take_lock(lock, create=False)
+                if held is not None:  # its process is gone
+                    remove_locked(folder, LOCK)
+                    os.close(held)
+            continue
         newest = max(path.stat().st_mtime for path in (folder, *folder.glob("image_?")))
         if time.time() - newest > ABANDONED:
             shutil.rmtree(folder, ignore_errors=True)

@@ -17,14 +17,18 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import numpy as np
 
+from torch_denkf._checks import check_count, check_number, read_lines
+from torch_denkf.data.lerobot.paths import stay_inside
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
 
 VERSIONS = {"v2.0": 2, "v2.1": 2, "v3.0": 3}
+MOST_ROWS = 10**8  # of a data set: 38 days at 30 a second
 COMPLETE = "download the data set completely"
 
 
@@ -97,19 +101,23 @@ def read_layout(root: Path, camera: str | None) -> Layout:
 
     Raises:
         FileNotFoundError: without metadata.
-        ValueError: for versions that are not supported, cameras that are not there, and malformed metadata.
+        ValueError: for versions that are not supported, cameras that are not there, malformed metadata, numbers out of
+            range, episodes that are listed twice, and paths that lead out of the folder.
     """
     file = root / "meta" / "info.json"
     if not file.is_file():
         raise FileNotFoundError(f"no {file}; pass the folder of a LeRobot data set, which holds meta and data")
     try:
-        info = json.loads(file.read_text())
+        info = json.loads("\n".join(read_lines(file)))
         version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it anew") from error
+    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
+    _check_features(file, features)
     if version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
     camera = _choose_camera(root, features, camera)
+    stay_inside(root, f"images/{camera}", f"{file}, by the name of a camera,")
     if VERSIONS[version] == 2:
         episodes, meta = _episodes_of_version_2(root, info, camera)
     else:
@@ -117,8 +125,57 @@ def read_layout(root: Path, camera: str | None) -> Layout:
     episodes = [episode for episode in episodes if episode.length]
     if not episodes:
         raise ValueError(f"{root} has no episodes; {COMPLETE}")
+    _check_episodes(meta, episodes)
+    rows = sum(episode.length for episode in episodes)
+    if rows > MOST_ROWS:
+        raise ValueError(
+            f"{root} announces {rows} rows, more than the {MOST_ROWS} that are read; its metadata are wrong"
+        )
     episodes.sort(key=lambda episode: episode.number)
     return Layout(root, fps, features, camera, tuple(episodes), (file, *meta))
+
+
+def _check_features(file: Path, features: dict) -> None:
+    for key, feature in features.items():
+        known = isinstance(feature, dict) and isinstance(feature.get("dtype"), str)
+        if not known or not isinstance(feature.get("shape"), (list, tuple)):
+            raise ValueError(
+                f"{file} is malformed: feature {key!r} has no 'dtype' and 'shape', but {feature!r}; download it anew"
+            )
+
+
+def _check_episodes(meta: list[Path], episodes: list[EpisodeFiles]) -> None:
+    seen: set[int] = set()
+    for episode in episodes:
+        if episode.number in seen:
+            raise ValueError(
+                f"{meta[0]} lists episode {episode.number} twice, again as entry {len(seen) + 1} of {len(episodes)}; "
+                "leave one out, or download it anew"
+            )
+        seen.add(episode.number)
+
+
+def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
+    """A file that a template of ``info.json`` names.
+
+    Raises:
+        ValueError: if there is no such template, it asks for what there is not, or it leads out of the folder.
+    """
+    file, template = root / "meta" / "info.json", info.get(name)
+    if not isinstance(template, str):
+        raise ValueError(f"{file} is malformed: {name!r} is no template of a path, but {template!r}; download it anew")
+    try:
+        if any(len(spec) > 4 for _, _, spec, _ in Formatter().parse(template) if spec):
+            raise ValueError("a number of more than 99 digits")
+        path = root / template.format(**place)
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{file} is malformed: {name!r}, {template!r}, is filled with {sorted(place)} ({type(error).__name__}: "
+            f"{error}); download it anew"
+        ) from error
+    if not path.is_relative_to(root) or ".." in path.relative_to(root).parts:
+        raise ValueError(f"{file}: {name!r}, {template!r}, leads out of {root}, to {path}; such a file is not read")
+    return path
 
 
 def _choose_camera(root: Path, features: dict[str, dict], camera: str | None) -> str:
@@ -148,22 +205,26 @@ def _episodes_of_version_2(root: Path, info: dict, camera: str) -> tuple[list[Ep
     if not file.is_file():
         raise FileNotFoundError(f"no {file}, which lists the episodes; {COMPLETE}")
     video = info["features"][camera]["dtype"] == "video"
+    chunk = info.get("chunks_size", 1000)
+    check_count(f"chunks_size in {root / 'meta' / 'info.json'}", chunk, cure="It is the episodes in a folder")
     episodes = []
-    for line in filter(str.strip, file.read_text().splitlines()):
+    for at, line in enumerate(read_lines(file), start=1):
+        if not line.strip():
+            continue
         try:
             entry = json.loads(line)
             number, length = int(entry["episode_index"]), int(entry["length"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{file} has a malformed line {line[:80]!r}; download it anew") from error
-        place = {
-            "episode_chunk": number // int(info.get("chunks_size", 1000)),
-            "episode_index": number,
-            "video_key": camera,
-        }
-        data = root / info["data_path"].format(**place)
-        episodes.append(
-            EpisodeFiles(number, length, data, root / info["video_path"].format(**place) if video else None, 0.0)
-        )
+            raise ValueError(
+                f"{file} has a malformed line {line[:80]!r}, line {at} ({type(error).__name__}: {error}); download it "
+                "anew"
+            ) from error
+        for name, value in (("episode_index", number), ("length", length)):
+            check_count(f"{name} in {file}:{at}", value, least=0)
+        place = {"episode_chunk": number // chunk, "episode_index": number, "video_key": camera}
+        data = _inside(root, info, "data_path", **place)
+        shown = _inside(root, info, "video_path", **place) if video else None
+        episodes.append(EpisodeFiles(number, length, data, shown, 0.0))
     return episodes, [file]
 
 
@@ -178,12 +239,20 @@ def _episodes_of_version_3(root: Path, info: dict, camera: str) -> tuple[list[Ep
     episodes = []
     for file in files:
         for entry in read_table(file, keys).to_pylist():
-            number, length, chunk, part = (int(entry[key]) for key in keys[:4])
-            shown, begin = None, 0.0
+            try:
+                number, length, chunk, part = (int(entry[key]) for key in keys[:4])
+                where = [int(entry[key]) for key in keys[4:6]]
+                begin = float(entry[keys[6]]) if video else 0.0
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{file} has a row with gaps, {entry}; download it anew") from error
+            for name, value in (("episode_index", number), ("length", length)):
+                check_count(f"{name} in {file}", value, least=0)
+            check_number(f"from_timestamp of episode {number} in {file}", begin, least=0)
+            shown = None
             if video:
-                place = {"video_key": camera, "chunk_index": entry[keys[4]], "file_index": entry[keys[5]]}
-                shown, begin = root / info["video_path"].format(**place), float(entry[keys[6]])
-            data = root / info["data_path"].format(chunk_index=chunk, file_index=part)
+                place = {"video_key": camera, "chunk_index": where[0], "file_index": where[1]}
+                shown = _inside(root, info, "video_path", **place)
+            data = _inside(root, info, "data_path", chunk_index=chunk, file_index=part)
             episodes.append(EpisodeFiles(number, length, data, shown, begin))
     return episodes, files
 
@@ -251,6 +320,7 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
     if data is None:
         names = [(value or {}).get("path")]
         names += [f"images/{camera}/episode{m}{episode:06d}/frame{m}{frame:06d}.png" for m in "_-"]
-        files = [root / name for name in names if name]
+        source = f"frame {frame} of episode {episode} in {root}"
+        files = [stay_inside(root, name, source) for name in names if name]
         data = next((file.read_bytes() for file in files if file.is_file()), b"")
     return decode_picture(data)

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.data.cache import _cached, cache_folder, stamp
+from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.lerobot.files import (
     EpisodeFiles,
     Layout,
@@ -24,10 +24,11 @@ from torch_denkf.data.lerobot.files import (
     rows_of_episode,
     vectors,
 )
+from torch_denkf.data.lerobot.sound import mask_rows, sound_times
 from torch_denkf.data.pictures import image_store, scaled, text_of_size
 from torch_denkf.data.video import frames_at_times
 
-_FORMAT = 1  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class DecodedRecording:
         rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,
             zeros where it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action``
             float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
-            and ``episode`` int64 ``[N]``.
+            and ``episode`` int64 ``[N]``. Where a row's state or action is not finite, also the masks of
+            :func:`~torch_denkf.data.lerobot.sound.mask_rows`.
         fps: rows a second.
         names: of the state's numbers, if they have any.
         source: folder that it was read from, if there is one.
@@ -80,7 +82,7 @@ def read_recording(
     key += [(str(file.relative_to(root)), *stamp(file)) for file in _files(layout)]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     entry = folder / f"lerobot-{root.name}-{layout.camera}-{size[0]}x{size[1]}-{digest}"
-    rows = _cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
+    rows = cached(entry, lambda: _read(layout, keys, widths, size, folder, progress))
     return DecodedRecording(rows, layout.fps, names, root)
 
 
@@ -128,7 +130,7 @@ def _read(
     lengths = [episode.length for episode in layout.episodes]
     starts = np.cumsum([0, *lengths])
     numbers = {name: np.empty((starts[-1], width), np.float32) for name, width in widths.items()}
-    time = np.empty(starts[-1])
+    time, stamped = np.empty(starts[-1]), np.ones(starts[-1], bool)
     frames = _Frames(starts[-1], size, folder, progress)
     videos: dict[Path, list[int]] = {}
     opened, table = None, None
@@ -140,8 +142,11 @@ def _read(
             rows, at = rows_of_episode(table, episode), slice(starts[place], starts[place + 1])
             for name, key in keys.items():
                 numbers[name][at] = vectors(rows, opened, key, widths[name])
-            stamped = "timestamp" in rows.column_names
-            time[at] = rows["timestamp"].to_numpy() if stamped else np.arange(episode.length) / layout.fps
+            if "timestamp" in rows.column_names:
+                source = f"{opened}, episode {episode.number}"
+                time[at], stamped[at] = sound_times(rows["timestamp"].to_numpy(), layout.fps, source)
+            else:
+                time[at] = np.arange(episode.length) / layout.fps
             if episode.video is None:
                 _put_images(layout, episode, rows, starts[place], frames)
                 _check_seen(episode, frames.observed[at, 0])
@@ -156,7 +161,7 @@ def _read(
                 _check_seen(layout.episodes[k], frames.observed[starts[k] : starts[k + 1], 0])
     finally:
         frames.close()
-    return TensorDict(
+    out = TensorDict(
         {
             "image": torch.from_numpy(frames.images),
             "observed": torch.from_numpy(frames.observed),
@@ -167,6 +172,7 @@ def _read(
         },
         batch_size=[int(starts[-1])],
     )
+    return mask_rows(out, torch.from_numpy(stamped), str(layout.root))
 
 
 def _check_columns(file: Path, table, columns: Sequence[str]) -> None:

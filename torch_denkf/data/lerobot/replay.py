@@ -58,8 +58,12 @@ class LeRobotReplay(EpisodeReplay):
     ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros where the frame is missing
     ``state``             [n,S]        float32, such as the joints' positions, in the recording's units
     ``action``            [n,A]        float32, where there are any
-    ``observed``          [n,1]        bool: the frame is there
+    ``observed``          [n,1]        bool: the frame is there, and its row is sound
     ===================== ============ ===========================================================================
+
+    Rows whose state or action is not finite, or whose time does not increase, keep their place and are not observed; a
+    warning counts them. Where numbers are not finite, the row holds the last ones that are, is False in
+    ``state_observed`` or ``action_observed``, and is left out of losses by ``("collector", "mask")``.
 
     Frames are kept as uint8 at the size asked for, memory-mapped: 37 kB a frame of 96 x 128. All splits share an entry
     of the cache.

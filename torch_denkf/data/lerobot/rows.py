@@ -11,7 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
+from torch_denkf._checks import check_number
 from torch_denkf.data.lerobot.recording import DecodedRecording
+from torch_denkf.data.lerobot.sound import mask_rows
 from torch_denkf.data.pictures import image_store, scaled
 
 __all__ = ["recording_from_rows"]
@@ -89,8 +91,7 @@ def recording_from_rows(
         ) from error
     if not count:
         raise ValueError("there are no rows to make a recording of")
-    if not fps > 0:
-        raise ValueError(f"fps is the number of rows a second and must be positive, got {fps}")
+    check_number("fps", fps, above=0, cure="It is the number of rows a second")
     stretches = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
     whole = size is None and isinstance(rows, TensorDictBase)
     image = _images(rows, pixels_key) if whole else None
@@ -124,7 +125,7 @@ def recording_from_rows(
             "frame": frame,
         }
     )
-    return DecodedRecording(out, float(fps), names)
+    return DecodedRecording(mask_rows(out, None, "the rows"), float(fps), names)
 
 
 def _get(rows: TensorDictBase, key: NestedKey) -> Tensor | TensorDictBase:

@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torch_denkf._files import clear_errors
 from torch_denkf._progress import progress_bar
-from torch_denkf.data.cache import _cached, cache_folder, stamp
-from torch_denkf.data.pictures import decode_picture, scaled, text_of_size, unnamed_file
+from torch_denkf.data.cache import cache_folder, cached, stamp
+from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
 from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
 from torch_denkf.data.video import NOT_DECODED, decoded_frames
 
@@ -80,7 +81,7 @@ class Frames:
         else:
             key = json.dumps([_FORMAT, *size, [(str(file), *stamp(file)) for file in files]])
             entry = folder / f"frames-{source.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-            stored = _cached(entry, lambda: self._decode(source, files, size, folder, progress))
+            stored = cached(entry, lambda: self._decode(source, files, size, folder, progress))
         times = self._times(source, stored)
         check_times(times, lambda row: f"picture {row} (from 0) of {source}", self.time)
         return TensorDict({"pixels": stored["pixels"], "time": torch.from_numpy(times)}, stored.batch_size)
@@ -245,6 +246,7 @@ class _Store:
     def __init__(self, size: tuple[int, int], folder: Path | None):
         self._size, self._memory = size, bytearray()
         self._file = None if folder is None else unnamed_file(folder)
+        self._folder = folder or Path()
 
     def add(self, pixels: np.ndarray) -> None:
         """Keep a picture ``[3, H, W]``."""
@@ -252,12 +254,14 @@ class _Store:
         if self._file is None:
             self._memory += data
         else:
-            self._file.write(data)
+            with clear_errors(self._folder / "pictures", CURE, name=f"pictures to {self._folder}"):
+                self._file.write(data)
 
     def pictures(self, count: int) -> torch.Tensor:
         """All of them, uint8 ``[count, 3, H, W]``."""
         shape = (count, 3, *self._size)
         if self._file is None:
             return torch.frombuffer(self._memory, dtype=torch.uint8).reshape(shape)
-        self._file.flush()
+        with clear_errors(self._folder / "pictures", CURE, name=f"pictures to {self._folder}"):
+            self._file.flush()
         return torch.from_numpy(np.memmap(self._file, np.uint8, "r+", shape=shape))

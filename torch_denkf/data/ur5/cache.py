@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data.cache import _cached_in_place, cache_folder
+from torch_denkf.data.cache import cache_folder, cached_in_place
 from torch_denkf.data.pictures import check_size
 from torch_denkf.data.ur5.files import COMMAND, MANIFEST, Demo, Entry, read_demo, read_manifest
 from torch_denkf.simulation.ur5.names import TASKS
@@ -30,6 +30,7 @@ def read_entries(root: Path) -> list[Entry]:
 
     Raises:
         FileNotFoundError: without the folder, or without a demo in it.
+        ValueError: naming the line, for a manifest that is damaged.
     """
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}; collect demos into it: {COMMAND} --out {root}")
@@ -79,19 +80,19 @@ def read_demos(
     size = None if size is None else check_size(size)
     directory = cache_folder(cache)
     if directory is None:
-        return _read(root, entries, size, None, progress)
+        return _read(root, entries, size, TensorDict.clone, progress)
     key = json.dumps([_FORMAT, size, [astuple(entry) for entry in entries]])  # by content, wherever the folder lies
     name = "x".join(map(str, size)) if size else "stored"
     entry = directory / f"ur5-{len(entries)}-{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     # Filled where it lies: whole sequences of 2,000 demos at 112 px are 26 GB.
-    return _cached_in_place(entry, lambda folder: _read(root, entries, size, folder, progress))
+    return cached_in_place(entry, lambda allocate: _read(root, entries, size, allocate, progress))
 
 
 def _read(
     root: Path,
     entries: Sequence[Entry],
     size: tuple[int, int] | None,
-    folder: Path | None,
+    allocate: Callable[[TensorDict], TensorDict],
     progress: Callable[[int], object],
 ) -> TensorDict:
     first = read_demo(root, entries[0])
@@ -101,7 +102,7 @@ def _read(
     frames = sum(entry.frames for entry in entries)
     if frames and (size[0] > native[0] or size[1] > native[1]):
         raise ValueError(f"size {size} is larger than the demos' {native} in {root}; collect larger ones or pass less")
-    store = _allocate(sum(entry.rows for entry in entries), frames, size, folder)
+    store = allocate(_like(sum(entry.rows for entry in entries), frames, size))
     starts = list(accumulate((entry.rows for entry in entries), initial=0))
     shots = list(accumulate((entry.frames for entry in entries), initial=0))
 
@@ -122,9 +123,11 @@ def _read(
     return store
 
 
-def _allocate(rows: int, frames: int, size: tuple[int, int], folder: Path | None) -> TensorDict:
+def _like(rows: int, frames: int, size: tuple[int, int]) -> TensorDict:
+    """Shapes and dtypes; takes no memory."""
+
     def of(count: int, dtype: torch.dtype, *shape: int) -> torch.Tensor:
-        return torch.zeros((), dtype=dtype).expand(count, *shape)  # takes no memory
+        return torch.zeros((), dtype=dtype).expand(count, *shape)
 
     entries = {
         "state": of(rows, torch.float32, 10),
@@ -137,7 +140,7 @@ def _allocate(rows: int, frames: int, size: tuple[int, int], folder: Path | None
         pictures = {"pixels": of(frames, torch.uint8, 3, *size)}
         pictures |= {key: of(frames, torch.int64, 3) for key in ("sum", "square")}
         like["frames"] = TensorDict(pictures, [frames])
-    return like.clone() if folder is None else like.memmap_like(folder)
+    return like
 
 
 def _fill(store: TensorDict, demo: Demo, pixels: np.ndarray, start: int, shot: int) -> None:

@@ -12,9 +12,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import threading
-import uuid
+import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -23,11 +24,16 @@ from typing import Any
 
 import numpy as np
 
+from torch_denkf._checks import check_count, read_lines
+from torch_denkf._files import clear_errors, write_bytes, write_text
 from torch_denkf.simulation.ur5.names import TASKS
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
 COMMAND = "denkf collect-ur5"
+MOST_BYTES = 1 << 32  # of one demo, unpacked: 350 pictures of 2,000 x 2,000
+_HEADER = 1 << 14  # bytes in which an array's header is, at most
+AGAIN = f"the collecting command ({COMMAND}), repeated, makes it again"
 
 
 @dataclass
@@ -82,29 +88,32 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
     """Write a demo beside its place and rename it, so that a file of that name is complete. Equal demos, equal bytes.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: if the file cannot be written, as on a full disk; names it and the free space.
     """
     name = f"demo-{demo.number:06d}.npz"
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **vars(demo))
     data = buffer.getvalue()
-    beside = root / f".{name}-{uuid.uuid4().hex[:8]}"
-    try:
-        beside.write_bytes(data)
-        os.replace(beside, root / name)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(f"cannot write {root / name} ({error}); is the disk full?") from error
+    write_bytes(root / name, data)
     return Entry(demo.number, name, hashlib.sha256(data).hexdigest(), len(demo.state), len(demo.steps), failures)
 
 
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
     """None for a file with the manifest's checksum, or else what is the matter, for a message."""
     try:
-        data = (root / entry.file).read_bytes()
+        data = _place(root, entry).read_bytes()
     except OSError as error:
         return f"{root / entry.file} cannot be read ({error.strerror})"
     return _compare(root, entry, data)
+
+
+def _place(root: Path, entry: Entry) -> Path:
+    if not isinstance(entry.file, str) or entry.file in ("", "..") or Path(entry.file).name != entry.file:
+        raise ValueError(
+            f"{root / MANIFEST} names a file outside of its folder, {entry.file!r}; such a collection may read "
+            "anything of yours: download it from where you trust it, or take the line out"
+        )
+    return root / entry.file
 
 
 def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
@@ -116,8 +125,8 @@ def _compare(root: Path, entry: Entry, data: bytes) -> str | None:
 _HEADERS = threading.Lock()
 
 
-def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, by name.
+def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, by name; what it announces is compared with the manifest before it is unpacked.
 
     NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 fails now and then where threads do it at a
     time ("AST constructor recursion depth mismatch", CPython issue 106905). So headers are read one after the other,
@@ -125,6 +134,7 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
     """
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        _refuse_other_arrays(archive, entry)
         for member in archive.namelist():
             stream = io.BytesIO(archive.read(member))
             with _HEADERS:
@@ -132,25 +142,62 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _refuse_other_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
+    """Looks at the headers alone: the rest could be of any size.
+
+    Raises:
+        ValueError: if an array is not what the manifest says.
+    """
+    expected: dict[str, tuple[int | None, ...]] = {"state": (entry.rows, 10), "action": (entry.rows, 7)}
+    expected |= {"success": (entry.rows,), "steps": (entry.frames,), "pixels": (entry.frames, 3, None, None)}
+    expected |= dict.fromkeys(("number", "task", "domain", "seed"), ())
+    names = [member.filename.removesuffix(".npy") for member in archive.infolist()]
+    if sorted(names) != sorted(expected):
+        raise ValueError(f"it holds {sorted(names)}, expected {sorted(expected)}")
+    total = sum(member.file_size for member in archive.infolist())
+    if total > MOST_BYTES:
+        raise ValueError(f"it announces {total} bytes, more than the {MOST_BYTES} that are unpacked")
+    for member, name in zip(archive.infolist(), names, strict=True):
+        with archive.open(member) as stream:
+            head = io.BytesIO(stream.read(_HEADER))
+        with _HEADERS:
+            version = np.lib.format.read_magic(head)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(head)
+        fits = len(shape) == len(expected[name])
+        fits = fits and all(want in (None, there) for want, there in zip(expected[name], shape, strict=True))
+        if not fits or math.prod(shape) * dtype.itemsize != member.file_size - head.tell():
+            raise _OtherShape(f"has {name!r} of shape {shape}, {MANIFEST} says {expected[name]}")
+
+
+class _OtherShape(ValueError):
+    """An array that is not what the manifest says."""
+
+
 def read_demo(root: Path, entry: Entry) -> Demo:
     """Read a demo and compare it with its line in the manifest.
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, or does not hold what the line says.
+        ValueError: if it was changed, does not hold what the line says, lies outside of the folder, or has numbers that
+            are not finite.
     """
-    file = root / entry.file
-    again = f"the collecting command ({COMMAND}), repeated, makes it again"
+    file = _place(root, entry)
     try:
+        size = file.stat().st_size
+        if size > MOST_BYTES:
+            raise ValueError(f"{file} has {size} bytes, more than a demo can have ({MOST_BYTES}); {AGAIN}")
         data = file.read_bytes()
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{file} is missing, but {MANIFEST} lists it; {again}") from error
+        raise FileNotFoundError(f"{file} is missing, but {MANIFEST} lists it; {AGAIN}") from error
     wrong = _compare(root, entry, data)
     if wrong is not None:
-        raise ValueError(f"{wrong}; {again}")
+        raise ValueError(f"{wrong}; {AGAIN}")
     try:
-        fields: dict[str, Any] = _read_arrays(data)  # numbers and names are arrays without dimensions yet
+        fields: dict[str, Any] = _read_arrays(data, entry)  # numbers and names are arrays without dimensions yet
         demo = Demo(**fields)
+    except _OtherShape as error:
+        raise ValueError(f"{file} {error}") from error
     except (TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} does not hold a demo ({error}); was it written by another version?") from error
     demo.number, demo.seed = int(demo.number), int(demo.seed)
@@ -160,45 +207,98 @@ def read_demo(root: Path, entry: Entry) -> Demo:
     for key, shape in expected.items():
         if getattr(demo, key).shape != shape:
             raise ValueError(f"{file} has {key!r} of shape {getattr(demo, key).shape}, {MANIFEST} says {shape}")
+    for key in ("state", "action"):
+        values = getattr(demo, key)
+        if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
+            row = 0 if values.dtype.kind != "f" else int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
+            raise ValueError(
+                f"{file} has {key!r} {values[row].tolist()} in row {row}, expected finite numbers; {AGAIN}"
+            )
+    steps = demo.steps
+    if len(steps) and (steps.min() < 0 or steps.max() >= entry.rows or (np.diff(steps) <= 0).any()):
+        raise ValueError(f"{file} has 'steps' {steps.tolist()[:9]}, expected ascending rows of {entry.rows}; {AGAIN}")
     if demo.task not in TASKS or demo.number != entry.demo:
         raise ValueError(f"{file} is demo {demo.number} of task {demo.task!r}, but is listed as demo {entry.demo}")
     return demo
 
 
-def read_manifest(root: Path) -> dict[int, Entry]:
-    """Entries by demo number, ascending; empty without a manifest. A line that a kill cut off counts as not written.
+def read_manifest(root: Path, *, skip_damaged: bool = False) -> dict[int, Entry]:
+    """Entries by demo number, ascending; empty without a manifest. A last line that a kill cut off is not written yet.
+
+    Args:
+        root: folder of the demos.
+        skip_damaged: True leaves lines out that are damaged, each with a warning, for a caller that makes their demos
+            again.
 
     Raises:
         OSError: if the manifest is there and cannot be read.
+        ValueError: naming the line, for one that is damaged or lists a demo again.
     """
-    try:
-        lines = (root / MANIFEST).read_text().splitlines()
-    except FileNotFoundError:
+    file = root / MANIFEST
+    if not file.exists():
         return {}
-    entries = {}
-    for line in lines:
+    lines = read_lines(file)
+    cut = bool(lines) and not file.read_bytes().endswith(b"\n")
+    entries: dict[int, Entry] = {}
+    for number, line in enumerate(lines, start=1):
         try:
-            entry = Entry(**json.loads(line))
-        except (TypeError, ValueError):
+            entry = _entry(line)
+            if entries.get(entry.demo, entry) != entry:
+                raise ValueError(f"demo {entry.demo} is listed in another line, too")
+        except (TypeError, ValueError) as error:
+            if cut and number == len(lines):
+                continue
+            wrong = f"{file}:{number} is damaged ({error}): {line[:80]!r}"
+            if not skip_damaged:
+                raise ValueError(
+                    f"{wrong}; the collecting command ({COMMAND}), repeated, makes its demo again"
+                ) from error
+            warnings.warn(f"{wrong}; its demo is made again", stacklevel=3)
             continue
         entries[entry.demo] = entry
     return dict(sorted(entries.items()))
 
 
+def _entry(line: str) -> Entry:
+    fields = json.loads(line)
+    if not isinstance(fields, dict):
+        raise ValueError("no entry of a demo")
+    entry = Entry(**fields)
+    for name, least in (("demo", 0), ("rows", 1), ("frames", 0), ("failures", 0)):
+        check_count(name, getattr(entry, name), least=least)
+    if not isinstance(entry.file, str) or Path(entry.file).name != entry.file or not isinstance(entry.sha256, str):
+        raise ValueError(f"file is the name of a file in the folder, and sha256 its checksum; got {entry.file!r}")
+    return entry
+
+
 def write_manifest(root: Path, entries: Iterable[Entry]) -> None:
     """Write the whole manifest, in the demos' order, at once."""
-    _replace(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
+    write_text(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
 
 
 def append_to_manifest(root: Path, entry: Entry) -> None:
-    """Add a demo that was just written."""
-    with (root / MANIFEST).open("a") as file:
-        file.write(_line(entry))
+    """Add a demo that was just written.
+
+    Raises:
+        OSError: if it cannot be added, as on a full disk; the manifest is then as it was.
+    """
+    file = root / MANIFEST
+    with clear_errors(file):
+        before = file.stat().st_size if file.exists() else 0
+        try:
+            with file.open("ab") as stream:
+                stream.write(_line(entry).encode())
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError:
+            if file.exists():
+                os.truncate(file, before)
+            raise
 
 
 def write_options(root: Path, options: dict) -> None:
     """Write what all demos of the folder follow from."""
-    _replace(root / COLLECTION, json.dumps(options, indent=1) + "\n")
+    write_text(root / COLLECTION, json.dumps(options, indent=1) + "\n")
 
 
 def read_options(root: Path) -> dict | None:
@@ -217,9 +317,3 @@ def read_options(root: Path) -> dict | None:
 
 def _line(entry: Entry) -> str:
     return json.dumps(asdict(entry)) + "\n"
-
-
-def _replace(file: Path, text: str) -> None:
-    beside = file.with_name(f".{file.name}-{uuid.uuid4().hex[:8]}")
-    beside.write_text(text)
-    os.replace(beside, file)

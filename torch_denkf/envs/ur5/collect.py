@@ -8,13 +8,11 @@ machine and OpenGL library). :class:`torch_denkf.data.UR5ExperienceReplay` reads
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
+from torch_denkf._lock import locked
 from torch_denkf.data.ur5 import files
 from torch_denkf.data.ur5.files import COLLECTION, Entry
 from torch_denkf.envs.ur5.episodes import Options, make_demos
@@ -65,7 +63,7 @@ def collect_ur5_demos(
 
     Raises:
         ValueError: for options out of range, or if the folder holds a collection of other options.
-        OSError: if the folder cannot be written to, or another process is collecting into it.
+        OSError: if the folder cannot be written to, the disk is full, or another process is collecting into it.
         RuntimeError: without OpenGL (the message names the packages), or if a demo fails again and again.
 
     Warns:
@@ -81,7 +79,7 @@ def collect_ur5_demos(
         raise ValueError(f"demos and processes must be positive, got {demos} and {processes}")
     options = Options(size, frames, domain, tuple(tasks), seed, max_steps, noise)
     root = Path(root).expanduser().resolve()
-    with _locked(root):
+    with locked(root, LOCK, "is collecting into it"):
         missing, entries = _missing(root, demos, options)
         if progress is not None:
             progress(demos - len(missing))
@@ -94,29 +92,11 @@ def collect_ur5_demos(
     return len(missing)
 
 
-@contextmanager
-def _locked(root: Path) -> Iterator[None]:
-    """The folder is this process's alone, until the end or until the process is gone, however it ends."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(root / LOCK, timeout=0)
-        lock.acquire()
-    except Timeout as error:
-        message = "another process is collecting into it; wait for it or choose another folder"
-        raise OSError(f"cannot collect into {root}: {message}") from error
-    except OSError as error:
-        raise OSError(f"cannot collect into {root}: {error}") from error
-    try:
-        yield
-    finally:
-        lock.release()
-
-
 def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[int, Entry]]:
     """Numbers of the demos to make, and the manifest without them."""
     ours = {"format": FORMAT, **asdict(options)}
     ours |= {"size": list(options.size), "tasks": list(options.tasks)}  # as JSON gives them back
-    entries = files.read_manifest(root)
+    entries = files.read_manifest(root, skip_damaged=True)
     theirs = files.read_options(root) if entries else ours
     if theirs is None:
         raise ValueError(f"{root} has demos but no {COLLECTION}; choose another folder")

@@ -14,7 +14,9 @@ from typing import Any
 
 import torch
 
-__all__ = ["TESTED_VERSIONS", "need_compiler", "options_for_processors"]
+from torch_denkf.filters.inductor.libraries import clear_damaged_libraries, clear_full_cache
+
+__all__ = ["TESTED_VERSIONS", "clear_damaged_libraries", "clear_full_cache", "need_compiler", "options_for_processors"]
 
 #: Versions of torch, by their first two numbers, that the passes were tested with.
 TESTED_VERSIONS = ("2.13",)
@@ -31,11 +33,13 @@ def options_for_processors() -> dict[str, Any]:
         try:
             from torch_denkf.filters.inductor.kernels import FewCalls
             from torch_denkf.filters.inductor.partition import FewSavedTensors
+            from torch_denkf.filters.inductor.scheduling import ShortFunctions
 
             return {
                 "cpp_wrapper": True,
                 "custom_partitioner_fn": FewSavedTensors(),
                 "post_grad_custom_post_pass": FewCalls(),
+                "_post_fusion_custom_pass": ShortFunctions(),
                 "guard_filter_fn": worth_checking,
             }
         except ImportError as error:

@@ -1,0 +1,200 @@
+"""Damaged drives in KITTI's layout: refused by file and line, or kept as far as they are sound, and counted."""
+
+import math
+import re
+import time
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from tests.data.kitti.test_drive import make
+from torch_denkf.data import bridge_gaps, frames_at, read_kitti_drive, render_drives, with_motion
+from torch_denkf.data.times import increasing
+from torch_denkf.envs import KITTIReplayEnv
+
+ROWS = 20
+POSES, TIMES, CALIBRATION, IMAGES = "poses/00.txt", "sequences/00/times.txt", "sequences/00/calib.txt", "image_2"
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A drive of 20 frames at 1 m and 0.1 s."""
+    return make(tmp_path, images=range(ROWS), poses=range(ROWS))
+
+
+def read(root, **options):
+    return read_kitti_drive(root, "00", size=(10, 30), cache=None, **options)
+
+
+def change(root, name, row, text):
+    """Replaces a line, counted from 1."""
+    lines = (root / name).read_text().splitlines()
+    lines[row - 1] = text
+    (root / name).write_text("\n".join(lines) + "\n")
+
+
+def set_times(root, times):
+    (root / TIMES).write_text("".join(f"{float(value)!r}\n" for value in times))
+
+
+def refuses(root, *words):
+    with pytest.raises(ValueError, match=re.escape(words[0])) as caught:
+        read(root)
+    missing = [word for word in words if word not in str(caught.value)]
+    assert not missing, str(caught.value)
+
+
+REFUSED = {
+    "zero rotation": (POSES, 4, "0 0 0 0 0 0 0 0 0 0 0 3", "poses/00.txt:4", "no rotation", "0 0 0 0 0 0 0 0 0"),
+    "reflected": (POSES, 4, "-1 0 0 0 0 1 0 0 0 0 1 3", "poses/00.txt:4", "mirrored", "determinant is -1"),
+    "sheared": (POSES, 9, "1 0.2 0 0 0 1 0 0 0 0 1 3", "poses/00.txt:9", "no rotation", "1 0.2 0"),
+    "scaled": (POSES, 9, "1e200 0 0 0 0 1e200 0 0 0 0 1e200 3", "poses/00.txt:9", "no rotation", "1e+200"),
+    "far": (POSES, 7, "1 0 0 1e200 0 1 0 0 0 0 1 3", "poses/00.txt:7", "position 1e+200 m", "metres"),
+    "far, in millimetres": (POSES, 7, "1 0 0 0 0 1 0 0 0 0 1 -3e6", "poses/00.txt:7", "position 3e+06 m"),
+    "not finite": (POSES, 7, "1 0 0 nan 0 1 0 0 0 0 1 3", "poses/00.txt:7", "12 finite numbers", "nan"),
+    "fx negative": (CALIBRATION, 3, "P2: -30 0 14.5 0 0 18 4.5 0 0 0 1 0", "calib.txt:3", "fx and fy", "-30"),
+    "fy zero": (CALIBRATION, 3, "P2: 30 0 14.5 0 0 0 4.5 0 0 0 1 0", "calib.txt:3", "positive", "30 and 0"),
+    "time nan": (TIMES, 5, "nan", "times.txt:5", "1 finite number", "nan"),
+    "two times": (TIMES, 5, "0.4 0.5", "times.txt:5", "got 2 words"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+def test_refused_lines(root, case):
+    name, row, text, *words = case
+    change(root, name, row, text)
+    refuses(root, *words)
+
+
+@pytest.mark.parametrize("name", [POSES, TIMES, CALIBRATION])
+def test_text_that_is_no_utf8(root, name):
+    lines = (root / name).read_bytes().splitlines(keepends=True)
+    (root / name).write_bytes(lines[0] + b"\xff\xfe" + b"".join(lines[1:]))
+    refuses(root, f"{name}:2", "UTF-8", "0xff")
+
+
+CLOCKS = {
+    "all equal": ([0.5] * ROWS, "times.txt:2", "0.5 s does not increase", "18 others of 20"),
+    "backwards": ([-0.1 * k for k in range(ROWS)], "does not increase", "18 others of 20"),
+    "begun anew": ([0.1 * (k % 10) for k in range(ROWS)], "does not increase", "9 others"),
+    "1e-300": ([k * 1e-300 for k in range(ROWS)], "median difference of its times is 1e-300 s", "seconds"),
+    "nanoseconds": ([k * 1e8 for k in range(ROWS)], "median difference of its times is 1e+08 s", "seconds"),
+}
+
+
+@pytest.mark.parametrize("case", CLOCKS.values(), ids=CLOCKS)
+def test_clocks_that_are_wrong_throughout(root, case):
+    times, *words = case
+    set_times(root, times)
+    refuses(root, *words)
+
+
+def test_a_gap_of_a_hundred_seconds(root):
+    """Speed is the mean over the gap; nothing pairs frames over it, and all else is as without it."""
+    regular = read(root)
+    times = [0.1 * k + (100.0 if k >= 12 else 0.0) for k in range(ROWS)]
+    set_times(root, times)
+    with pytest.warns(UserWarning, match=r"times.txt: 1 gaps, the longest of 100.1 s before line 13"):
+        drive = read(root)
+    others = torch.arange(ROWS) != 12
+    for key in ("state", "dt"):
+        torch.testing.assert_close(drive[key][others], regular[key][others], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(drive["dt"][12], torch.tensor([100.1]))
+    torch.testing.assert_close(drive["state"][12], torch.tensor([12.0, 0.0, 0.0, 1 / 100.1, 0.0]))
+    torch.testing.assert_close(drive["time"][:, 0], torch.tensor(times, dtype=torch.float64))
+    assert drive["frame_valid"].all()
+    observed = frames_at(drive, torch.arange(ROWS))["observed"][:, 0]
+    assert observed.equal((torch.arange(ROWS) > 0) & others)
+    assert KITTIReplayEnv(drive).dt == pytest.approx(0.1)
+
+
+def test_no_pair_is_bridged_over_a_gap(root):
+    (root / "sequences/00/image_2/000011.png").unlink()
+    (root / "sequences/00/image_2/000005.png").unlink()
+    set_times(root, [0.1 * k + (100.0 if k >= 12 else 0.0) for k in range(ROWS)])
+    with pytest.warns(UserWarning, match="1 gaps"):
+        drive = read(root)
+    steps = bridge_gaps(drive, 3)["steps"][:, 0].tolist()
+    assert steps == [0, 1, 1, 1, 1, 0, 2, 1, 1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 1, 1]
+    # The flow that is kept is of these pairs, and not that of a drive without the gap.
+    flow = with_motion(drive, cache=root / "cache")
+    set_times(root, [0.1 * k for k in range(ROWS)])
+    with_motion(read(root), cache=root / "cache")
+    assert len(list((root / "cache").glob("motion-*"))) == 2
+    assert not flow["flow"][12].any()
+
+
+@pytest.mark.parametrize(
+    ("row", "value"), [(7, 0.55), (7, 0.6), (7, 1e9), (7, 0.6001), (0, 5.0), (ROWS - 1, 0.0)], ids=str
+)
+def test_one_stamp_that_is_wrong(root, row, value):
+    """Back, repeated, far ahead, nearly repeated; first and last: that frame is masked, all else is as it was."""
+    regular = read(root)
+    times = [0.1 * k for k in range(ROWS)]
+    times[row] = value
+    set_times(root, times)
+    with pytest.warns(UserWarning, match=rf"times.txt: 1 of 20 times do not increase, the first in line {row + 1} \("):
+        drive = read(root)
+    assert drive["frame_valid"][:, 0].tolist() == [k != row for k in range(ROWS)]
+    assert not drive["image"][row].any()
+    for key in ("state", "dt", "time"):
+        torch.testing.assert_close(drive[key], regular[key], rtol=1e-5, atol=1e-6)
+
+
+def test_jitter_counts_as_a_steady_rate(root):
+    """As before: cameras are triggered, and their stamps are written a little later."""
+    regular, rng = read(root), np.random.default_rng(0)
+    set_times(root, 0.1 * np.arange(ROWS) + rng.uniform(-0.01, 0.01, ROWS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        drive = read(root)
+    assert (drive["dt"] == drive["dt"][0]).all()
+    torch.testing.assert_close(drive["state"][:, 3], regular["state"][:, 3], rtol=0.1, atol=0)
+    assert (drive["state"][:, 3] == drive["state"][0, 3]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_increasing_is_the_longest(seed):
+    """Against the quadratic rule: the longest that ends at k is one longer than that of a smaller value before."""
+    times = np.random.default_rng(seed).integers(0, 12, 30).astype(float)
+    longest: list[int] = []
+    for k, value in enumerate(times):
+        longest.append(1 + max((longest[j] for j in range(k) if times[j] < value), default=0))
+    kept = times[increasing(times)]
+    assert len(kept) == max(longest)
+    assert (np.diff(kept) > 0).all()
+
+
+@pytest.mark.parametrize("name", ["0003.png", "00000000003.png", "3.png"])
+def test_frames_of_another_name(root, name):
+    folder = root / "sequences/00" / IMAGES
+    (folder / "000003.png").rename(folder / name)
+    refuses(root, f"image_2/{name}", "FFFFFF.png", "rename it to 000003.png")
+
+
+def test_rotations_of_few_digits_pass(tmp_path):
+    make(tmp_path)
+    angles = np.linspace(0, 1, 6)
+    rows = [f"{math.cos(a):.3f} 0 {math.sin(a):.3f} 0 0 1 0 0 {-math.sin(a):.3f} 0 {math.cos(a):.3f} {k}" for k, a in
+            enumerate(angles)]  # fmt: skip
+    (tmp_path / POSES).write_text("\n".join(rows))
+    torch.testing.assert_close(read(tmp_path)["state"][:, 2], -torch.tensor(angles).float(), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("distance", [4e5, 9e5])
+def test_rendering_refuses_what_it_cannot_lay_out(tmp_path, distance):
+    """In seconds, and before it writes anything; farther places are refused by the reader of poses."""
+    (tmp_path / "poses").mkdir()
+    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {k * distance / 2:.9g}" for k in range(3)]
+    (tmp_path / "poses/00.txt").write_text("\n".join(rows))
+    begun = time.monotonic()
+    with pytest.raises(ValueError, match=r"poses/00.txt is \d+ m long, .*rows 1 and 2; .*50000 m at most") as caught:
+        render_drives(tmp_path / "out", poses=tmp_path / "poses")
+    assert f"{distance:g} m long" in str(caught.value)
+    assert time.monotonic() - begun < 2
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "poses/00.txt").write_text("\n".join(f"1 0 0 0 0 1 0 0 0 0 1 {k}e7" for k in range(3)))
+    with pytest.raises(ValueError, match=r"poses/00.txt:2: the position 1e\+07 m"):
+        render_drives(tmp_path / "out", poses=tmp_path / "poses")

@@ -1,0 +1,404 @@
+"""Readings that cannot be true: refused with the key's name, or filtered exactly as if a mask hid them, and counted."""
+
+import re
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
+
+from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
+from tests.filters.gaussian_for_tests import linear_filter
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.filters import DEnKF, Filter, LSTMFilter, ParticleFilter
+from torch_denkf.functional import soft_resample, systematic_resample
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    FromSensor,
+    GaussianLikelihood,
+    GaussianPrior,
+    LearnedLikelihood,
+    LearnedTransition,
+    LinearObservation,
+    LocalEnsembleAnalysis,
+    ParticleAnalysis,
+    Select,
+    StochasticMLP,
+    VectorSensor,
+)
+from torch_denkf.transforms import DEnKFTransform
+
+REJECTED = ("info", "rejected")
+BAD = [float("nan"), float("inf"), -float("inf"), 1e25, -2e18]
+
+
+def particles(scheme, **kwargs):
+    likelihood = GaussianLikelihood(sensor_key="observation")
+    return ParticleFilter(
+        LearnedTransition(StochasticMLP(2, 2, (8,))),
+        None,
+        LinearObservation(torch.eye(2)),
+        likelihood,
+        noise=ConstantNoise([0.5, 0.3], in_key="observation"),
+        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
+        resampling=scheme,
+        **kwargs,
+    )
+
+
+def learned_particles(**kwargs):
+    return ParticleFilter(
+        LearnedTransition(StochasticMLP(S, S, (8,))),
+        VectorSensor(M, 2, ensemble_size=1, num_cells=(8,), layer="none"),
+        Select([0, 1]),
+        LearnedLikelihood(2, 2, num_cells=(8,), encoding_key=("sensor", "ensemble")),
+        initial=GaussianPrior([0.0] * S, [1.0] * S, ensemble_size=16),
+        **kwargs,
+    )
+
+
+def local(**kwargs):
+    return DEnKF(
+        transition=LearnedTransition(StochasticMLP(2, 2, (8,))),
+        sensor=None,
+        observation=LinearObservation(torch.eye(2)),
+        noise=ConstantNoise([0.5, 0.3], in_key="observation"),
+        analysis=LocalEnsembleAnalysis.around(
+            torch.tensor([[0.0], [1.0]]), torch.tensor([[0.0], [1.0]]), 1.0, sensor_key="observation"
+        ),
+        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
+        **kwargs,
+    )
+
+
+def from_sensor(**kwargs):
+    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, sensor_key="observation")
+    return linear_denkf("etkf", initial=start, **kwargs)
+
+
+#: Filters by name, the entry that they read, and whether its components are hidden one by one.
+FILTERS = {
+    "Kalman": (linear_kalman, "observation", True),
+    "EKF": (lambda **kwargs: linear_filter("EKF", **kwargs), "observation", True),
+    "UKF": (lambda **kwargs: linear_filter("UKF", **kwargs), "observation", True),
+    "BackpropKF": (lambda **kwargs: linear_filter("BackpropKF", **kwargs), "observation", True),
+    "etkf": (lambda **kwargs: linear_denkf("etkf", **kwargs), "observation", True),
+    "perturbed": (lambda **kwargs: linear_denkf("perturbed", noisy=True, **kwargs), "observation", True),
+    "sakov": (lambda **kwargs: linear_denkf("sakov", **kwargs), "observation", True),
+    "local": (local, "observation", True),
+    "sensor": (lambda **kwargs: toy_denkf(action=False, **kwargs), "measurement", False),
+    "systematic": (lambda **kwargs: particles("systematic", **kwargs), "observation", True),
+    "soft": (lambda **kwargs: particles("soft", **kwargs), "observation", True),
+    "transport": (lambda **kwargs: particles("transport", **kwargs), "observation", True),
+    "learned likelihood": (learned_particles, "measurement", False),
+    "LSTM": (
+        lambda **kwargs: LSTMFilter(
+            None, state_dim=2, observation_key="observation", observation_dim=2, hidden_size=6, **kwargs
+        ),
+        "observation",
+        True,
+    ),
+}
+ALL = pytest.mark.parametrize("name", FILTERS)
+
+
+def make(name, **options) -> Filter:
+    """The same weights each time."""
+    torch.manual_seed(7)
+    return FILTERS[name][0](**options)
+
+
+def frames_of(name, *batch, value=float("nan"), masked=False):
+    """Sound frames with a mask, the same frames with bad values where the mask hides them, and how many that are."""
+    _, key, by_component = FILTERS[name]
+    generator = torch.Generator().manual_seed(3)
+    clean = torch.randn(*batch, M if key == "measurement" else 2, generator=generator)
+    bad = torch.rand(clean.shape, generator=generator) < 0.2
+    hidden = bad if by_component else bad.any(-1, keepdim=True)
+    observed = torch.rand(*batch, 1, generator=generator) < 0.7 if masked else torch.ones(*batch, 1, dtype=torch.bool)
+    expected = TensorDict({key: clean, "observed": observed & ~hidden}, batch)
+    spoiled = TensorDict({key: torch.where(bad, value, clean)}, batch)
+    if masked:
+        spoiled["observed"] = observed
+    return expected, spoiled, (hidden & observed).sum(-1, keepdim=True)
+
+
+def same(filter, got, expected):
+    keys = [*filter.belief_keys, *filter.log_likelihood_keys]
+    for key in keys:
+        assert got[key].isfinite().all(), key
+        torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0, msg=lambda text, key=key: f"{key}: {text}")
+
+
+@ALL
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("value", BAD)
+def test_a_sequence_is_that_of_a_mask(name, masked, value):
+    expected, spoiled, count = frames_of(name, 3, 12, value=value, masked=masked)
+    torch.manual_seed(0)
+    expected = make(name).sequence(expected)
+    torch.manual_seed(0)
+    filter = make(name, reject=True)
+    got = filter.sequence(spoiled.copy())
+    same(filter, got, expected)
+    assert (got[REJECTED][:, 0] == 0).all()  # an initial belief has rejected nothing
+    assert got[REJECTED][:, 1:].equal(count[:, 1:])
+    assert count.sum() > 0
+    for key, given in spoiled.items():  # what came in stays
+        assert ((got[key] == given) | (given != given)).all()
+
+
+@ALL
+def test_steps_are_those_of_a_mask(name):
+    expected, spoiled, count = frames_of(name, 3, 12)
+    outs = []
+    for filter, frames in ((make(name), expected), (make(name, reject=True), spoiled)):
+        torch.manual_seed(0)
+        td, out = filter.initialise(frames[:, 0].copy()), []
+        for t in range(1, 12):
+            td = filter.step(td.update(frames[:, t]))
+            out.append(td.clone())
+        outs.append(torch.stack(out, 1))
+    same(filter, outs[1], outs[0])
+    assert outs[1][REJECTED].equal(count[:, 1:])
+
+
+@ALL
+def test_nothing_changes_where_all_readings_are_sound(name):
+    frames = frames_of(name, 3, 12)[0]
+    outs = []
+    for reject in (False, True):
+        torch.manual_seed(0)
+        filter = make(name, reject=reject)
+        outs.append(filter.sequence(frames.copy()))
+    same(filter, *outs)
+    assert (outs[1][REJECTED] == 0).all()
+    assert REJECTED not in make(name).out_keys
+
+
+@ALL
+@pytest.mark.parametrize("value", BAD)
+def test_a_step_refuses_with_the_key(name, value):
+    _, key, _ = FILTERS[name]
+    filter = make(name)
+    td = filter.initialise(frames_of(name, 3)[0])
+    before = td.clone()
+    td[key][1, 0] = value
+    td["observed"][:] = True
+    with pytest.raises(ValueError, match=re.escape(f"['{key}']")):
+        filter.step(td)
+    assert all(td[belief].equal(before[belief]) for belief in filter.carry_keys)
+    td["observed"][1] = False
+    assert filter.step(td)["belief", "mean"].isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["Kalman", "etkf", "systematic"])
+def test_readings_that_no_step_uses_may_be_anything(name):
+    """Left out of a step, or of a reset that does not look at them."""
+    _, key, _ = FILTERS[name]
+    filter = make(name)
+    td = filter.initialise(TensorDict({key: torch.full((3, 2), torch.nan)}, [3]))
+    assert filter.predict(td.clone())["belief", "mean"].isfinite().all()
+    assert filter.step(td.clone(), without=[key])["belief", "mean"].isfinite().all()
+    env = TransformedEnv(base_env(missing=1.0, batch_size=[2]), ExcludeTransform("observed"))
+    env.append_transform(DEnKFTransform(make(name)))
+    td = env.reset()
+    assert td[key].isnan().all()
+    assert td["belief", "mean"].isfinite().all()
+    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+        env.step(env.rand_action(td))
+
+
+@pytest.mark.parametrize("name", ["Kalman", "etkf", "sensor", "systematic", "LSTM"])
+def test_compiled_steps_and_sequences(name):
+    """Through dynamo: one graph without a branch."""
+    _, spoiled, _ = frames_of(name, 3, 6)
+    torch.manual_seed(0)
+    eager = make(name, reject=True)
+    expected = eager.sequence(spoiled.copy())
+    torch.manual_seed(0)
+    filter = make(name, reject=True).compile(chunk=2, backend="eager")
+    got = filter.sequence(spoiled.copy())
+    for key in (*filter.belief_keys, REJECTED):
+        torch.testing.assert_close(got[key], expected[key], rtol=1e-5, atol=1e-5)
+    td = filter.initialise(spoiled[:, 0].copy())
+    assert filter.step(td.update(spoiled[:, 1]))[REJECTED].equal(got[REJECTED][:, 1])
+
+
+@pytest.mark.parametrize("name", ["Kalman", "etkf", "sensor", "systematic", "transport", "LSTM"])
+def test_packaged_steps(name, tmp_path):
+    _, spoiled, count = frames_of(name, 3, 6)
+    filter = make(name, reject=True)
+    start = filter.initialise(spoiled[:, 0].copy())
+    drawn = filter.draw_noise(start.copy())
+    step = load_step(export_step(filter, drawn.exclude("info"), tmp_path / "step.pt2", compiled=False))
+    assert "info.rejected" in step.outputs
+    noise = _flat(drawn.select("noise", strict=False))
+    carry = {".".join(key): start[key] for key in filter.carry_keys}
+    for t in range(1, 6):
+        out = step({**_flat(spoiled[:, t]), **carry, **noise})
+        carry = {name: out[name] for name in step.carry}
+        assert out["info.rejected"].equal(count[:, t])
+        assert all(value.isfinite().all() for value in carry.values())
+    assert (
+        "info.rejected"
+        not in load_step(export_step(make(name), start.exclude("info"), tmp_path / "other.pt2", compiled=False)).outputs
+    )
+
+
+def _flat(tensordict):
+    return {key if isinstance(key, str) else ".".join(key): value for key, value in tensordict.items(True, True)}
+
+
+@pytest.mark.parametrize("make_filter", [linear_kalman, lambda **kw: linear_denkf("etkf", **kw), from_sensor])
+@pytest.mark.parametrize("update_at_reset", [False, True])
+def test_the_transform_without_its_check(make_filter, update_at_reset):
+    """An environment that says when a reading is missing, and one that does not: the beliefs are the same."""
+    rollouts = []
+    for silent in (False, True):
+        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], max_steps=[3, 5], seed=1))
+        if silent:
+            env.append_transform(ExcludeTransform("observed"))
+        filter = make_filter(update_at_reset=update_at_reset)
+        env.append_transform(DEnKFTransform(filter, check_finite=False, diagnostics=[REJECTED]))
+        if silent:
+            check_env_specs(env)
+        env.set_seed(1)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(9, break_when_any_done=False))
+    said, silent = rollouts
+    missing = ~said["next", "observed"]
+    assert missing.any()
+    assert missing[:, 1:].any()
+    for key in filter.belief_keys:
+        assert said["next"][key].isfinite().all()
+        torch.testing.assert_close(silent["next"][key], said["next"][key], rtol=0, atol=0)
+        torch.testing.assert_close(silent[key], said[key], rtol=0, atol=0)
+    assert silent["next"][REJECTED].equal(2 * missing.long())
+    assert (said["next"][REJECTED] == 0).all()
+
+
+@pytest.mark.parametrize("value", BAD)
+def test_the_transform_with_its_check(value):
+    env = TransformedEnv(base_env(batch_size=[2]))
+    env.append_transform(ExcludeTransform("observed"))
+    env.append_transform(DEnKFTransform(particles("systematic")))
+    td = env.rand_action(env.reset())
+    emit = env.base_env._emit
+    env.base_env._emit = lambda *args: emit(*args).update({"observation": torch.tensor([[0.0, 0.0], [value, 0.0]])})
+    with pytest.raises(ValueError, match=r"because of .* in \['observation'\].*check_finite=False"):
+        env.step(td)
+
+
+def test_the_transform_of_a_package(tmp_path):
+    """Rejecting or refusing; without either, a word in advance."""
+    frame = TensorDict({"observation": torch.zeros(2, 2)}, [2])
+    steps = {
+        reject: load_step(export_step(linear_kalman(reject=reject), frame, tmp_path / f"{reject}.pt2", compiled=False))
+        for reject in (False, True)
+    }
+
+    def rollout(**options):
+        env = TransformedEnv(base_env(missing=0.4, batch_size=[2], seed=1)).append_transform(
+            ExcludeTransform("observed")
+        )
+        env.append_transform(DEnKFTransform(linear_kalman(), diagnostics=[], **options))
+        env.set_seed(1)
+        return env.rollout(9)["next", "belief", "mean"]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = rollout(check_finite=False)
+        torch.testing.assert_close(rollout(check_finite=False, packaged=steps[True]), expected)
+    assert expected.isfinite().all()
+    with pytest.warns(UserWarning, match="packaged step rejects no readings.*reject=True"):
+        assert rollout(check_finite=False, packaged=steps[False]).isnan().any()
+    for step in steps.values():
+        with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+            rollout(packaged=step)
+
+
+def test_gradients_do_not_meet_what_was_rejected():
+    """Also those of the sensor that would have read it: they are those of a masked frame."""
+    expected, spoiled, _ = frames_of("sensor", 3, 12)
+    gradients = []
+    for reject, frames in ((False, expected), (True, spoiled)):
+        filter = make("sensor", reject=reject)
+        torch.manual_seed(0)
+        filter.sequence(frames)["belief", "mean"].square().mean().backward()
+        gradients.append({name: value.grad for name, value in filter.named_parameters() if value.grad is not None})
+    assert gradients[0].keys() == gradients[1].keys()
+    for name, gradient in gradients[1].items():
+        assert gradient.isfinite().all(), name
+        torch.testing.assert_close(gradient, gradients[0][name])
+
+
+def test_two_sensors_with_masks_of_their_own():
+    """One is broken, the other goes on: as a filter that has it alone."""
+    _, _, H, R = linear_system()
+
+    def two(**options):
+        def analysis(key, start, end):
+            keys = {"observed_key": f"{key}_seen", "sensor_key": key, "noise_variance_key": (key + "_noise",)}
+            return EnsembleAnalysis("etkf", forecast_key=start, belief_key=end, **keys)
+
+        single = linear_denkf("etkf")
+        return Filter(
+            {
+                "noise_a": ConstantNoise(R.sqrt(), in_key="a", out_key="a_noise"),
+                "noise_b": ConstantNoise(R.sqrt(), in_key="b", out_key="b_noise"),
+                "transition": single["transition"],
+                "observation_a": LinearObservation(H),
+                "first": analysis("a", ("forecast", "ensemble"), "half"),
+                "observation_b": LinearObservation(H, in_key=("half", "ensemble")),
+                "second": analysis("b", ("half", "ensemble"), "belief"),
+            },
+            initial=single.initial,
+            **options,
+        )
+
+    clean = TensorDict({"a": torch.randn(3, 8, 2), "b": torch.randn(3, 8, 2)}, [3, 8])
+    spoiled = clean.clone()
+    spoiled["a"][:, 2:5] = torch.nan
+    masked = clean.clone()
+    masked["a_seen"] = torch.ones(3, 8, 1, dtype=torch.bool)
+    masked["a_seen"][:, 2:5] = False
+    got, expected = two(reject=True).sequence(spoiled), two().sequence(masked)
+    torch.testing.assert_close(got["belief", "ensemble"], expected["belief", "ensemble"], rtol=0, atol=0)
+    assert got[REJECTED][:, :, 0].tolist() == [[0, 0, 2, 2, 2, 0, 0, 0]] * 3
+
+
+def test_a_reading_that_no_particle_can_explain():
+    """0 / 0 of Bayes' rule: the weights stay, and the log-likelihood tells."""
+    prior = torch.tensor([0.2, 0.3, 0.5]).log()
+    td = TensorDict({
+        "forecast": {
+            "ensemble": torch.tensor([[0.0], [1.0], [2.0]]),
+            "log_weight": prior,
+            "log_likelihood": torch.full((3,), -torch.inf),
+        }
+    })  # fmt: skip
+    out = ParticleAnalysis()(td)
+    assert out["belief", "log_weight"].equal(prior)
+    torch.testing.assert_close(out["belief", "mean"], torch.tensor([1.3]))
+    assert out["info", "log_likelihood"].item() == -torch.inf
+
+
+@pytest.mark.parametrize("resample", [systematic_resample, soft_resample])
+def test_weights_that_are_not_a_number_stay_so(resample):
+    """And no index is out of bounds; the other rows are as they were."""
+    generator = torch.Generator().manual_seed(0)
+    points, weights = (
+        torch.randn(2, 16, 2, generator=generator),
+        torch.randn(2, 16, generator=generator).log_softmax(-1),
+    )
+    uniform = torch.rand(2, 1, generator=generator)
+    expected = resample(points, weights, uniform)
+    weights[0, 3] = torch.nan
+    moved, after = resample(points, weights, uniform)
+    assert after[0].isnan().all()
+    assert moved[1].equal(expected[0][1])
+    assert after[1].equal(expected[1][1])

@@ -1,0 +1,93 @@
+"""Damaged collections of UR5 demos: refused by file and line."""
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from tests.data.ur5.ur5_demos import make_demo, write_folder
+from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.data.ur5.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
+
+open_all = partial(UR5ExperienceReplay, cache=None, split="all", progress=False)
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_folder(tmp_path, [make_demo(number, 8) for number in range(4)])
+    return tmp_path
+
+
+def refuses(root, *words):
+    with pytest.raises(ValueError, match=re.escape(words[0])) as caught:
+        open_all(root)
+    missing = [word for word in (*words, COMMAND) if word not in str(caught.value)]
+    assert not missing, str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("key", ["state", "action"])
+def test_numbers_that_are_not_finite(tmp_path, key, value):
+    demo = make_demo(1, 8)
+    values = getattr(demo, key).copy()
+    values[3, 2] = value
+    write_folder(tmp_path, [make_demo(0, 8), replace(demo, **{key: values})])
+    refuses(tmp_path, "demo-000001.npz", f"'{key}'", "row 3", str(value))
+
+
+@pytest.mark.parametrize("steps", [[3, 3, 4], [-1, 2, 3], [0, 1, 8]])
+def test_pictures_of_rows_that_are_not_there(tmp_path, steps):
+    demo = make_demo(0, 8)
+    demo = replace(demo, steps=np.array(steps, np.int32), pixels=np.zeros((3, 3, 12, 16), np.uint8))
+    write_folder(tmp_path, [demo])
+    refuses(tmp_path, "demo-000000.npz", "'steps'", str(steps[0]))
+
+
+LINES = {
+    "cut": ('{"demo": 1, "fi', f"{MANIFEST}:2", '{"demo": 1, "fi'),
+    "empty": ("", f"{MANIFEST}:2", "''"),
+    "a number": ("17", f"{MANIFEST}:2", "no entry"),
+    "another field": ('{"demo": 1, "seed": 3}', f"{MANIFEST}:2", "seed"),
+    "negative": ({"demo": -1}, f"{MANIFEST}:2", "demo must be", "got -1"),
+    "rows 0": ({"rows": 0}, f"{MANIFEST}:2", "rows must be", "got 0"),
+    "rows a float": ({"rows": 8.5}, f"{MANIFEST}:2", "rows must be", "8.5"),
+    "above": ({"file": "../demo-000001.npz"}, f"{MANIFEST}:2", "../demo-000001.npz"),
+    "twice": ({"demo": 0}, f"{MANIFEST}:2", "demo 0 is listed in another line"),
+}
+
+
+def damage(root, change):
+    lines = (root / MANIFEST).read_text().splitlines()
+    lines[1] = change if isinstance(change, str) else json.dumps(json.loads(lines[1]) | change)
+    (root / MANIFEST).write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("case", LINES.values(), ids=LINES)
+def test_damaged_lines(root, case):
+    """They dropped their demo; collecting goes on without them and makes it again."""
+    change, *words = case
+    damage(root, change)
+    refuses(root, *words)
+    with pytest.warns(UserWarning, match=rf"{MANIFEST}:2 is damaged .*; its demo is made again"):
+        assert list(read_manifest(root, skip_damaged=True)) == [0, 2, 3]
+
+
+def test_text_that_is_no_utf8(root):
+    (root / MANIFEST).write_bytes((root / MANIFEST).read_bytes() + b"\xff\n")
+    with pytest.raises(ValueError, match=rf"{MANIFEST}:5 is no text in UTF-8 \(byte 0xff\)"):
+        open_all(root)
+
+
+def test_a_last_line_that_is_being_written(root):
+    text = (root / MANIFEST).read_text()
+    (root / MANIFEST).write_text(text[:-20])
+    assert [episode.demo for episode in open_all(root).episodes] == [0, 1, 2]
+
+
+def test_the_same_line_twice_is_one_demo(root):
+    entry = write_demo(root, make_demo(2, 8))
+    write_manifest(root, [*read_manifest(root).values(), entry])
+    assert len(open_all(root).episodes) == 4

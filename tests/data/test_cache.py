@@ -1,0 +1,320 @@
+"""Cache entries: what is opened is what was written, or it is made anew; nothing in them is executed."""
+
+import json
+import logging
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+import tensordict
+import torch
+from tensordict import MemoryMappedTensor, TensorDict
+
+from torch_denkf.cli.cache import main as denkf_cache
+from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget, sweep
+from torch_denkf.data.cache_entry import END, MANIFEST, DamagedEntry, check_entry, open_entry
+
+ROOT = Path(__file__).parents[2]
+NAME = "drive-0123456789abcdef"
+
+
+def content():
+    generator = torch.Generator().manual_seed(0)
+    rows = {
+        "state": torch.randn(4, 3, generator=generator),
+        "half": torch.randn(4, generator=generator).half(),
+        "observed": torch.tensor([[True], [False], [True], [True]]),
+        "empty": torch.zeros(4, 0),
+    }
+    pictures = torch.randint(0, 256, (5, 3, 100, 200), generator=generator, dtype=torch.uint8)  # 5 ends of a file
+    assert pictures.numel() > 4 * END
+    time = torch.arange(4.0, dtype=torch.float64)
+    return TensorDict({"rows": TensorDict(rows, [4]), "pixels": pictures, "time": time}, [])
+
+
+def same(one, other):
+    keys = sorted(map(str, one.keys(True, True)))
+    assert keys == sorted(map(str, other.keys(True, True)))
+    assert one.batch_size == other.batch_size
+    for key in one.keys(True, True):
+        assert one[key].dtype == other[key].dtype
+        assert torch.equal(torch.Tensor(one[key]), torch.Tensor(other[key])), key
+    return True
+
+
+def never():
+    raise AssertionError("made again")
+
+
+@pytest.fixture
+def entry(tmp_path):
+    entry = tmp_path / "cache" / NAME
+    assert same(cached(entry, content), content())
+    return entry
+
+
+def test_an_entry_is_read_back_from_its_files(entry):
+    opened = cached(entry, never)
+    assert same(opened, content())
+    assert opened["rows"].batch_size == (4,)
+    assert all(isinstance(opened[key], MemoryMappedTensor) for key in opened.keys(True, True) if key[1] != "empty")
+    files = {f"{name}.bin" for name in ("rows.state", "rows.half", "rows.observed", "rows.empty", "pixels", "time")}
+    assert set(os.listdir(entry)) == {MANIFEST, *files}
+    assert (entry / "time.bin").read_bytes() == content()["time"].numpy().tobytes()
+    about = json.loads(json.loads((entry / MANIFEST).read_text())["content"])["tensors"]["pixels"]
+    assert about["crc32"] == zlib.crc32((entry / "pixels.bin").read_bytes())
+    assert about["shape"] == [5, 3, 100, 200]
+    assert os.listdir(entry.parent) == [NAME]
+
+
+def test_what_is_filled_in_place_is_the_same(tmp_path, entry):
+    def fill(allocate):
+        store, wanted = allocate(content()), content()
+        for key in wanted.keys(True, True):
+            assert not store[key].any()
+            store[key][:] = wanted[key]
+
+    other = tmp_path / "cache" / "other-0123456789abcdef"
+    assert same(cached_in_place(other, fill), content())
+    assert (other / MANIFEST).read_bytes() == (entry / MANIFEST).read_bytes()
+
+
+def test_writing_to_an_opened_entry_changes_no_file(entry):
+    opened = cached(entry, never)
+    opened["pixels"].zero_()
+    assert not opened["pixels"].any()
+    assert same(cached(entry, never), content())
+    check_entry(entry)
+
+
+def test_workers_get_the_file_and_what_was_written_to_it(entry):
+    opened = cached(entry, never)
+    data = pickle.dumps(opened["pixels"])
+    assert len(data) < 1000  # its name
+    assert torch.equal(torch.Tensor(pickle.loads(data)), content()["pixels"])
+    part = pickle.loads(pickle.dumps(opened["pixels"][2:4]))
+    assert torch.equal(torch.Tensor(part), content()["pixels"][2:4])
+    with get_context("spawn").Pool(1) as pool:
+        assert pool.apply(torch.sum, (opened["pixels"],)) == content()["pixels"].sum()
+        opened["pixels"][0] = 7
+        assert pool.apply(torch.sum, (opened["pixels"],)) == opened["pixels"].sum()
+    assert torch.equal(pickle.loads(pickle.dumps(opened["pixels"])), torch.Tensor(opened["pixels"]))
+
+
+def damage(entry, how):
+    file = entry / "pixels.bin"
+    size = file.stat().st_size
+    flipped = {"head": 5, "tail": size - 5}
+    if how == "cut":
+        os.truncate(file, size // 2)
+    elif how == "cut, then filled with zeros":
+        os.truncate(file, size // 2)
+        os.truncate(file, size)
+    elif how == "longer":
+        with file.open("ab") as stream:
+            stream.write(b"x")
+    elif how == "gone":
+        file.unlink()
+    elif how == "a folder":
+        file.unlink()
+        file.mkdir()
+    elif how in flipped:
+        flip(file, flipped[how])
+    elif how == "small file":
+        flip(entry / "rows.state.bin", 20)
+    elif how == "no manifest":
+        (entry / MANIFEST).unlink()
+    elif how == "half a manifest":
+        os.truncate(entry / MANIFEST, 300)
+    elif how == "manifest":
+        text = (entry / MANIFEST).read_text()
+        (entry / MANIFEST).write_text(text.replace("100, 200", "200, 100"))
+    elif how == "another manifest":
+        text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {}, "tensors": {}})
+        (entry / MANIFEST).write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
+    elif how == "path":
+        outside = {"../x": {"dtype": "uint8", "shape": [1], "bytes": 1, "crc32": 0, "ends": 0}}
+        text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {"": []}, "tensors": outside})
+        (entry / MANIFEST).write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
+
+
+def flip(file, place):
+    data = bytearray(file.read_bytes())
+    data[place] ^= 1
+    file.write_bytes(data)
+
+
+WAYS = (
+    "cut",
+    "cut, then filled with zeros",
+    "longer",
+    "gone",
+    "a folder",
+    "head",
+    "tail",
+    "small file",
+    "no manifest",
+    "half a manifest",
+    "manifest",
+    "another manifest",
+    "path",
+)
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
+    damage(entry, how)
+    with pytest.raises(DamagedEntry):
+        open_entry(entry)
+    with caplog.at_level(logging.WARNING, "torch_denkf"):
+        assert same(cached(entry, content), content())
+    (record,) = caplog.records
+    assert f"the cache entry {entry} is damaged, and is made anew: " in record.getMessage()
+    assert same(cached(entry, never), content())
+    assert os.listdir(entry.parent) == [NAME]
+
+
+def test_every_byte_counts_for_the_whole_check(entry, capsys):
+    check_entry(entry)
+    flip(entry / "pixels.bin", 2 * END)  # in the middle: opening does not read it
+    cached(entry, never)
+    with pytest.raises(DamagedEntry, match=r"pixels.bin does not have its checksum"):
+        check_entry(entry)
+    words = ["--folder", str(entry.parent)]
+    assert denkf_cache(["check", *words]) == 1
+    assert "pixels.bin does not have its checksum" in capsys.readouterr().out
+    assert denkf_cache(["clear", "--damaged", *words]) == 0
+    assert os.listdir(entry.parent) == []
+    assert denkf_cache(["check", *words]) == 0
+
+
+def test_nothing_that_was_planted_is_executed(entry, tmp_path):
+    """tensordict's own format may hold pickles; an entry of the cache that holds one is none."""
+
+    class Trap:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "executed",)
+
+    names = [str(kind) for kind in tensordict.base._ACCEPTED_CLASSES if "NonTensorData" in str(kind)]
+    for name in ("pickle.pkl", "other.pickle"):
+        (entry / name).write_bytes(pickle.dumps(Trap()))
+    (entry / "_tensordict").mkdir()
+    (entry / "_tensordict" / "meta.json").write_text(
+        json.dumps({"_type": str(TensorDict), "shape": [], "device": "cpu"})
+    )
+    (entry / "meta.json").write_text(json.dumps({"_type": names[0], "_metadata": None, "stack_dim": None}))
+    assert same(cached(entry, never), content())
+    (entry / MANIFEST).unlink()
+    assert same(cached(entry, content), content())
+    assert set(os.listdir(tmp_path)) == {"cache"}
+
+
+def test_only_tensors_are_kept(tmp_path):
+    for value in ("text", torch.zeros(1, dtype=torch.complex64)):
+        with pytest.raises(TypeError, match="the cache holds tensors alone"):
+            cached(tmp_path / NAME, lambda value=value: TensorDict({"x": value}, []))
+    assert os.listdir(tmp_path) == []
+
+
+SLOW = """
+import sys, time
+from pathlib import Path
+import torch
+from tensordict import TensorDict
+from torch_denkf.data import cache
+
+def fill(allocate):
+    store = allocate(TensorDict({"x": torch.zeros(1000)}, []))
+    print("ready", flush=True)
+    sys.stdin.read()
+    store["x"].fill_(3)
+
+print(float(cache.cached_in_place(Path(sys.argv[1]), fill)["x"].sum()))
+"""
+
+
+def start(entry):
+    command = [sys.executable, "-c", SLOW, str(entry)]
+    process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_two_writers_and_one_that_is_killed(tmp_path):
+    entry = tmp_path / NAME
+    one, other, killed = start(entry), start(entry), start(entry)
+    assert len(os.listdir(tmp_path)) == 3
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert sweep(tmp_path) == 1  # and not those that are alive
+    assert one.communicate()[0] == "3000.0\n"
+    opened = cached(entry, never)  # while the other one still writes
+    assert other.communicate()[0] == "3000.0\n"
+    assert opened["x"].sum() == cached(entry, never)["x"].sum() == 3000
+    assert os.listdir(tmp_path) == [NAME]
+
+
+def test_the_next_start_sweeps(tmp_path):
+    killed = start(tmp_path / NAME)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    earlier, recent = tmp_path / ".writing-earlier1", tmp_path / ".writing-recent12"  # of a version without locks
+    for folder, age in ((earlier, 7200), (recent, 60)):
+        folder.mkdir()
+        (folder / "image.memmap").touch()
+        for path in (folder / "image.memmap", folder):
+            os.utime(path, (time.time() - age, time.time() - age))
+    cached(tmp_path / "other-0123456789abcdef", content)
+    assert sorted(os.listdir(tmp_path)) == [recent.name, "other-0123456789abcdef"]
+
+
+def test_a_sound_entry_of_another_process_is_not_taken_for_damaged(entry, monkeypatch):
+    """Found damaged, but replaced by a sound one before it could be removed."""
+    from torch_denkf.data import cache
+
+    calls = []
+
+    def open_once(folder):
+        calls.append(folder)
+        if len(calls) == 1:
+            raise DamagedEntry("it was, a moment ago")
+        return open_entry(folder)
+
+    monkeypatch.setattr(cache, "open_entry", open_once)
+    inode = entry.stat().st_ino
+    assert same(cached(entry, content), content())
+    assert entry.stat().st_ino == inode
+    assert os.listdir(entry.parent) == [NAME]
+
+
+def test_the_command_lists_and_clears(entry, capsys):
+    folder = entry.parent
+    earlier = folder / "drive-fedcba9876543210"  # of a version without manifests
+    earlier.mkdir()
+    (earlier / "meta.json").write_text("{}")
+    foreign = folder / "holiday-pictures"
+    foreign.mkdir()
+    assert entries_of(folder) == [entry, earlier]
+    assert denkf_cache(["list", "--folder", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert f"{NAME}\n" in out
+    assert f"2 entries, 0.3 MB, in {folder}\n" in out
+    assert denkf_cache(["check", "--folder", str(folder)]) == 1
+    assert f"{NAME}: sound\n" in capsys.readouterr().out
+    assert denkf_cache(["clear", "--older-than", "1", "--folder", str(folder)]) == 0
+    assert entries_of(folder) == [entry, earlier]
+    opened = open_entry(entry)
+    assert denkf_cache(["clear", "--folder", str(folder)]) == 0
+    assert f"0.3 MB removed from {folder}\n" in capsys.readouterr().out
+    assert os.listdir(folder) == [foreign.name]
+    assert same(opened, content())  # who has it open keeps it
+    forget(entry)  # is gone: no error
+    assert denkf_cache(["list", "--damaged"]) == 2
+    assert denkf_cache(["list", "--folder", str(folder / "none")]) == 0

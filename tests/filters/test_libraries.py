@@ -1,0 +1,87 @@
+"""Half a library in inductor's cache: removed, said, and compiled again; whole ones and those being written stay."""
+
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.conftest import COMPILED
+from tests.filters.factories import has_compiler
+from torch_denkf._lock import locked
+from torch_denkf.filters.inductor.libraries import clear_damaged_libraries, is_whole
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """A real library, the smallest of torch's, and its beginnings."""
+    source = min(Path(torch.__file__).parent.glob("lib/*.so"), key=os.path.getsize)
+    (tmp_path / "ab").mkdir()
+    shutil.copy(source, tmp_path / "ab" / "cabwhole.so")
+    size = os.path.getsize(source)
+    for name, length in (("empty", 0), ("head", 40), ("half", size // 2), ("nearly", size - 1)):
+        shutil.copy(source, tmp_path / "ab" / f"cab{name}.main.so")
+        os.truncate(tmp_path / "ab" / f"cab{name}.main.so", length)
+    (tmp_path / "ab" / "cabtext.so").write_text("x" * 200)
+    return tmp_path
+
+
+def test_half_libraries_go_and_whole_ones_stay(cache, caplog):
+    assert is_whole(cache / "ab" / "cabwhole.so")
+    with caplog.at_level(logging.WARNING, "torch_denkf"), locked(cache / "locks", "cabhead.lock", "compiles"):
+        removed = clear_damaged_libraries(cache)
+    assert sorted(path.name for path in removed) == [
+        "cabempty.main.so",
+        "cabhalf.main.so",
+        "cabnearly.main.so",
+        "cabtext.so",
+    ]
+    assert sorted(path.name for path in (cache / "ab").iterdir()) == ["cabhead.main.so", "cabwhole.so"]
+    assert len(caplog.records) == 4
+    assert "it is compiled again" in caplog.text
+    assert [path.name for path in clear_damaged_libraries(cache)] == ["cabhead.main.so"]
+    assert clear_damaged_libraries(cache) == []
+
+
+STEP = """
+import logging
+import torch
+from tensordict import TensorDict
+from torch_denkf.filters import KalmanFilter
+
+logging.basicConfig()
+one = torch.eye(1)
+kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one).compile()
+out = kf.step(kf.initialise(TensorDict({"observation": torch.ones(5, 1)}, [5])))
+print(out["belief", "mean"].flatten().tolist())
+print(*sorted({line.split()[-1] for line in open("/proc/self/maps") if line.rstrip().endswith(".main.so")}))
+"""
+
+
+def compiled_step():
+    """The mean after a compiled step of five robots, in a process of its own; the libraries that were loaded; log."""
+    done = subprocess.run([sys.executable, "-c", STEP], cwd=ROOT, capture_output=True, text=True, check=True)
+    mean, libraries = done.stdout.splitlines()
+    return json.loads(mean), [Path(name) for name in libraries.split()], done.stderr
+
+
+@pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
+def test_a_compilation_that_was_killed_is_done_again():
+    """A library of the tests' own cache, cut as a killed linker leaves it."""
+    mean, libraries, _ = compiled_step()
+    assert mean == pytest.approx([2 / 3] * 5)
+    library = libraries[0]
+    assert library.is_relative_to(COMPILED)
+    library.unlink()  # who has it loaded keeps it
+    library.write_bytes(b"\x7fELF" + bytes(30))
+    again, _, log = compiled_step()
+    assert again == mean
+    assert f"inductor's cache held half a library, {library}: it is compiled again" in log
+    assert is_whole(library)

@@ -1,0 +1,129 @@
+"""Results are written whole or not at all, also by killed processes and by two at a time."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torch_denkf._files import replacing, reserve, write_bytes, write_text
+from torch_denkf._lock import locked
+
+ROOT = Path(__file__).parents[1]
+
+
+def start(code, *arguments):
+    """A process that says when it holds what it holds."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+WRITES = """
+import sys
+from torch_denkf._files import replacing
+with replacing(sys.argv[1]) as beside:
+    beside.write_text("half")
+    print("ready", flush=True)
+    sys.stdin.read()
+    beside.write_text("whole")
+"""
+
+LOCKS = """
+import sys
+from pathlib import Path
+from torch_denkf._lock import locked
+with locked(Path(sys.argv[1]), ".lock", "is writing to it"):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_failure_leaves_what_was_there(tmp_path):
+    file = tmp_path / "new" / "table.csv"
+    write_text(file, "earlier")
+    for error in (ValueError, KeyboardInterrupt, OSError):
+        with pytest.raises(error):
+            fail_half_way(file, error)
+    assert file.read_text() == "earlier"
+    assert os.listdir(file.parent) == ["table.csv"]
+    write_bytes(file, b"later")
+    assert file.read_bytes() == b"later"
+    assert file.stat().st_mode & 0o777 == 0o666 & ~_mask()
+
+
+def fail_half_way(file, error):
+    with replacing(file) as beside:
+        assert (beside.parent, beside.suffix) == (file.parent, ".csv")
+        beside.write_text("half")
+        raise error
+
+
+def _mask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_what_a_killed_writer_left_goes_and_what_a_living_one_writes_stays(tmp_path):
+    file = tmp_path / "result.json"
+    write_text(file, "earlier")
+    alive, killed = start(WRITES, file), start(WRITES, file)
+    assert len(os.listdir(tmp_path)) == 3
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert file.read_text() == "earlier"
+    (tmp_path / ".hidden.part").write_text("not ours")
+    write_text(tmp_path / "other.json", "another result")
+    assert len(os.listdir(tmp_path)) == 4  # both results, the living one's half, and the hidden file
+    alive.communicate()
+    assert file.read_text() == "whole"
+    assert sorted(os.listdir(tmp_path)) == [".hidden.part", "other.json", "result.json"]
+
+
+def test_links_stay_and_devices_are_written_to(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "last.pt").symlink_to(tmp_path / "elsewhere" / "last.pt")
+    write_text(tmp_path / "last.pt", "new")
+    assert (tmp_path / "last.pt").is_symlink()
+    assert (tmp_path / "elsewhere" / "last.pt").read_text() == "new"
+    write_text("/dev/null", "nothing")
+    assert not Path("/dev/null").is_file()
+    with pytest.raises(IsADirectoryError, match=r"cannot write .*elsewhere: Is a directory .*choose another"):
+        write_text(tmp_path / "elsewhere", "text")
+
+
+def test_errors_of_other_files_are_not_the_writers(tmp_path):
+    match = r"^\[Errno 2\] No such file or directory: '/nowhere'$"
+    with pytest.raises(FileNotFoundError, match=match), replacing(tmp_path / "a.txt"):
+        Path("/nowhere").read_text()
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot write .*file/a.txt: .*; choose another folder"):
+        write_text(tmp_path / "file" / "a.txt", "")
+
+
+def test_space_is_reserved_where_the_file_system_does_not_know_how(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(95, "not supported")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with (tmp_path / "file").open("wb") as stream:
+        reserve(stream, 20_000_000)
+        stream.write(b"abc")
+    data = (tmp_path / "file").read_bytes()
+    assert (len(data), data[:4]) == (20_000_000, b"abc\0")
+
+
+def test_a_folder_is_one_process_s_alone(tmp_path):
+    holder = start(LOCKS, tmp_path)
+    match = rf"cannot use .*{tmp_path.name}: another process is writing to it \(process {holder.pid}\); wait"
+    with pytest.raises(OSError, match=match), locked(tmp_path, ".lock", "is writing to it"):
+        pass
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    with locked(tmp_path, ".lock", "is writing to it"):
+        assert os.listdir(tmp_path) == [".lock"]
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,326 @@
+"""Checks of what comes in at the borders: the message names the argument and its value, and says what to pass.
+
+There are three kinds. Shapes and dtypes are known without looking at a tensor's values, so that functions check them
+wherever they run, also under ``torch.compile``. Numbers and constants are checked by constructors, which see their
+values. Text is checked by readers, which add the file and the line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "check_count",
+    "check_covariance",
+    "check_ensemble",
+    "check_mask",
+    "check_number",
+    "check_one_dtype",
+    "check_shape",
+    "check_square",
+    "check_values",
+    "read_lines",
+]
+
+
+# ------------------------------------------------------------------------------------------------- shapes and dtypes
+
+
+def check_shape(name: str, tensor: Tensor, shape: Sequence[int], layout: str) -> None:
+    """Raise unless ``tensor`` has exactly this shape.
+
+    Args:
+        name: the argument's name, for the message.
+        tensor: the argument.
+        shape: the shape it must have.
+        layout: the shape in words, such as ``"[*B, E, O]"``.
+
+    Raises:
+        ValueError: if the shape differs.
+    """
+    if tensor.shape != tuple(shape):
+        raise ValueError(
+            f"{name} must be {layout} = {list(shape)}, got {list(tensor.shape)}; reshape or expand it first"
+        )
+
+
+def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
+    """Raise unless ``ensemble`` is ``[*B, E, S]`` with ``E >= min_size``.
+
+    Args:
+        name: the argument's name, for the message.
+        ensemble: the argument.
+        min_size: the fewest members that make sense.
+
+    Raises:
+        ValueError: if there are too few dimensions or members.
+    """
+    if ensemble.ndim < 2:
+        raise ValueError(
+            f"{name} must be [*B, E, S] (members, then components), got {list(ensemble.shape)}; "
+            "add the missing dimension with unsqueeze"
+        )
+    if ensemble.shape[-2] < min_size:
+        raise ValueError(
+            f"{name} has E = {ensemble.shape[-2]} members in shape {list(ensemble.shape)}, "
+            f"but at least {min_size} are needed; use a larger ensemble"
+        )
+
+
+def check_one_dtype(**tensors: Tensor | None) -> None:
+    """Raise unless all tensors have the dtype of the first.
+
+    Args:
+        **tensors: the arguments by name; ``None`` is passed over.
+
+    Raises:
+        TypeError: if two differ.
+
+    Example:
+        >>> check_one_dtype(mean=torch.zeros(1), cov=torch.zeros(1, 1, dtype=torch.float64))
+        Traceback (most recent call last):
+        ...
+        TypeError: cov is torch.float64 and mean is torch.float32; convert one of them, e.g. cov.to(mean.dtype)
+    """
+    first: tuple[str, torch.dtype] | None = None
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if first is None:
+            first = name, tensor.dtype
+        elif tensor.dtype != first[1]:
+            raise TypeError(
+                f"{name} is {tensor.dtype} and {first[0]} is {first[1]}; convert one of them, e.g. "
+                f"{name}.to({first[0]}.dtype)"
+            )
+
+
+def check_mask(name: str, mask: Tensor | None) -> None:
+    """Raise unless a mask is boolean, or ``None``.
+
+    Raises:
+        ValueError: if it has another dtype.
+    """
+    if mask is not None and mask.dtype != torch.bool:
+        raise ValueError(f"{name} must be boolean, got {mask.dtype}; pass {name}.bool()")
+
+
+# ----------------------------------------------------------------------------------------------- numbers and constants
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    cure: str = "",
+) -> None:
+    """Raise unless ``value`` is a finite number within limits; a tensor, if all of its values are.
+
+    Args:
+        name: the argument's name, for the message.
+        value: the argument.
+        above: what it must be larger than.
+        least: its smallest value.
+        below: what it must be smaller than.
+        most: its largest value.
+        cure: what to do, as an end of the message.
+
+    Raises:
+        TypeError: if it is no number.
+        ValueError: if it is out of range.
+
+    Example:
+        >>> check_number("relaxation", 2, least=0, most=1)
+        Traceback (most recent call last):
+        ...
+        ValueError: relaxation must be finite, at least 0 and at most 1; got 2
+    """
+    if isinstance(value, Tensor):
+        check_values(name, value, above=above, least=least, below=below, most=most, cure=cure)
+        return
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})" + _end(cure))
+    number = float(value)
+    inside = (
+        math.isfinite(number)
+        and (above is None or number > above)
+        and (least is None or number >= least)
+        and (below is None or number < below)
+        and (most is None or number <= most)
+    )
+    if not inside:
+        raise ValueError(f"{name} must be {_range(above, least, below, most)}; got {value!r}" + _end(cure))
+
+
+def check_count(name: str, value: Any, *, least: int = 1, cure: str = "") -> None:
+    """Raise unless ``value`` is a whole number, at least so large.
+
+    Raises:
+        TypeError: if it is no whole number.
+        ValueError: if it is too small.
+
+    Example:
+        >>> check_count("ensemble_size", -3)
+        Traceback (most recent call last):
+        ...
+        ValueError: ensemble_size must be a whole number, at least 1; got -3
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(
+            f"{name} must be a whole number, at least {least}; got {value!r} ({type(value).__name__})" + _end(cure)
+        )
+    if value < least:
+        raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}" + _end(cure))
+
+
+def check_values(
+    name: str,
+    tensor: Tensor,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    infinite: bool = False,
+    cure: str = "",
+) -> None:
+    """Raise unless all values of a constant are finite and within limits; one without values, on "meta", passes.
+
+    Args:
+        name: the argument's name, for the message.
+        tensor: the argument.
+        above: what the values must be larger than.
+        least: their smallest value.
+        below: what they must be smaller than.
+        most: their largest value.
+        infinite: whether infinity will do.
+        cure: what to do, as an end of the message.
+
+    Raises:
+        ValueError: if one is not; the message has its index.
+    """
+    if not _has_values(tensor):
+        return
+    values = tensor.detach()
+    good = ~values.isnan() if infinite else values.isfinite()
+    for limit, compare in ((above, torch.gt), (least, torch.ge), (below, torch.lt), (most, torch.le)):
+        if limit is not None:
+            good = good & compare(values, limit)
+    if not bool(good.all()):
+        at = (~good).nonzero()[0].tolist()
+        value = values[tuple(at)].item()
+        where = f" at {at}" if at else ""
+        raise ValueError(
+            f"{name} must be {_range(above, least, below, most, infinite)}; got {value!r}{where}" + _end(cure)
+        )
+
+
+def check_square(name: str, matrix: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
+    """Raise unless ``matrix`` is square, and of ``size`` where that is given.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
+    if not square or (size is not None and matrix.shape[0] != size):
+        expected = layout if size is None else f"{layout} = {[size, size]}"
+        raise ValueError(f"{name} must be {expected}, got {list(matrix.shape)}")
+
+
+def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
+    """Raise unless a constant is a covariance: square, finite, symmetric and positive semi-definite, up to rounding.
+
+    What is tested are the correlations, so that metres and milliradians count alike.
+
+    Args:
+        name: the argument's name, for the message.
+        cov: the argument, ``[N, N]``.
+        size: N, where it is known.
+        layout: the shape in words.
+
+    Raises:
+        ValueError: if it is none.
+
+    Example:
+        >>> check_covariance("cov", torch.tensor([[1.0, 2.0], [2.0, 1.0]]))
+        Traceback (most recent call last):
+        ...
+        ValueError: cov must be positive semi-definite; its correlations have the eigenvalue -1. Pass A @ A.T ...
+    """
+    check_square(name, cov, size, layout)
+    check_values(name, cov)
+    if not _has_values(cov):
+        return
+    matrix = cov.detach().to("cpu", torch.float64)
+    variance = matrix.diagonal()
+    check_values(f"{name}, a covariance, on its diagonal", variance, least=0)
+    std = variance.sqrt()
+    inverse = torch.where(std > 0, 1 / torch.where(std > 0, std, 1), 0)
+    rounding = 100 * max(len(matrix), 1) * torch.finfo(cov.dtype).eps
+    correlation = matrix * inverse.unsqueeze(-1) * inverse
+    away = (correlation - correlation.mT).abs()
+    empty = (std == 0).unsqueeze(-1) | (std == 0)
+    wrong = (away > rounding) | (empty & (matrix != 0))
+    if bool(wrong.any()):
+        row, column = wrong.nonzero()[0].tolist()
+        raise ValueError(
+            f"{name} must be a symmetric covariance; it has {matrix[row, column]:g} at {[row, column]} and "
+            f"{matrix[column, row]:g} at {[column, row]}, beside variances {variance[row]:g} and {variance[column]:g}. "
+            "Pass (P + P.T) / 2, and zero beside a variance of zero"
+        )
+    lowest = float(torch.linalg.eigvalsh((correlation + correlation.mT) / 2)[0]) if len(matrix) else 0.0
+    if lowest < -rounding:
+        raise ValueError(
+            f"{name} must be positive semi-definite; its correlations have the eigenvalue {lowest:.3g}. Pass A @ A.T "
+            "of a root A, or the sample covariance of more samples than dimensions"
+        )
+
+
+def _has_values(tensor: Tensor) -> bool:
+    """Whether a constant's values can be looked at: not on "meta", of a fake tensor, or while a graph is traced."""
+    return type(tensor) in (Tensor, torch.nn.Parameter) and not tensor.is_meta and not torch.compiler.is_compiling()
+
+
+def _range(above=None, least=None, below=None, most=None, infinite: bool = False) -> str:
+    words = [] if infinite else ["finite"]
+    words += [f"above {above:g}"] if above is not None else []
+    words += [f"at least {least:g}"] if least is not None else []
+    words += [f"below {below:g}"] if below is not None else []
+    words += [f"at most {most:g}"] if most is not None else []
+    return " and ".join(", ".join(words).rsplit(", ", 1)) if words else "a number, not NaN"
+
+
+def _end(cure: str) -> str:
+    return f". {cure}" if cure else ""
+
+
+# ----------------------------------------------------------------------------------------------------------- text
+
+
+def read_lines(file: Path) -> list[str]:
+    """The lines of a text file in UTF-8.
+
+    Raises:
+        ValueError: if it is no such text; the message names the file and the line.
+    """
+    data = file.read_bytes()
+    try:
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        byte = data[error.start]
+        raise ValueError(
+            f"{file}:{line} is no text in UTF-8 (byte 0x{byte:02x}); is the file compressed or damaged? Download or "
+            "copy it anew, or convert it to UTF-8"
+        ) from error

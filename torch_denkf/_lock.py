@@ -1,0 +1,101 @@
+"""Locks that end with the process that holds them, however it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["locked", "remove_locked", "take_lock"]
+
+
+def take_lock(file: Path, *, create: bool = True) -> int | None:
+    """Takes the lock of a file without waiting.
+
+    Args:
+        file: what is locked.
+        create: whether the file may be made.
+
+    Returns:
+        A file descriptor, whose closing ends the lock; None while another one holds it, and without the file.
+
+    Raises:
+        OSError: if the file cannot be opened, or its file system knows no locks.
+    """
+    try:
+        descriptor = os.open(file, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if create else 0), 0o644)
+    except FileNotFoundError:
+        if create:
+            raise
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.samestat(os.fstat(descriptor), os.stat(file)):
+            return descriptor
+    except (BlockingIOError, FileNotFoundError):  # another one holds it, or has just removed it
+        pass
+    except BaseException:
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None
+
+
+def remove_locked(folder: Path, name: str) -> None:
+    """Removes a folder, the file that is its lock last: what a kill leaves of it is still known as a dead process's."""
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name != name:
+                path.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def locked(folder: Path, name: str, doing: str) -> Iterator[None]:
+    """A folder is this process's alone, until the block or the process ends.
+
+    Args:
+        folder: made where it is not there.
+        name: of the file that is the lock; it goes with it.
+        doing: what holders of the lock do in the folder, for the message: ``"is writing to it"``.
+
+    Raises:
+        OSError: if another process holds the lock, or the folder cannot be written to; names the folder and the
+            process.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with locked(folder, ".lock", "is writing to it"), locked(folder, ".lock", "is writing to it"):
+        ...     pass
+        Traceback (most recent call last):
+        OSError: cannot use ...: another process is writing to it (process ...); wait for it to end, or choose ...
+    """
+    file = folder / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = take_lock(file) or take_lock(file)  # the first holder may have removed it at that moment
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot use {folder}: {error.strerror}; choose another folder") from error
+    if held is None:
+        holder = ""
+        with contextlib.suppress(OSError):
+            holder = file.read_text().strip()
+        raise OSError(
+            f"cannot use {folder}: another process {doing} ({holder or 'unknown'}); wait for it to end, or choose "
+            "another folder"
+        )
+    try:
+        os.ftruncate(held, 0)
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without the number
+            os.write(held, f"process {os.getpid()}".encode())
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+        os.close(held)

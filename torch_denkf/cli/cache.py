@@ -1,0 +1,100 @@
+"""``denkf cache``: what is kept of earlier runs, whether it is sound, and how to be rid of it.
+
+::
+
+    denkf cache list                     # entries, sizes, ages
+    denkf cache check                    # every byte against its checksum; 1 if one is damaged
+    denkf cache clear --older-than 30    # entries of which nothing was written in 30 days
+    denkf cache clear --damaged
+
+Entries are decoded pictures and optical flow: all can be made again, from the recordings. From Python:
+
+>>> import tempfile
+>>> main(["list", "--folder", tempfile.mkdtemp()])
+0 entries, 0.0 MB, in ...
+0
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from torch_denkf.cli._command import Command, say
+
+__all__ = ["main"]
+
+_DAY = 86400.0
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "what",
+        choices=("list", "check", "clear"),
+        help="list entries, compare them with their checksums, or remove them",
+    )
+    add("--folder", type=Path, help="of the cache; $TORCH_DENKF_CACHE, or else ~/.cache/torch_denkf, by default")
+    add("--damaged", action="store_true", help="clear: only what is damaged, or of an earlier version")
+    add("--older-than", type=float, metavar="DAYS", help="clear: only what was written before so many days")
+
+
+def _run(args: argparse.Namespace) -> int:
+    from torch_denkf.data.cache import entries_of, forget, sweep, usual_folder
+
+    if args.what != "clear" and (args.damaged or args.older_than is not None):
+        raise ValueError("--damaged and --older-than belong to denkf cache clear")
+    folder = (args.folder or usual_folder()).expanduser()
+    swept = sweep(folder) if folder.is_dir() else 0
+    if swept:
+        say(f"removed what {swept} killed processes left half written")
+    entries, damaged, size = entries_of(folder), 0, 0
+    for entry in entries:
+        bytes_, age = _size(entry), (time.time() - entry.stat().st_mtime) / _DAY
+        text = f"{bytes_ / 1e6:10.1f} MB  {age:7.1f} days  {entry.name}"
+        if args.what == "list":
+            say(text)
+        elif args.what == "check":
+            wrong = _wrong(entry)
+            damaged += wrong is not None
+            say(f"{text}: {wrong or 'sound'}")
+        else:
+            if (args.older_than is not None and age < args.older_than) or (args.damaged and _wrong(entry) is None):
+                continue
+            forget(entry)
+            say(f"{text}: removed")
+        size += bytes_
+    if args.what == "clear":
+        say(f"{size / 1e6:.1f} MB removed from {folder}")
+        return 0
+    say(f"{len(entries)} entries, {size / 1e6:.1f} MB, in {folder}")
+    if damaged:
+        say(f"{damaged} damaged: each is made anew when it is next used, or goes with denkf cache clear --damaged")
+    return 1 if damaged else 0
+
+
+def _size(entry: Path) -> int:
+    return sum(file.stat().st_size for file in entry.rglob("*") if file.is_file())
+
+
+def _wrong(entry: Path) -> str | None:
+    from torch_denkf.data.cache_entry import DamagedEntry, check_entry
+
+    try:
+        check_entry(entry)
+    except (DamagedEntry, FileNotFoundError) as error:
+        return str(error)
+    return None
+
+
+main = Command(
+    "cache",
+    "List, check or clear what is kept of earlier runs: decoded pictures and optical flow.",
+    "denkf cache check",
+    _arguments,
+    _run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

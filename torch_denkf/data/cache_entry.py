@@ -1,0 +1,274 @@
+"""One entry of the cache: tensors as files, and a manifest that says what they are and what they must sum up to.
+
+::
+
+    ENTRY/manifest.json      format, batch sizes, and of each tensor: file, dtype, shape, bytes, checksums
+    ENTRY/NAME.bin           a tensor's bytes in C order, little endian; NAME is its key, nested ones joined by dots
+
+Nothing else is read, and nothing that is read can hold code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import sys
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from tensordict import MemoryMappedTensor, TensorDict, is_leaf_nontensor
+from torch import Tensor
+
+from torch_denkf._files import reserve, sync
+
+__all__ = [
+    "MANIFEST",
+    "CachedTensor",
+    "DamagedEntry",
+    "check_entry",
+    "is_entry",
+    "open_entry",
+    "reserve_entry",
+    "seal_entry",
+    "write_entry",
+]
+
+MANIFEST = "manifest.json"
+FORMAT = "torch_denkf.cache/1"
+END = 1 << 16  # bytes at either end of a file that are compared when it is opened
+_BLOCK = 1 << 24  # bytes that are written or summed at a time
+_LARGEST_MANIFEST = 1 << 20
+_DTYPES = {
+    str(dtype).removeprefix("torch."): dtype
+    for dtype in (torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32, torch.float64)
+}
+_MAP = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
+
+
+class DamagedEntry(Exception):
+    """What is wrong with an entry."""
+
+
+class CachedTensor(MemoryMappedTensor):
+    """A file of the cache as a tensor: a process that writes to it changes a copy of its own, never the file.
+
+    Workers get the name of the file, not its content.
+    """
+
+    @classmethod
+    def from_filename(cls, filename, dtype, shape, index=None) -> CachedTensor:
+        """Maps a file; where it is shorter than the tensor, that is an error, and it does not grow."""
+        shape, file = torch.Size(shape), Path(filename)
+        tensor = _map(file, dtype, shape, _MAP)
+        out = cls(tensor if index is None else tensor[index])
+        out.filename, out._handler, out.index, out.parent_shape = str(file), None, index, shape
+        return out
+
+    def __reduce__(self):
+        if self._version:  # it was written to: no longer what the file holds
+            return self.as_subclass(Tensor).clone().__reduce_ex__(2)
+        return super().__reduce__()
+
+
+def reserve_entry(folder: Path, like: TensorDict) -> TensorDict:
+    """Makes an entry whose tensors are still to be filled, where they lie, and reserves their space on the disk.
+
+    Args:
+        folder: of the entry; made.
+        like: shapes and dtypes.
+
+    Returns:
+        Zeros, mapped to the files; :func:`seal_entry` finishes the entry.
+
+    Raises:
+        OSError: if there is not enough space.
+    """
+    folder.mkdir()
+    out = TensorDict({}, like.batch_size)
+    for name, tensor in _tensors(like):
+        file = folder / f"{'.'.join(name)}.bin"
+        with file.open("wb") as stream:
+            reserve(stream, tensor.numel() * tensor.element_size())
+        out.set(name, _map(file, tensor.dtype, tensor.shape, mmap.MAP_SHARED))
+    for name, size in _batch_sizes(like):
+        if name:
+            out.get(name).batch_size = size
+    return out
+
+
+def write_entry(folder: Path, content: TensorDict) -> None:
+    """Writes tensors that are in memory as an entry.
+
+    Raises:
+        OSError: if there is not enough space.
+    """
+    folder.mkdir()
+    for name, tensor in _tensors(content):
+        file = folder / f"{'.'.join(name)}.bin"
+        with file.open("wb", buffering=0) as stream:
+            data = _bytes(tensor).numpy().data
+            reserve(stream, len(data))
+            for begin in range(0, len(data), _BLOCK):
+                part = data[begin : begin + _BLOCK]
+                while len(part):
+                    part = part[stream.write(part) :]
+    seal_entry(folder, content)
+
+
+def seal_entry(folder: Path, content: TensorDict) -> None:
+    """Sums up the files of an entry, writes its manifest, and waits until all is on the disk."""
+    tensors = {}
+    for name, tensor in _tensors(content):
+        file = folder / f"{'.'.join(name)}.bin"
+        sync(file)
+        with file.open("rb") as stream:
+            sums = {"crc32": _whole(stream), "ends": _ends(stream)}
+        shape = {"dtype": str(tensor.dtype).removeprefix("torch."), "shape": list(tensor.shape)}
+        tensors[".".join(name)] = {**shape, "bytes": file.stat().st_size, **sums}
+    sizes = {".".join(name): list(size) for name, size in _batch_sizes(content)}
+    text = json.dumps({"format": FORMAT, "batch_sizes": sizes, "tensors": tensors})
+    file = folder / MANIFEST
+    file.write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
+    sync(file)
+    sync(folder)
+
+
+def open_entry(folder: Path) -> TensorDict:
+    """Maps the tensors of an entry, after a look at sizes and at both ends of each file.
+
+    Raises:
+        DamagedEntry: if something is wrong; says what.
+        FileNotFoundError: without the entry.
+    """
+    content = _read_manifest(folder)
+    try:
+        out = TensorDict({}, content["batch_sizes"][""], device="cpu")
+        for name, about in content["tensors"].items():
+            file = folder / f"{name}.bin"
+            _check(file, about, whole=False)
+            out.set(tuple(name.split(".")), CachedTensor.from_filename(file, _DTYPES[about["dtype"]], about["shape"]))
+        for name, size in content["batch_sizes"].items():
+            if name:
+                out.get(tuple(name.split("."))).batch_size = size
+    except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
+        raise DamagedEntry(f"{folder / MANIFEST} does not fit its files ({error})") from error
+    return out.lock_()
+
+
+def check_entry(folder: Path) -> None:
+    """Compares every byte of an entry with its checksums.
+
+    Raises:
+        DamagedEntry: if something is wrong; says what.
+        FileNotFoundError: without the entry.
+    """
+    for name, about in _read_manifest(folder)["tensors"].items():
+        _check(folder / f"{name}.bin", about, whole=True)
+
+
+def is_entry(folder: Path) -> bool:
+    """Whether a folder is one that this module writes, sound or not."""
+    try:
+        with (folder / MANIFEST).open("rb") as stream:
+            return FORMAT.encode() in stream.read(_LARGEST_MANIFEST)
+    except OSError:
+        return False
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    file = folder / MANIFEST
+    try:
+        with file.open("rb") as stream:
+            sealed = json.loads(stream.read(_LARGEST_MANIFEST))
+        text = sealed["content"]
+        content = json.loads(text)
+        sound = zlib.crc32(text.encode()) == sealed["crc32"] and content["format"] == FORMAT
+    except (FileNotFoundError, NotADirectoryError):
+        if folder.is_dir():
+            raise DamagedEntry(f"it has no {MANIFEST}: another version wrote it, or a part was deleted") from None
+        raise FileNotFoundError(f"no entry {folder}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedEntry(f"{file} cannot be read ({error})") from error
+    if not sound:
+        raise DamagedEntry(f"{file} does not have its checksum")
+    for name in content["tensors"]:
+        if "/" in name or "\0" in name:
+            raise DamagedEntry(f"{file} names a file outside: {name!r}")
+    return content
+
+
+def _check(file: Path, about: dict[str, Any], whole: bool) -> None:
+    try:
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            expected = torch.Size(about["shape"]).numel() * _DTYPES[about["dtype"]].itemsize
+            if not size == about["bytes"] == expected:
+                raise DamagedEntry(f"{file} has {size} bytes instead of {expected}")
+            if _ends(stream) != about["ends"] or (whole and _whole(stream) != about["crc32"]):
+                raise DamagedEntry(f"{file} does not have its checksum")
+    except OSError as error:
+        raise DamagedEntry(f"{file} cannot be read ({error.strerror})") from error
+
+
+def _whole(stream: BinaryIO) -> int:
+    stream.seek(0)
+    total = 0
+    while block := stream.read(_BLOCK):
+        total = zlib.crc32(block, total)
+    return total
+
+
+def _ends(stream: BinaryIO) -> int:
+    """Of a small file, all of it."""
+    size = os.fstat(stream.fileno()).st_size
+    stream.seek(0)
+    total = zlib.crc32(stream.read(END))
+    if size > END:
+        stream.seek(max(END, size - END))
+        total = zlib.crc32(stream.read(END), total)
+    return total
+
+
+def _map(file: Path, dtype: torch.dtype, shape: torch.Size, flags: int) -> Tensor:
+    size = shape.numel() * dtype.itemsize
+    with file.open("r+b" if flags & mmap.MAP_SHARED else "rb") as stream:
+        there = os.fstat(stream.fileno()).st_size
+        if there != size:
+            raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made anew")
+        if not size:
+            return torch.empty(shape, dtype=dtype)
+        mapped = mmap.mmap(stream.fileno(), size, flags, mmap.PROT_READ | mmap.PROT_WRITE)
+    return torch.frombuffer(mapped, dtype=dtype).reshape(shape)
+
+
+def _bytes(tensor: Tensor) -> Tensor:
+    return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
+
+
+def _tensors(content: TensorDict) -> Iterator[tuple[tuple[str, ...], Tensor]]:
+    for key in content.keys(include_nested=True, leaves_only=True, is_leaf=is_leaf_nontensor):
+        name = (key,) if isinstance(key, str) else key
+        value = content.get(key)
+        dtype = str(getattr(value, "dtype", type(value).__name__)).removeprefix("torch.")
+        if dtype not in _DTYPES or not isinstance(value, Tensor) or any("." in part or "/" in part for part in name):
+            raise TypeError(f"the cache holds tensors alone, of {', '.join(_DTYPES)}; {key!r} is {dtype}")
+        yield name, value
+
+
+def _batch_sizes(content: TensorDict) -> Iterator[tuple[tuple[str, ...], torch.Size]]:
+    yield (), content.batch_size
+    for key in content.keys(include_nested=True):
+        value = content.get(key)
+        if isinstance(value, TensorDict):
+            yield (key,) if isinstance(key, str) else key, value.batch_size
+
+
+with contextlib.suppress(AttributeError):  # workers get the name of the file
+    from multiprocessing.reduction import ForkingPickler
+
+    ForkingPickler.register(CachedTensor, lambda tensor: tensor.__reduce__())

@@ -1,0 +1,105 @@
+"""Rows of a recording that are not sound: kept in their place, masked and counted."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.data.times import MOST_WRONG, filled, sound
+
+__all__ = ["mask_rows", "sound_times"]
+
+_NUMBERS = ("state", "action")
+
+
+def sound_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
+
+    Args:
+        times: as they are stored, s.
+        fps: rows a second.
+        source: file and episode, for the message.
+
+    Raises:
+        ValueError: if more than a tenth are not finite or do not increase.
+    """
+    times = np.asarray(times, np.float64)
+    good = sound(times)
+    wrong = np.flatnonzero(~good)
+    if len(wrong) > MOST_WRONG * len(times):
+        raise ValueError(
+            f"{source}: the timestamp {times[wrong[0]]:g} of frame {wrong[0]} does not increase, nor do "
+            f"{len(wrong) - 1} others of {len(times)}; expected seconds that count frames, k / fps: download it anew, "
+            "or write them anew"
+        )
+    return (filled(times, good, 1 / fps) if len(wrong) else times), good
+
+
+def mask_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
+    """Masks rows whose numbers or times are not sound, where there are any.
+
+    ``state`` and ``action`` of a row that are not finite hold those of the last row of the episode that are. The row is
+    not observed, is left out of losses (``("collector", "mask")``) and, by ``NAME_observed``, out of statistics. A
+    row with a wrong time is not observed. A warning counts both.
+
+    Args:
+        rows: batch size ``[N]``, with ``state``, ``observed``, ``episode``, ``frame`` and maybe ``action``; changed.
+        stamped: whether a row's time is right, bool ``[N]``; ``None`` for all.
+        source: where they are from, for the messages.
+
+    Returns:
+        The rows.
+
+    Raises:
+        ValueError: if an episode has no row that is finite.
+    """
+    if stamped is not None and not bool(stamped.all()):
+        _warn(rows, ~stamped, source, "a timestamp that does not increase", "observed False")
+        rows["observed"] &= stamped.unsqueeze(-1)
+    for name in _NUMBERS:
+        if name not in rows:
+            continue
+        finite = rows[name].isfinite().all(-1)
+        if bool(finite.all()):
+            continue
+        what = f"observed and {name}_observed False, and are left out of losses"
+        _warn(rows, ~finite, source, f"{name!r} that is not finite", what)
+        rows[name] = rows[name][_last_sound(rows["episode"], finite, name, source)]
+        rows[f"{name}_observed"] = finite.unsqueeze(-1)
+        rows["observed"] &= finite.unsqueeze(-1)
+        mask = rows.get(("collector", "mask"), None)
+        rows["collector", "mask"] = finite if mask is None else mask & finite
+    return rows
+
+
+def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tensor:
+    """For each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
+    row = torch.arange(len(episode))
+    lengths = torch.unique_consecutive(episode, return_counts=True)[1]
+    first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
+    last = torch.where(finite, row, -1).cummax(0).values
+    following = torch.where(finite, row, len(row)).flip(0).cummin(0).values.flip(0)
+    end = first + lengths.repeat_interleave(lengths)
+    index = torch.where(last >= first, last, following)
+    empty = index >= end
+    if bool(empty.any()):
+        number = int(episode[empty][0])
+        raise ValueError(
+            f"{source}: no row of episode {number} has a {name!r} that is finite; download it anew, or leave the "
+            "episode out"
+        )
+    return index
+
+
+def _warn(rows: TensorDict, wrong: Tensor, source: str, what: str, then: str) -> None:
+    at = int(wrong.nonzero()[0])
+    place = f"frame {int(rows['frame'][at])} of episode {int(rows['episode'][at])}"
+    warnings.warn(
+        f"{source}: {int(wrong.sum())} of {len(wrong)} rows have {what}, the first is {place}; they count as missing "
+        f"({then})",
+        stacklevel=4,
+    )

@@ -1,0 +1,97 @@
+"""A belief that explodes: its variances are held at a ceiling, and that is said once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from math import sqrt
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+
+from torch_denkf.filters._said import say_once
+from torch_denkf.modules._base import Entries
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["hold_variances", "look_at_ceiling", "say_ceiling"]
+
+#: The mean is held within so many of the largest standard deviations that a variance ceiling allows.
+_FARTHEST = 1000.0
+
+
+def say_ceiling(filter: Filter, key: NestedKey) -> None:
+    """Warns that the variance ``key`` is held at the ceiling, once."""
+    say_once(
+        filter,
+        "ceiling",
+        f"The variance in {key!r} has reached variance_ceiling={filter.variance_ceiling:g} and is held there: "
+        "nothing observes what grows.",
+    )
+
+
+def hold_variances(
+    written: Entries, belief: Iterable[NestedKey], ceiling: float, say: Callable[[NestedKey], None]
+) -> None:
+    """Holds the variances at the ceiling, in place of the entries ``written``; the correlations stay.
+
+    Args:
+        written: what a step wrote; changed.
+        belief: keys of the belief.
+        ceiling: largest variance, in the state's units squared.
+        say: told which variance is held.
+    """
+    for key in _variances(belief):
+        variance = written.get(key)
+        if variance is None:
+            continue
+        exceeded = _exceeds(variance, ceiling)
+        if exceeded is False:
+            continue
+        if exceeded:
+            say(key)
+        prefix, farthest = key[:-1], _FARTHEST * sqrt(ceiling)
+        mean_key = (*prefix, "mean")
+        mean = written.get(mean_key)
+        if mean is None:
+            continue
+        factor = (variance / ceiling).clamp(min=1).rsqrt()
+        held = mean.clamp(-farthest, farthest)
+        written[key] = variance * factor.square()
+        written[mean_key] = held
+        cov = written.get((*prefix, "cov"))
+        if cov is not None:
+            written[*prefix, "cov"] = cov * factor.unsqueeze(-1) * factor.unsqueeze(-2)
+        ensemble = written.get((*prefix, "ensemble"))
+        if ensemble is not None:
+            deviations = (ensemble - mean.unsqueeze(-2)) * factor.unsqueeze(-2)
+            limited = held.unsqueeze(-2) + deviations
+            # Where nothing is held, nothing moves, not even by rounding.
+            same = ((factor == 1) & (held == mean)).unsqueeze(-2)
+            written[*prefix, "ensemble"] = torch.where(same, ensemble, limited)
+
+
+def look_at_ceiling(filter: Filter, written: Entries) -> None:
+    """Says whether a variance is held at the ceiling, where a compiled graph could not."""
+    if filter.variance_ceiling is None or "ceiling" in filter._said or torch.compiler.is_compiling():
+        return
+    for key in _variances(filter.structure.belief):
+        value = written.get(key)
+        if value is not None and not value.is_cuda and (value >= 0.999 * filter.variance_ceiling).any():
+            say_ceiling(filter, key)
+
+
+def _variances(belief: Iterable[NestedKey]) -> list[NestedKey]:
+    return [key for key in belief if key[-1] == "var"]
+
+
+def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
+    """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
+    if torch.compiler.is_compiling() or variance.is_cuda:
+        return None
+    try:
+        return bool((variance > ceiling).any())
+    except RuntimeError:  # under vmap a number has no value
+        return None

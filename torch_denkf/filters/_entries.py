@@ -1,0 +1,61 @@
+"""From tensordicts to entries, which are a flat dictionary of tensors, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+
+from torch_denkf.filters._checks import refuse_unknown_noise
+from torch_denkf.modules._base import Entries, flat_noise
+
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["entries_of", "of_one_robot", "write"]
+
+
+def of_one_robot(filter: Filter, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+    """A tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and on its device."""
+    if isinstance(tensordict, TensorDictBase):
+        return tensordict
+    like = filter.like()
+    out = TensorDict(dict(tensordict), batch_size=[])
+    out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
+    if like is None:
+        return out
+    return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
+
+
+def entries_of(filter: Filter, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Entries:
+    """The entries ``keys``, as far as they are there, and the noise.
+
+    Raises:
+        KeyError: if there is noise that no module draws.
+    """
+    entries = {}
+    for key in keys:
+        value = tensordict.get(key, None)
+        if value is not None:
+            entries[key] = value
+    noise = flat_noise(tensordict.get("noise", None))
+    if noise:
+        refuse_unknown_noise(filter, noise)
+        entries.update(noise)
+    return entries
+
+
+def write(tensordict: TensorDictBase, written: Entries) -> None:
+    """Sets entries, looking up each nested tensordict once."""
+    owners: dict[tuple, Any] = {}
+    for key, value in written.items():
+        prefix = () if isinstance(key, str) else key[:-1]
+        owner = tensordict if not prefix else owners.get(prefix)
+        if owner is None:
+            owner = tensordict.get(prefix, None) if type(tensordict) is TensorDict else None
+        if isinstance(owner, TensorDictBase):
+            owners[prefix] = owner
+            owner.set(key[-1] if prefix else key, value)
+        else:  # not there yet
+            tensordict.set(key, value)

@@ -1,0 +1,109 @@
+"""Libraries in inductor's cache: those that a killed compilation, or a full disk, left unfinished are removed.
+
+Inductor's linker writes them in their place, and inductor takes what is there: without this, each later compilation
+fails with "file too short" until someone deletes the cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from torch_denkf._files import free_space
+from torch_denkf._lock import take_lock
+
+__all__ = ["clear_damaged_libraries", "clear_full_cache", "is_whole"]
+
+_LOG = logging.getLogger("torch_denkf")
+_HEADER, _64_BITS = 64, 2  # bytes of ELF's header; its class
+
+
+def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
+    """Removes unfinished libraries that nobody is writing, so that they are compiled again.
+
+    Args:
+        cache: folder of inductor's cache; by default the one in use.
+
+    Returns:
+        What was removed; a line in the log names each.
+    """
+    if not sys.platform.startswith("linux"):
+        return []
+    cache = cache or _cache_in_use()
+    removed = []
+    for library in cache.glob("*/*.so"):
+        with contextlib.suppress(OSError):
+            if not is_whole(library) and _remove(library, cache / "locks"):
+                _LOG.warning("inductor's cache held half a library, %s: it is compiled again", library)
+                removed.append(library)
+    return removed
+
+
+@contextmanager
+def clear_full_cache() -> Iterator[None]:
+    """A compilation that fails because the disk of inductor's cache is full says so.
+
+    Raises:
+        OSError: naming the cache and the free space.
+    """
+    try:
+        yield
+    except Exception as error:
+        if os.strerror(errno.ENOSPC) not in str(error):
+            raise
+        cache = _cache_in_use()
+        raise OSError(
+            errno.ENOSPC,
+            f"cannot compile in {cache}, inductor's cache: {os.strerror(errno.ENOSPC)}, {free_space(cache)}; free some "
+            "space, or set TORCHINDUCTOR_CACHE_DIR to another folder",
+        ) from error
+
+
+def _cache_in_use() -> Path:
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    return Path(cache_dir())
+
+
+def is_whole(library: Path) -> bool:
+    """Whether a file is a library (ELF, 64 bits) that reaches to the end of what its header announces."""
+    with library.open("rb") as stream:
+        header, size = stream.read(_HEADER), os.fstat(stream.fileno()).st_size
+        if len(header) < _HEADER or header[:4] != b"\x7fELF":
+            return False
+        if header[4] != _64_BITS:
+            return True
+        segments, sections, segment_size, segment_count, section_size, section_count = struct.unpack_from(
+            "<32xQQ6xHHHH", header
+        )
+        if (
+            not segment_count
+            or max(segments + segment_size * segment_count, sections + section_size * section_count) > size
+        ):
+            return False
+        stream.seek(segments)
+        table = stream.read(segment_size * segment_count)
+    ends = (sum(struct.unpack_from("<8xQ16xQ", table, at)) for at in range(0, len(table), segment_size))
+    return max(ends) <= size
+
+
+def _remove(library: Path, locks: Path) -> bool:
+    """Under the lock that inductor compiles it under; False while another process does."""
+    locks.mkdir(exist_ok=True)
+    held = take_lock(locks / f"{library.name.split('.')[0]}.lock")
+    if held is None:
+        return False
+    try:
+        if is_whole(library):  # by now
+            return False
+        library.unlink()
+        return True
+    finally:
+        os.close(held)

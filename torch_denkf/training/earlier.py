@@ -1,0 +1,37 @@
+"""Files of an earlier training that nobody can make again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["set_aside"]
+
+_LOG = logging.getLogger("torch_denkf")
+
+
+def set_aside(out: Path, files: Sequence[Path]) -> None:
+    """Moves files below a training's folder to ``out/earlier-1``, or the next number that is free, and logs it.
+
+    Args:
+        out: the folder.
+        files: below it; their places relative to it stay.
+
+    Example:
+        >>> import tempfile
+        >>> out = Path(tempfile.mkdtemp())
+        >>> (out / "best_fit.pt").touch()
+        >>> set_aside(out, [out / "best_fit.pt"])
+        >>> (out / "earlier-1" / "best_fit.pt").is_file()
+        True
+    """
+    if not files:
+        return
+    taken = [folder.name.removeprefix("earlier-") for folder in out.glob("earlier-*")]
+    aside = out / f"earlier-{1 + max((int(number) for number in taken if number.isdecimal()), default=0)}"
+    for file in files:
+        place = aside / file.relative_to(out)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(place)
+    _LOG.warning("%s has no last.pt, but other files of an earlier training: they are now in %s", out, aside)
