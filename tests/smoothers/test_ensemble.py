@@ -248,3 +248,15 @@ def test_what_cannot_be_smoothed_says_so():
     stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
     with pytest.raises(KeyError, match="stored without a lag"):
         FixedLag(linear_denkf(), 2).sequence(stored)
+
+
+@pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])
+def test_rejected_readings_are_missing_ones(float64, smoother):
+    filter = (linear_kalman if smoother is RTSSmoother else linear_denkf)(reject=True)
+    frames = drive(2, 7, missing=0.0, resets=False)
+    masked = frames.copy()
+    masked["observed"] = frames["observed"].clone()
+    masked["observed"][:, 3, 0] = False
+    frames["observation"][:, 3, 0] = torch.nan
+    made = smoother(filter)
+    assert made.sequence(frames)["smoothed", "mean"].equal(made.sequence(masked)["smoothed", "mean"])
