@@ -142,7 +142,6 @@ def options_of(filter: Filter) -> dict:
         "variance_ceiling": filter.variance_ceiling,
         "check_finite": filter.check_finite,
         "reject": filter.reject,
-        "reject": filter.reject,
     }
 
 
