@@ -86,7 +86,9 @@ def page(rows: Sequence[dict], study: Study) -> str:
         assert scored is not None
         errors = [mean(key) for key in COLUMNS.names[4:]]
         cells = [case.system, case.method, "all" if case.lag is None else case.lag or "", case.ensemble_size]
-        cells += ["" if error is None else f"{error:.3f}" for error in errors]
+        counts = [sum(key in row for row in found) for key in COLUMNS.names[4:]]
+        partly = [f" ({count} seeds)" if 0 < count < len(found) else "" for count in counts]
+        cells += ["" if error is None else f"{error:.3f}{seeds}" for error, seeds in zip(errors, partly, strict=True)]
         lines.append(line(*cells, f"{case.scored} {case.target}", "yes" if scored <= case.target else "no"))
     lines += [
         "",
