@@ -4,7 +4,7 @@
 
 A filter knows the past; a smoother also knows what came later. The program compares both on recordings, shows a lag of
 a few steps in an environment that runs, and lets a loss score the smoothed belief. No data set, and no training but a
-few steps. It takes half a minute. The page behind this one is ``docs/how_to/smoothing.md``; the measured errors of all
+few steps. It takes ten seconds. The page behind this one is ``docs/how_to/smoothing.md``; the measured errors of all
 smoothers are in ``docs/results/smoothing.md``.
 """
 
@@ -36,15 +36,15 @@ START = torch.tensor([0.5, 0.0]), torch.tensor([0.5, 0.5])  # mean and standard 
 
 
 class Swing(nn.Module):
-    """A pendulum's [angle, rate] one step later; its damping is a parameter."""
+    """A pendulum's [angle, rate] one step later; its length in metres is a parameter."""
 
-    def __init__(self, damping: float = 0.1):
+    def __init__(self, length: float = 1.0):
         super().__init__()
-        self.damping = nn.Parameter(torch.tensor(damping))
+        self.length = nn.Parameter(torch.tensor(length))
 
     def forward(self, state: Tensor) -> Tensor:
         angle, rate = state.unbind(-1)
-        faster = rate + DT * (-9.81 * angle.sin() - self.damping * rate)
+        faster = rate + DT * (-9.81 / self.length * angle.sin() - 0.1 * rate)
         return torch.stack([angle + DT * faster, faster], -1)
 
 
@@ -129,17 +129,17 @@ def main() -> None:
     print(f"  the rate now is known to {now[..., 1].square().mean().sqrt():.3f} rad/s,")
     print(f"  that of 10 steps ago to  {then[..., 1].square().mean().sqrt():.3f} rad/s")
 
-    # A loss may score what is believed in hindsight: here it finds the damping, which starts three times too large.
-    swing = Swing(damping=0.3)
+    # A loss may score what is believed in hindsight: here it finds the length, which starts twice too large.
+    swing = Swing(length=2.0)
     denkf = make_denkf(swing, members=30)
     loss = DEnKFLoss(denkf, state=0.0, transition=0.0, smoothed=1.0, smoother=partial(EnRTS, lag=10))
-    optimiser = torch.optim.Adam(denkf.parameters(), 0.02)
-    for _ in range(2 if parser.parse_args().smoke else 15):
+    optimiser = torch.optim.Adam(denkf.parameters(), 0.1)
+    for _ in range(2 if parser.parse_args().smoke else 20):
         value = loss(recordings[:, :50])["loss_smoothed"]
         optimiser.zero_grad()
         value.backward()
         optimiser.step()
-    print(f"\nDamping, learned from the smoothed belief: {swing.damping.item():.2f} (true 0.10)")
+    print(f"\nLength, learned from the smoothed belief: {swing.length.item():.2f} m (true 1.00 m)")
 
 
 if __name__ == "__main__":

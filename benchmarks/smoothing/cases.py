@@ -18,6 +18,7 @@ class Case:
         lag: cycles; ``None`` for all that come later.
         inflation: factor on the analysis anomalies.
         scheme: of the analysis.
+        damping: of EnRTS, in each cycle.
         jitter: of the particles.
         ess_threshold: likewise.
     """
@@ -30,6 +31,7 @@ class Case:
     lag: int | None = None
     inflation: float = 1.0
     scheme: str = "etkf"
+    damping: float = 1.0
     jitter: float = 0.0
     ess_threshold: float | None = None
 
@@ -50,8 +52,8 @@ CASES = [
     Case(method="EnKS", lag=5, target=0.32, **_L63),
     Case(method="EnRTS", target=0.33, **_L63),
     Case("lorenz63", "IEnKS", 0.33, "filter", ensemble_size=10, lag=1, inflation=1.02),
-    Case("lorenz63", "particles", 0.28, "filter", ensemble_size=800, lag=0, jitter=0.9, ess_threshold=0.2),
+    Case("lorenz63", "particles", 0.28, "filter", ensemble_size=800, lag=0, jitter=0.8, ess_threshold=0.2),
     Case(method="EnKS", lag=4, target=0.235, **_L96),
     Case(method="EnKS", lag=12, target=0.22, **_L96),
-    Case(method="EnRTS", target=0.215, **_L96),
+    Case(method="EnRTS", target=0.215, damping=0.86, **_L96),
 ]

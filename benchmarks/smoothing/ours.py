@@ -43,7 +43,7 @@ def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:
     torch.manual_seed(0)
     frames, filter = frames_of(readings), make_filter(case)
     if case.method == "EnRTS":
-        out = EnRTS(filter).sequence(frames, keep=[BELIEF])
+        out = EnRTS(filter, damping=case.damping).sequence(frames, keep=[BELIEF])
         return out[BELIEF][:, 1:], out[SMOOTHED][:, 1:]
     if case.method == "particles":
         out = filter.sequence(frames, keep=[BELIEF])

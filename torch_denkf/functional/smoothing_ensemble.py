@@ -18,7 +18,7 @@ from torch_denkf.functional.moments import ensemble_anomalies
 from torch_denkf.functional.smoothing import check_lag
 
 
-def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor) -> Tensor:
+def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping: float = 1.0) -> Tensor:
     """One step back in time: the smoothed members of t from those of t + 1.
 
     X + (X_s − X_f) A_f⁺ A, with A and A_f the anomalies at t and of the forecast: the gain of
@@ -29,12 +29,15 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor) -> Tensor:
         ensemble: X, the filter's belief at t, ``[*B, E, S]``.
         forecast: X_f of t + 1, the same members one step on, ``[*B, E, S]``.
         smoothed: X_s of t + 1, ``[*B, E, S]``.
+        damping: factor on the gain. Where the filter inflates its members by a factor r, the gains carry the inflation
+            back, r times more in each step, in directions that no reading holds: damping below 1 / r keeps a long way
+            back stable (``DeCorr`` in DAPPER).
 
     Returns:
         The smoothed members of t, ``[*B, E, S]``.
 
     Raises:
-        ValueError: if the shapes do not fit.
+        ValueError: if the shapes do not fit, or ``damping`` is not in (0, 1].
 
     Examples:
         Members that double in each step, and at t + 1 turn out to be 1 larger:
@@ -47,9 +50,11 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor) -> Tensor:
     check_ensemble("ensemble", ensemble, min_size=2)
     for name, value in (("forecast", forecast), ("smoothed", smoothed)):
         check_shape(name, value, ensemble.shape, "[*B, E, S]")
+    if not 0 < damping <= 1:
+        raise ValueError(f"damping is a factor on the gain, above 0 and at most 1; got {damping}.")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
-    shift = smoothed - forecast
+    shift = damping * (smoothed - forecast)
     if dim < size:
         cross = forecast_anomalies.mT @ anomalies
         return ensemble + shift @ semidefinite_solve(forecast_anomalies.mT @ forecast_anomalies, cross)
@@ -67,7 +72,12 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor) -> Tensor:
 
 
 def enrts_smooth(
-    ensemble: Tensor, forecast: Tensor, *, follows: Tensor | None = None, lag: int | None = None
+    ensemble: Tensor,
+    forecast: Tensor,
+    *,
+    follows: Tensor | None = None,
+    lag: int | None = None,
+    damping: float = 1.0,
 ) -> Tensor:
     """Smooth the ensembles of a whole sequence.
 
@@ -76,6 +86,7 @@ def enrts_smooth(
         forecast: of each time, the members before it one step on, ``[*B, T, E, S]``.
         follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.rts_smooth`.
         lag: likewise.
+        damping: see :func:`enrts_step`.
 
     Returns:
         The smoothed ensembles, ``[*B, T, E, S]``.
@@ -100,7 +111,7 @@ def enrts_smooth(
 
     def back(index: slice | int, later: Tensor) -> Tensor:
         own = before[..., index, :, :]
-        out = enrts_step(own, moved[..., index, :, :], later)
+        out = enrts_step(own, moved[..., index, :, :], later, damping=damping)
         return out if follows is None else torch.where(follows[..., index][..., None, None], out, own)
 
     count = ensemble.shape[-3]

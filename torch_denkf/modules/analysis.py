@@ -149,7 +149,9 @@ class EnsembleAnalysis(EnsembleUpdate):
             The updated past, ``[*B, E, L, S]``.
         """
         predicted, observation = align_angles(predicted, observation, self.angles, observed)
-        taper = None if self.state_taper is None else self.state_taper.repeat(past.shape[-2], 1)
+        lag, dim = past.shape[-2:]
+        # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
+        taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
         moved = self._analyse(past.flatten(-2), predicted, observation, variance, observed, noise, taper)
         return moved.ensemble.unflatten(-1, past.shape[-2:])
 

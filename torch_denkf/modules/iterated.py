@@ -81,6 +81,8 @@ class IteratedAnalysis(SubModel):
         KeyError: if an entry is missing.
     """
 
+    reads_components = True
+
     def __init__(
         self,
         transition: TensorDictModuleBase,

@@ -152,6 +152,7 @@ class LaggedAnalysis(InPlaceOf):
             optional_keys=analysis.optional_keys,
         )
         self.info_key, self.reading_keys = analysis.info_key, analysis.reading_keys
+        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
         if hasattr(analysis, "noise_variance_key"):
             self.noise_variance_key = analysis.noise_variance_key
 

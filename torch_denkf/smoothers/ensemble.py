@@ -25,6 +25,8 @@ class EnRTS(Smoother):
     Args:
         filter: an ensemble filter. Its analysis must keep members in their places: not ``rotate=True``.
         lag: how many later readings count; ``None`` for all.
+        damping: factor on each gain. A long way back through a filter with inflation needs one below 1 / inflation, see
+            :func:`~torch_denkf.functional.enrts_step`.
 
     Raises:
         TypeError: for a filter without an ensemble.
@@ -43,7 +45,7 @@ class EnRTS(Smoother):
         torch.Size([2, 3, 8, 5])
     """
 
-    def __init__(self, filter: Filter, lag: int | None = None):
+    def __init__(self, filter: Filter, lag: int | None = None, *, damping: float = 1.0):
         kind, prefix = kind_of(filter)
         if kind != "ensemble":
             raise TypeError(f"EnRTS smooths an ensemble; {type(filter).__name__} carries {filter.carry_keys}.")
@@ -54,9 +56,11 @@ class EnRTS(Smoother):
             )
         keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
+        self.damping = damping
 
     def _smooth(self, entries, follows, out):
-        ensemble = enrts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag)
+        values = (entries[key] for key in self._needed)
+        ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=self.damping)
         return ensemble, *moments_of(ensemble, None)
 
 
