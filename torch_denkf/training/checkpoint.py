@@ -89,7 +89,7 @@ _BEST = {"stage": str, "update": int, "model": dict, "metrics": dict}
 
 
 def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
-    """Raises unless a checkpoint holds the state of a training, with finite parameters.
+    """Raises unless a checkpoint holds the state of a training, with parameters that are no NaN.
 
     Args:
         file: the checkpoint, for the message.
@@ -120,8 +120,9 @@ def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
         if not re.fullmatch(r"[\w-]+", state["best"]["stage"]):
             refuse(f"its best is of stage {state['best']['stage']!r}")
     for name, value in state["model"].items():
-        if isinstance(value, torch.Tensor) and value.is_floating_point() and not bool(value.isfinite().all()):
-            refuse(f"{name!r} of its model is not finite")
+        # An infinite buffer may be meant, such as a mask of -inf.
+        if isinstance(value, torch.Tensor) and value.is_floating_point() and bool(value.isnan().any()):
+            refuse(f"{name!r} of its model has NaN")
 
 
 def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[str, Any], stage: int) -> None:

@@ -149,8 +149,6 @@ def _numbers(rows: TensorDictBase, keys: NestedKey | list[NestedKey]) -> Tensor:
         if not isinstance(value, Tensor) or value.ndim > 2:
             found = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "several entries: pass a list"
             raise ValueError(f"{_text(key)} must be numbers [N, n], it has {found}")
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise ValueError(f"{_text(key)} has NaN or infinity; take these rows out, or repair them")
         parts.append(value.reshape(len(rows), -1).float())
     return torch.cat(parts, -1)
 
