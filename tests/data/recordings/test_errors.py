@@ -77,7 +77,7 @@ def test_videos(tmp_path):
     fails(ValueError, r"times\[1\]: 'time' goes from 3 to 2 s",
           camera=Video(tmp_path / "run.mkv", times=[3, 2, 1, 0, -1]))  # fmt: skip
     fails(ValueError, r"times\[2\]: 'time' is nan", camera=Video(tmp_path / "run.mkv", times=[0, 1, np.nan, 3, 4]))
-    with pytest.raises(ValueError, match="start is a time in s, got nan"):
+    with pytest.raises(ValueError, match="start must be finite; got nan"):
         Video(tmp_path / "run.mkv", start=np.nan)
     (tmp_path / "run.mkv").write_bytes(b"nothing")
     fails(ValueError, r"no frame of .*run.mkv can be decoded.*AV1", camera=Video(tmp_path / "run.mkv"))
@@ -89,7 +89,7 @@ def test_images(tmp_path):
     fails(ValueError, r"nothing says when the images in .*run were taken: .*'a.png'.*pass times= or rate=",
           camera=Images(tmp_path / "run"))  # fmt: skip
     for rate in (0.0, np.inf):
-        with pytest.raises(ValueError, match=r"rate is .* positive, got"):
+        with pytest.raises(ValueError, match=r"rate must be finite and above 0; got"):
             Images(tmp_path / "run", rate=rate)
     with pytest.raises(ValueError, match="times or rate, not both"):
         Images(tmp_path / "run", rate=1.0, times=[0.0, 1.0])
@@ -125,7 +125,7 @@ def test_streams_and_clocks(tmp_path):
         Video("run.mp4", sample="linear")
     with pytest.raises(ValueError, match="unit is one of 's', 'ms', 'us', 'ns', got 'min'"):
         Table("run.csv", unit="min")
-    with pytest.raises(ValueError, match="tolerance is a time in s, positive"):
+    with pytest.raises(ValueError, match="tolerance must be finite and above 0; got"):
         Table("run.csv", tolerance=0.0)
 
 

@@ -276,10 +276,10 @@ def test_options_out_of_range(tmp_path):
         ({"tasks": ["pick", "stack"]}, "tasks are some of pick, push, put_down"),
         ({"domain": "mars"}, "unknown domain 'mars'"),
         ({"size": (0, 4)}, "size is"),
-        ({"seed": -1}, "seed=-1"),
-        ({"noise": -0.1}, "noise=-0.1"),
-        ({"max_steps": 0}, "max_steps=0"),
-        ({"processes": 0}, "positive, got 1 and 0"),
+        ({"seed": -1}, "seed must be a whole number, at least 0; got -1"),
+        ({"noise": -0.1}, "noise must be finite and at least 0; got -0.1"),
+        ({"max_steps": 0}, "max_steps must be"),
+        ({"processes": 0}, "processes must be"),
     ]:
         with pytest.raises(ValueError, match=text):
             collect_ur5_demos(tmp_path / "no", 1, **{**BLIND, **change})

@@ -20,6 +20,7 @@ import numpy as np
 
 from torch_denkf._files import clear_errors, sync
 from torch_denkf._lock import remove_locked, take_lock
+from torch_denkf._workers import follow_parent
 from torch_denkf.data.kitti.files import write_poses
 from torch_denkf.simulation.street.camera import Camera
 from torch_denkf.simulation.street.renderer import Renderer
@@ -184,9 +185,7 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
             return
         # Not forked: a fork of a process with threads (PyTorch's, OpenCV's) can hang.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(
-            min(processes, len(tasks)), context, initializer=cv2.setNumThreads, initargs=(1,)
-        ) as pool:
+        with ProcessPoolExecutor(min(processes, len(tasks)), context, initializer=_start_worker) as pool:
             waiting = {pool.submit(_draw, *task): task for task in tasks}
             try:
                 for future in as_completed(waiting):
@@ -205,6 +204,11 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
 
 
 _last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
+
+
+def _start_worker() -> None:
+    cv2.setNumThreads(1)
+    follow_parent()
 
 
 def _draw(job: Job, start: int, stop: int) -> None:

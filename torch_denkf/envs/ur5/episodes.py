@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from torch_denkf._checks import check_count, check_number
+from torch_denkf._workers import follow_parent
 from torch_denkf.data.pictures import check_size
 from torch_denkf.data.ur5.files import Demo, Entry, write_demo
 from torch_denkf.envs.ur5.expert import UR5Expert
@@ -82,13 +79,7 @@ def make_demos(root: Path, options: Options, numbers: list[int], processes: int)
 
 def _start_worker() -> None:
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops the pool
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
-
-
-def _end_with(parent: multiprocessing.process.BaseProcess) -> None:
-    wait([parent.sentinel])
-    os._exit(1)  # workers of a killed parent would wait for work for ever
+    follow_parent()
 
 
 _envs: dict[tuple[Options, str], UR5TableEnv] = {}  # of this process: compiling a scene and opening OpenGL take time
