@@ -253,7 +253,7 @@ def test_errors_say_what_to_do(tmp_path_factory):
     fails(ValueError, "pass length", start="random")
     fails(ValueError, r"do not fit in 2 of 4 episodes: {'run0': 6, 'run2': 4}; .*Pass episodes=", length=7)
     fails(ValueError, "at least 2 rows", length=1)
-    fails(ValueError, "do not fit in 0 of 4", start=-1)
+    fails(ValueError, "start must be a whole number, at least 0; got -1", start=-1)
     with pytest.raises(TypeError, match="got TensorDict"):
         ReplayEnv(data[:])
     with pytest.raises(ValueError, match="offers single rows"):

@@ -124,5 +124,5 @@ def test_a_batch_norm_sees_all_frames():
 
 
 def test_a_budget_is_positive():
-    with pytest.raises(ValueError, match="bytes and positive; got 0"):
+    with pytest.raises(ValueError, match="trunk_memory must be a whole number, at least 1; got 0"):
         image_sensor(trunk_memory=0)

@@ -86,7 +86,7 @@ def test_mistakes_say_what_to_do(root, trained, tmp_path):
         train_car_filter(trained[0], root=root, **{**OPTIONS, "seed": 4})
     with pytest.raises(ValueError, match="at least one update"):
         Updates(filter=0)
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match=r"dt must be finite and above 0; got 0.0"):
         car_filter(dt=0.0)
     with pytest.raises(ValueError, match=r"longest is 1 to lags \+ 1 = 3"):
         CarSettings(lags=2, longest=4)

@@ -116,10 +116,7 @@ class KITTIReplayEnv(RowsEnv):
         if self._random and length is None:
             raise ValueError("random starts need the number of frames of an episode: pass length")
         for name, value in (("start", 0 if self._random else start), ("length", length)):
-            whole = isinstance(value, (int, Tensor)) or (
-                isinstance(value, Sequence) and all(isinstance(part, int) for part in value)
-            )
-            if (value is not None and not whole) or (isinstance(value, Tensor) and value.is_floating_point()):
+            if value is not None and not _is_whole(value):
                 raise TypeError(f"{name} is a whole number, or one for each element of the batch; got {value!r}")
         begin = torch.as_tensor(0 if self._random else start, device=where).expand(self.batch_size)
         frames = rows - begin if length is None else torch.as_tensor(length, device=where).expand(self.batch_size)
@@ -136,3 +133,11 @@ class KITTIReplayEnv(RowsEnv):
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
         first = self._draw(self._rows - self._lengths + 1) if self._random else self._starts
         return first, first + self._lengths - 1
+
+
+def _is_whole(value: object) -> bool:
+    try:
+        kind = torch.as_tensor(value).dtype
+    except (TypeError, ValueError, RuntimeError):
+        return False
+    return not (kind.is_floating_point or kind.is_complex or kind == torch.bool)

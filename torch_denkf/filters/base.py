@@ -86,6 +86,7 @@ class Filter(TensorDictSequential):
 
     Example:
         >>> from torch_denkf.filters import KalmanFilter
+        >>> from tensordict import TensorDict
         >>> one = torch.eye(1)
         >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
         >>> kf.carry_keys

@@ -137,8 +137,10 @@ def jitter_copies(
         >>> import torch
         >>> particles, picked = torch.tensor([[0.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [2.0]])
         >>> even, normal = torch.full((3,), 1 / 3).log(), torch.ones(3, 1)
-        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()  # 3^(-1/5) / 2 = 0.4014
-        tensor([1.0000, 1.4014, 2.0000])
+        >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()
+        tensor([1.0000, 1.3367, 2.0000])
+
+        N is 3 here: the second copy of 1 moved by 3^(-1/5) / 2, times the root of the covariance 2 / 3 + 1 / 27.
     """
     check_particles(particles, log_weights)
     check_shape("resampled", resampled, particles.shape, "[*B, E, S]")

@@ -292,7 +292,11 @@ def test_errors_name_the_file(tmp_path):
 
     fails(FileNotFoundError, r"no folder .*sequences/07; .*sequences has \['00'\]", "07")
     fails(FileNotFoundError, r"no folder .*image_1; pass another camera", camera="image_1")
-    fails(ValueError, r"size is \(height, width\) in pixels and must be positive, got \(0, 5\)", size=(0, 5))
+    fails(
+        ValueError,
+        r"size is \(height, width\) in pixels, whole numbers, and must be positive, got \(0, 5\)",
+        size=(0, 5),
+    )
     make(tmp_path, sequence="01", images=[])
     fails(FileNotFoundError, r"no images in .*sequences/01; expected FFFFFF.png in one of", "01")
     fails(FileNotFoundError, r"no images FFFFFF.png in .*01/image_2", "01", camera="image_2")
