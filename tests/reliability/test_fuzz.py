@@ -17,14 +17,14 @@ ROOT = Path(__file__).parents[2]
 def test_a_sample_is_refused_clearly_or_right(tmp_path):
     """In a process of its own: cases are forked, and this one may have threads.
 
-    results/fuzz.json lists what is not yet clear or right: 3.4 % of all. A sample may have half as much again.
+    results/fuzz.json lists what is not yet clear or right: 1.5 % of all. A sample is small, and may have more.
     """
     file = tmp_path / "fuzz.json"
-    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "200", "--out", str(file)]
+    command = [sys.executable, "-m", "benchmarks.reliability", "fuzz", "--sample", "80", "--out", str(file)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     found = json.loads(file.read_text())
-    assert found["records"] >= 190
+    assert found["records"] >= 70
     wrong = json.dumps(found["wrong"], indent=1)
     assert (found["hang"], found["crash"]) == (0, 0), wrong
     assert found["silent"] + found["unclear"] <= 0.05 * found["records"], wrong
