@@ -233,9 +233,9 @@ def test_compiled_functions_are_the_eager_ones():
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="EnRTS smooths an ensemble"):
+    with pytest.raises(TypeError, match="EnRTS takes a filter with an ensemble"):
         EnRTS(linear_kalman())
-    with pytest.raises(TypeError, match="EnKS smooths an ensemble"):
+    with pytest.raises(TypeError, match="EnKS takes a filter with an ensemble"):
         EnKS(linear_kalman())
     with pytest.raises(TypeError, match="has an ensemble"):
         RTSSmoother(linear_denkf())

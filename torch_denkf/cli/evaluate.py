@@ -10,7 +10,6 @@ See :func:`torch_denkf.odometry.evaluate_car_filter`, which does the work.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from torch_denkf._files import write_text
 from torch_denkf.cli._command import Command, filled, path, say, whole
@@ -21,7 +20,12 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--checkpoint", type=filled, default="car-odometry", help="that of the library, or a folder that denkf train left")
+    add(
+        "--checkpoint",
+        type=filled,
+        default="car-odometry",
+        help="that of the library, or a folder that denkf train left",
+    )
     add("--root", required=True, type=path, help="folder in KITTI's layout, with sequences/ and poses/")
     add("--drives", nargs="+", metavar="NAME", help="drives below --root; all by default")
     add("--out", type=path, help="folder for evaluation.csv and evaluation.md, and a cache of the optical flow")

@@ -40,7 +40,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
     )
-    add("--checkpoint", type=filled, default="car-odometry", help="that of the library, or a folder that denkf train left")
+    add(
+        "--checkpoint",
+        type=filled,
+        default="car-odometry",
+        help="that of the library, or a folder that denkf train left",
+    )
     add("--out", required=True, type=path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
     add("--fps", type=float, help="frames in a second; by default that of a video, or the times of its frames")

@@ -11,7 +11,6 @@ See :func:`torch_denkf.odometry.train_car_filter`, which does the work.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from torch_denkf.cli._command import Command, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT

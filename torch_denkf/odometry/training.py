@@ -109,8 +109,8 @@ def train_car_filter(
 
     Raises:
         FileNotFoundError: if there are no drives below ``root``.
-        ValueError: if there are too few drives, names of drives without a root, drives of different frame times, windows longer than the drives, or a
-            training with other settings in ``out``.
+        ValueError: if there are too few drives, names of drives without a root, drives of different frame times,
+            windows longer than the drives, or a training with other settings in ``out``.
 
     Example:
         >>> import tempfile

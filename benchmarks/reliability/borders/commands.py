@@ -270,9 +270,7 @@ def _files() -> Iterator[Case]:
                     "commands", f"{name}, {Path(file).name} {what}", (Path(file).name,), act, right, WITHIN, base
                 )
             act = partial(_act, name, changes, lambda root, file=file: gone(root / file))
-            yield Case(
-                "commands", f"{name}, {Path(file).name} taken away", (Path(file).name,), act, None, WITHIN, base
-            )
+            yield Case("commands", f"{name}, {Path(file).name} taken away", (Path(file).name,), act, None, WITHIN, base)
     row: dict[str, Callable[[list[str]], list[str]]] = {
         "a cell of text": lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "far"), *lines[4:]],
         "a cell of nan": lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "nan"), *lines[4:]],

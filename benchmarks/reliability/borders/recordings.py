@@ -310,9 +310,7 @@ def _rows() -> Iterator[Case]:
         import torch
 
         state = torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
-        made = TensorDict(
-            {"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": state}}, [12]
-        )
+        made = TensorDict({"observation": {"image": torch.zeros(12, 3, 8, 8, dtype=torch.uint8), "state": state}}, [12])
         made["episode"] = torch.arange(3).repeat_interleave(4)
         change(made)
         return made
