@@ -139,8 +139,8 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     strange = [name for name, value in weights.items() if name in made and not _fits(value, made[name])]
     if strange:
         raise ValueError(
-            f"{file} holds NaN, infinity or whole numbers in {strange[:3]}, where {CONFIG} makes none; restore it from a "
-            "copy, or train anew"
+            f"{file} holds NaN, infinity or whole numbers in {strange[:3]}, where {CONFIG} makes none; restore it from "
+            "a copy, or train anew"
         )
     try:
         model.load_state_dict(weights)

@@ -231,18 +231,14 @@ class LaggedBelief(SubModel):
 
     def compute(self, past, age, log_weight=None):
         """The past, and the belief of its oldest state."""
+        check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
-        return past, ensemble, *moments_of(ensemble, log_weight), older(age, past.shape[:-3], past.shape[-2])
+        return past, ensemble, *moments_of(ensemble, log_weight), (age + 1).clamp(max=past.shape[-2])
 
 
-def older(age: torch.Tensor, batch_size: Sequence[int], lag: int) -> torch.Tensor:
-    """The age ``[*B, 1]`` of the oldest state that is carried, a step later.
-
-    Raises:
-        ValueError: if it has another shape.
-    """
+def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
+    """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
     check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
-    return (age + 1).clamp(max=lag)
 
 
 def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:

@@ -16,7 +16,7 @@ from torch_denkf.functional import smoothing_gain
 from torch_denkf.modules._base import SubModel, reads, run_module
 from torch_denkf.modules._gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.modules.past import InPlaceOf, WithPast, older
+from torch_denkf.modules.past import InPlaceOf, WithPast, check_age
 
 __all__ = ["CrossTransition", "LaggedMoments", "MomentsPast", "WithMomentsPast"]
 
@@ -121,6 +121,7 @@ class MomentsPast(SubModel):
 
     def compute(self, mean, cov, forecast_cov, cross, past_mean, past_cov, past_gain, age):
         """The past."""
+        check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
         identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
@@ -166,5 +167,5 @@ class LaggedMoments(SubModel):
         smoothed = (smoothed + smoothed.mT) / 2
         variance = smoothed.diagonal(dim1=-2, dim2=-1)
         oldest = past_mean[..., -1, :]
-        age = older(age, mean.shape[:-1], past_mean.shape[-2])
+        age = (age + 1).clamp(max=past_mean.shape[-2])
         return past_mean, past_cov, past_gain, oldest, smoothed, variance, age

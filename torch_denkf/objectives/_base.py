@@ -178,8 +178,8 @@ class FilterLoss(LossModule):
             return errors
         if scale.numel() not in (1, errors.shape[-1]):
             raise ValueError(
-                f"{name}_scale has {scale.numel()} entries, but {errors.shape[-1]} dimensions of the {name} are scored; "
-                "pass one entry for each"
+                f"{name}_scale has {scale.numel()} entries, but {errors.shape[-1]} dimensions of the {name} are "
+                "scored; pass one entry for each"
             )
         return self._counting(name, errors) / self._counting(name, scale)
 

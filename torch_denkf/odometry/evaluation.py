@@ -95,8 +95,8 @@ def evaluate_car_filter(
 
     Raises:
         FileNotFoundError: if a drive is not there.
-        ValueError: if a share, a number of draws, a window or the pitch is out of range, or a drive's frame time is not that of
-            the filter.
+        ValueError: if a share, a number of draws, a window or the pitch is out of range, or a drive's frame time is not
+            that of the filter.
     """
     if not 0 <= missing < 1 or draws < 1 or window < 1:
         raise ValueError(f"missing is in [0, 1), draws and window at least 1; got {missing}, {draws} and {window}")

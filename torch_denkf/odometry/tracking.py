@@ -113,9 +113,8 @@ def track(
         raise ValueError("pass times or fps, not both")
     if fps is not None and not 0 < fps < np.inf:
         raise ValueError(f"fps is the number of frames in a second; got {fps}")
-    if black_level is not None:
-        if not 0 <= black_level <= 255:
-            raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
+    if black_level is not None and not 0 <= black_level <= 255:
+        raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
     return _track(car, _seen(frames, black_level), calibration, times, fps, height, pitch, seed)
 
 
