@@ -107,10 +107,10 @@ def test_too_many_that_are_not_finite(tmp_path):
 def small_filter():
     """An EKF of two states with a transition that is trained."""
     return EKF(
-        LearnedTransition(nn.Linear(2, 2)),
-        None,
-        Select([0, 1]),
-        ConstantNoise([0.5, 0.5], in_key="observation"),
+        transition=LearnedTransition(nn.Linear(2, 2)),
+        sensor=None,
+        observation=Select([0, 1]),
+        noise=ConstantNoise([0.5, 0.5], in_key="observation"),
         initial=MomentPrior(torch.zeros(2), torch.eye(2)),
         process_noise=[0.1, 0.1],
         observation_key="observation",
