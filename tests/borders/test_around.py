@@ -139,7 +139,10 @@ TRACKED = {
     "text": ({"frames": ["a", "b"]}, "frame 0 is a str"),
     "text, looked at for black": ({"frames": [FRAME, "b"], "black_level": 3}, "frame 1 is a str"),
     "times": ({"times": ["a", "b", "c"]}, "times are those of the frames"),
-    "a day": ({"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1]}, "steps without a frame before frame 2.*Its time is 86400"),
+    "a day": (
+        {"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1]},
+        "steps without a frame before frame 2.*Its time is 86400",
+    ),
 }
 
 
