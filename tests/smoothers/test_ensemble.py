@@ -237,7 +237,7 @@ def test_what_cannot_be_smoothed_says_so():
         EnRTS(linear_kalman())
     with pytest.raises(TypeError, match="EnKS takes a filter with an ensemble"):
         EnKS(linear_kalman())
-    with pytest.raises(TypeError, match="has an ensemble"):
+    with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF has none"):
         RTSSmoother(linear_denkf())
     with pytest.raises(ValueError, match="at least 1"):
         FixedLag(linear_denkf(), 0)
