@@ -150,7 +150,8 @@ def jobs(root: Path | None, out: Path, smoke: bool) -> dict[Path, Callable[[], l
         task = make()
         for place, members in enumerate(task.members):
             file = out / "parts" / f"{task.name}-{members}.json"
-            made[file] = partial(ensembles, make, place, out / "readings", 1 if smoke else 4)
+            draws = 1 if smoke or place else 4  # a large ensemble's errors hardly move with its noise
+            made[file] = partial(ensembles, make, place, out / "readings", draws)
         made[out / "parts" / f"{task.name}-gaussian.json"] = partial(
             gaussians, make, out / "readings", 2 if smoke else 60
         )

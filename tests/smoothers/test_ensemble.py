@@ -241,7 +241,7 @@ def test_what_cannot_be_smoothed_says_so():
         RTSSmoother(linear_denkf())
     with pytest.raises(ValueError, match="at least 1"):
         FixedLag(linear_denkf(), 0)
-    with pytest.raises(ValueError, match="0 or more"):
+    with pytest.raises(ValueError, match="at least 0"):
         EnRTS(linear_denkf(), -1)
     with pytest.raises(TypeError, match="carries a past already"):
         FixedLag(FixedLag(linear_denkf(), 2), 2)

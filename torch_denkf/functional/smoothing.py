@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_shape
+from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional.linalg import semidefinite_solve
 
 
@@ -109,6 +109,7 @@ def rts_smooth(
 
     Raises:
         ValueError: if the shapes do not fit, or ``lag`` is negative.
+        TypeError: if ``lag`` is no whole number.
 
     Examples:
         >>> import torch
@@ -150,6 +151,6 @@ def rts_smooth(
 
 
 def check_lag(lag: int | None) -> None:
-    """Raise ``ValueError`` for a negative lag."""
-    if lag is not None and lag < 0:
-        raise ValueError(f"lag counts the later readings that are used, 0 or more, or None for all; got {lag}.")
+    """Raise ``TypeError`` for a lag that is no whole number, ``ValueError`` for a negative one."""
+    if lag is not None:
+        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is all of them")

@@ -14,6 +14,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
@@ -216,9 +217,8 @@ def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple
 
 
 def check_positive_lag(lag: int) -> None:
-    """Raise ``ValueError`` unless there is something to look back at."""
-    if lag < 1:
-        raise ValueError(f"lag counts the steps to look back, at least 1; got {lag}.")
+    """Raise ``TypeError`` for a lag that is no whole number, ``ValueError`` for nothing to look back at."""
+    check_count("lag", lag, cure="It counts the steps to look back")
 
 
 def copy_sizes(initial: nn.Module, owner: nn.Module) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch_denkf.filters import Filter
 from torch_denkf.filters._structure import submodels
 from torch_denkf.functional import enrts_smooth
+from torch_denkf.functional.smoothing_ensemble import check_damping
 from torch_denkf.modules.past import moments_of
 from torch_denkf.smoothers.base import Smoother, last_of_runs
 from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of
@@ -30,7 +31,8 @@ class EnRTS(Smoother):
 
     Raises:
         TypeError: for a filter without an ensemble.
-        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own.
+        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own; and
+            if ``damping`` is not in (0, 1].
 
     Reference:
         Raanes, "On the ensemble Rauch-Tung-Striebel smoother and its equivalence to the ensemble Kalman smoother",
@@ -56,6 +58,7 @@ class EnRTS(Smoother):
             )
         keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
+        check_damping(damping)
         self.damping = damping
 
     def _smooth(self, entries, follows, out):
