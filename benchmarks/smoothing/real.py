@@ -15,6 +15,7 @@ from benchmarks.common.arguments import command, processor
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.smoothing import gaussian, linear
 from benchmarks.smoothing.gaussian import Series
+from benchmarks.smoothing.paths import paths
 from benchmarks.smoothing.recordings import Group, Task, tasks
 from torch_denkf.smoothers import EnKS, EnRTS, RTSSmoother
 
@@ -94,7 +95,7 @@ def series_of(task: Task, batches: Group) -> dict[str, Series]:
     for names, batch in batches.items():
         reading = batch["sensor", "ensemble"].mean(-2).double()
         reading = reading[..., task.dims] if reading.shape[-1] > len(task.dims) else reading
-        target = batch["action"].double() if "action" in batch.keys() else None
+        target = batch["action"].double() if batch.get("action", None) is not None else None
         out[names] = Series(batch["state"][..., task.dims].double(), reading, batch["observed"], target)
     return out
 
@@ -143,9 +144,13 @@ def correlation(error: Tensor, lag: int) -> Tensor:
     return (error[:, lag:] * error[:, :-lag]).mean(1) / error.square().mean(1)
 
 
-def jobs(root: Path | None, out: Path, smoke: bool) -> dict[Path, Callable[[], list[dict]]]:
-    """What writes which file, each on its own."""
-    made: dict[Path, Callable[[], list[dict]]] = {}
+Jobs = dict[Path, Callable[[], list[dict]]]
+
+
+def jobs(root: Path | None, out: Path, smoke: bool) -> tuple[Jobs, Jobs]:
+    """What writes which file, each on its own: of the velocities and joints, and of the path."""
+    made: Jobs = {}
+    ways: Jobs = {}
     for make in tasks(root, out, smoke=smoke):
         task = make()
         for place, members in enumerate(task.members):
@@ -155,16 +160,18 @@ def jobs(root: Path | None, out: Path, smoke: bool) -> dict[Path, Callable[[], l
         made[out / "parts" / f"{task.name}-gaussian.json"] = partial(
             gaussians, make, out / "readings", 2 if smoke else 60
         )
-    return made
+        if task.name == "kitti":
+            ways[out / "parts" / "kitti-paths.json"] = partial(paths, make, out / "readings", 1 if smoke else 2)
+    return made, ways
 
 
-def page(rows: Sequence[dict]) -> str:
+def page(rows: Sequence[dict], ways: Sequence[dict]) -> str:
     """Means over the recordings of each group."""
     lines = [
         "# Smoothers behind trained sensors",
         "",
-        f"Root mean square errors with {LAG} later readings, and those of the filter on the same frames; means over the",
-        f'recordings. "Less" is how much of the filter\'s error the smoother takes away; the target is {LESS:.0%}.',
+        f"Root mean square errors with {LAG} later readings, and those of the filter on the same frames; means over",
+        f'the recordings. "Less" is how much of the filter\'s error the smoother takes away; the target is {LESS:.0%}.',
         "",
         *head("task", "recordings", "quantity", "method", "members", "filter", "smoother", "less", "met"),
     ]
@@ -182,5 +189,12 @@ def page(rows: Sequence[dict]) -> str:
         own = pick(sensors, **dict(zip(keys, found, strict=False)))
         values = [fmean(row[key] for row in own) for key in COLUMNS.names[-3:]]
         lines.append(line(*found, f"{values[0]:.4f}", *(f"{value:.2f}" for value in values[1:])))
+    if ways:
+        lines += ["", "End point errors of a car's path over 100 steps, means over the drives.", ""]
+        methods = list(dict.fromkeys(row["method"] for row in ways))
+        lines += head("drives", *methods)
+        for group in dict.fromkeys(row["group"] for row in ways):
+            errors = [fmean(r["translation_m_per_m"] for r in pick(ways, group=group, method=m)) for m in methods]
+            lines.append(line(group, *(f"{error:.4f} m/m" for error in errors)))
     lines += ["", f"* Command: `{command('smoothing')}`.", f"* Hardware: {processor()}; torch {torch.__version__}."]
     return "\n".join(lines) + "\n"

@@ -16,7 +16,7 @@ from torch_denkf.odometry import CarFilter, car_filter
 from torch_denkf.odometry.batches import mark_start
 from torch_denkf.odometry.scores import first_state
 from torch_denkf.odometry.streams import Drive, all_frames, read_spans
-from torch_denkf.pretrained import from_pretrained, ur5_table
+from torch_denkf.pretrained import from_pretrained
 from torch_denkf.pretrained.train.ur5_table import behind_sensor, read_demos, whole_demos
 from torch_denkf.pretrained.ur5_table import JOINTS, UR5TableFilter
 

@@ -14,7 +14,7 @@ import torch
 from benchmarks.common.arguments import command, parse, processor
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import Columns, head, line, pick, write_page
-from benchmarks.smoothing import against_dapper, ours, real
+from benchmarks.smoothing import against_dapper, ours, paths, real
 from benchmarks.smoothing.cases import CASES
 
 COLUMNS = Columns(
@@ -129,11 +129,14 @@ def main() -> None:
 
 def run_real(study: Study) -> None:
     """The part on recordings."""
-    jobs = real.jobs(study.root, study.out, study.smoke)
-    side_by_side([partial(one_file, file, rows) for file, rows in jobs.items()], study.processes, "smoothing")
-    rows = read_rows(jobs)
+    jobs, ways = real.jobs(study.root, study.out, study.smoke)
+    calls = [partial(one_file, file, rows) for file, rows in {**jobs, **ways}.items()]
+    side_by_side(calls, study.processes, "smoothing")
+    rows, way_rows = read_rows(jobs), read_rows(ways)
     real.COLUMNS.write(rows, study.out / "smoothing_real.csv")
-    write_page(real.page(rows), study.out / "smoothing_real.md")
+    if way_rows:
+        paths.COLUMNS.write(way_rows, study.out / "smoothing_paths.csv")
+    write_page(real.page(rows, way_rows), study.out / "smoothing_real.md")
 
 
 def joined(rows: Sequence[dict]) -> list[dict]:
