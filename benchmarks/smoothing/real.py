@@ -150,18 +150,20 @@ Jobs = dict[Path, Callable[[], list[dict]]]
 def jobs(root: Path | None, out: Path, smoke: bool) -> tuple[Jobs, Jobs]:
     """What writes which file, each on its own: of the velocities and joints, and of the path."""
     made: Jobs = {}
+    large: Jobs = {}
     ways: Jobs = {}
+    parts, readings = out / "parts", out / "readings"
     for make in tasks(root, out, smoke=smoke):
         task = make()
         for place, members in enumerate(task.members):
-            file = out / "parts" / f"{task.name}-{members}.json"
-            draws = 1 if smoke or place else 4  # a large ensemble's errors hardly move with its noise
-            made[file] = partial(ensembles, make, place, out / "readings", draws)
-        made[out / "parts" / f"{task.name}-gaussian.json"] = partial(
-            gaussians, make, out / "readings", 2 if smoke else 60
-        )
+            # A large ensemble's errors hardly move with its noise.
+            draws = 1 if smoke or place else task.draws
+            job = partial(ensembles, make, place, readings, draws)
+            (large if place else made)[parts / f"{task.name}-{members}.json"] = job
+        made[parts / f"{task.name}-gaussian.json"] = partial(gaussians, make, readings, 2 if smoke else 60)
         if task.name == "kitti":
-            ways[out / "parts" / "kitti-paths.json"] = partial(paths, make, out / "readings", 1 if smoke else 2)
+            ways[parts / "kitti-paths.json"] = partial(paths, make, readings)
+    return made | large, ways
     return made, ways
 
 
@@ -180,7 +182,7 @@ def page(rows: Sequence[dict], ways: Sequence[dict]) -> str:
         own = pick([{"members": None, **row} for row in rows], **dict(zip(keys, found, strict=True)))
         before, after = (fmean(row[f"rmse_{name}"] for row in own) for name in ("filter", "smoother"))
         less = 1 - fmean(row["rmse_smoother"] / row["rmse_filter"] for row in own)
-        cells = [*found[:4], found[4] or "", f"{before:.4f}", f"{after:.4f}", f"{less:.0%}"]
+        cells = [*found[:4], found[4] or "", f"{before:.4f}", f"{after:.4f}", f"{less:.1%}"]
         lines.append(line(*cells, "yes" if less >= LESS else "no"))
     lines += ["", "How long a sensor's errors last: their correlation one step and ten steps later.", ""]
     lines += head("task", "recordings", "quantity", "sensor", "one step", f"{LAG} steps")

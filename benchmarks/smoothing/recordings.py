@@ -32,6 +32,7 @@ class Task:
         quantities: names of what is scored, with their units.
         dims: their dimensions of the state.
         members: sizes of the ensemble; the first is the one that the filter was trained with.
+        draws: of the noise, of an ensemble of that size.
         model: the trained filter, for a number of members.
         behind: the same without its sensor.
         read: the groups of recordings, the first for choices alone, as that filter's sensor reads them.
@@ -41,6 +42,7 @@ class Task:
     quantities: tuple[str, ...]
     dims: range
     members: tuple[int, ...]
+    draws: int
     model: Callable[[int], Filter]
     behind: Callable[[Filter], Filter]
     read: Callable[[Filter], dict[str, Group]]
@@ -90,7 +92,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
         return {name: side_by_side((d, drive(car, r, d, out / "cache")) for r, d in of) for name, of in places.items()}
 
     names = ("speed m/s", "turn rate rad/s")
-    return Task("kitti", names, range(3, 5), (32, 256), model, CarFilter.without_sensor, read)
+    return Task("kitti", names, range(3, 5), (32, 256), 4, model, CarFilter.without_sensor, read)
 
 
 def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
@@ -126,7 +128,7 @@ def ur5(out: Path, *, smoke: bool = False) -> Task:
         return groups
 
     names = tuple(f"J{number} rad" for number in range(1, JOINTS + 1))
-    return Task("ur5", names, range(JOINTS), (64, 256), model, behind_sensor, read)
+    return Task("ur5", names, range(JOINTS), (64, 256), 1, model, behind_sensor, read)
 
 
 def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:

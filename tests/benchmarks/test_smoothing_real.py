@@ -67,7 +67,7 @@ def test_readings_that_are_missing_are_held(float64):
 
 
 def test_rows_and_page(tmp_path):
-    task = Task("kitti", ("speed m/s", "turn rate rad/s"), range(3, 5), (32,), *[lambda *_: None] * 3)
+    task = Task("kitti", ("speed m/s", "turn rate rad/s"), range(3, 5), (32,), 4, *[lambda *_: None] * 3)
     say = partial(real.rows_of, task, method="EnKS", members=32, draws=4)
     rows = say("real", "01 02", torch.tensor([[1.0, 4.0], [9.0, 4.0]]), torch.tensor([[0.64, 4.0], [5.76, 4.0]]))
     assert [row["rmse_filter"] for row in rows] == [1, 2, 3, 2]
@@ -76,5 +76,5 @@ def test_rows_and_page(tmp_path):
     real.COLUMNS.write(rows, tmp_path / "rows.csv")
     assert len(real.COLUMNS.read(tmp_path / "rows.csv")) == 4
     lines = [line for line in real.page(rows, []).splitlines() if line.startswith("| kitti")]
-    assert lines[0] == "| kitti | real | speed m/s | EnKS | 32 | 2.0000 | 1.6000 | 20% | yes |"
-    assert lines[1].endswith("| 0% | no |")
+    assert lines[0] == "| kitti | real | speed m/s | EnKS | 32 | 2.0000 | 1.6000 | 20.0% | yes |"
+    assert lines[1].endswith("| 0.0% | no |")
