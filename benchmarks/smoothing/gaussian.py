@@ -45,6 +45,7 @@ class Model(NamedTuple):
     cov: Tensor  # [D, 3, 3]
 
 
+WINDOW, BURN_IN = 60, 10  # steps of a recording that are fitted at once, and of these the first that do not count
 OBSERVATION = torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)
 
 
@@ -106,19 +107,31 @@ def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
         "share": zero,
     }
     parameters = {name: value.clone().requires_grad_() for name, value in parameters.items()}
+    cut = [windows_of(each) for each in series]
     optimiser = torch.optim.Adam(parameters.values(), 0.2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
     for _ in range(updates):
         model = model_of(parameters, series)
         scores = []
-        for each in series:
-            mean = believe(model, each, lag)[1]
-            scores.append((mean - each.truth)[:, 1 : -lag or None].square().mean(1).log())
+        for each, (count, steps, size) in zip(cut, (each.truth.shape for each in series), strict=True):
+            error = (believe(model, each, lag)[1] - each.truth)[:, min(BURN_IN, steps // 4) : -lag or None]
+            scores.append(error.square().reshape(count, -1, size).mean(1).log())
         optimiser.zero_grad()
         torch.cat(scores).mean().backward()
         optimiser.step()
         schedule.step()
     return {name: value.detach() for name, value in parameters.items()}
+
+
+def windows_of(series: Series) -> Series:
+    """The same as shorter recordings; what is left over at the end is not used."""
+    steps = series.truth.shape[1]
+    length = min(WINDOW, steps)
+
+    def cut(value: Tensor) -> Tensor:
+        return value[:, : steps // length * length].reshape(-1, length, value.shape[-1])
+
+    return Series(*(None if value is None else cut(value) for value in series))
 
 
 def kalman_filter(model: Model) -> KalmanFilter:
