@@ -128,7 +128,7 @@ def ur5(out: Path, *, smoke: bool = False) -> Task:
         return groups
 
     names = tuple(f"J{number} rad" for number in range(1, JOINTS + 1))
-    return Task("ur5", names, range(JOINTS), (64, 256), 1, model, behind_sensor, read)
+    return Task("ur5", names, range(JOINTS), (64,), 1, model, behind_sensor, read)
 
 
 def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
