@@ -135,5 +135,5 @@ def test_what_is_no_lag_and_what_no_filter():
         with pytest.raises(TypeError, match="before and after a step"):
             smoother(recurrent)
     for smoother in (EnKS, EnRTS):
-        with pytest.raises(TypeError, match="smooths an ensemble"):
+        with pytest.raises(TypeError, match="LSTMFilter carries"):
             smoother(recurrent)

@@ -109,7 +109,6 @@ def rts_smooth(
 
     Raises:
         ValueError: if the shapes do not fit, or ``lag`` is negative.
-        TypeError: if ``lag`` is no whole number.
 
     Examples:
         >>> import torch
@@ -151,6 +150,6 @@ def rts_smooth(
 
 
 def check_lag(lag: int | None) -> None:
-    """Raise ``TypeError`` for a lag that is no whole number, ``ValueError`` for a negative one."""
+    """Raise unless ``lag`` is ``None`` or a whole number, 0 or more."""
     if lag is not None:
-        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is all of them")
+        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is for all")

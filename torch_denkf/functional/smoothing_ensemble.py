@@ -50,7 +50,7 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     check_ensemble("ensemble", ensemble, min_size=2)
     for name, value in (("forecast", forecast), ("smoothed", smoothed)):
         check_shape(name, value, ensemble.shape, "[*B, E, S]")
-    check_damping(damping)
+    check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
     # Where all members are alike, what they have beside their mean is rounding, and no direction to learn from.
@@ -127,8 +127,3 @@ def enrts_smooth(
     for _ in range(lag):  # all times at once: each round takes in one more reading
         smoothed = torch.cat([back(slice(None), smoothed[..., 1:, :, :]), ensemble[..., -1:, :, :]], -3)
     return smoothed
-
-
-def check_damping(damping: float) -> None:
-    """Raise ``TypeError`` for what is no number, ``ValueError`` for a factor that is not in (0, 1]."""
-    check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
