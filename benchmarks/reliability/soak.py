@@ -98,12 +98,12 @@ def _cell(value: Any) -> str:
 #: The columns of each part's table; all others stay in the JSON file.
 COLUMNS = {
     "steps": (
-        "package",
         "steps",
         "unobserved",
         "not finite",
         "mean squared error, first chunk",
         "mean squared error, last chunk",
+        "largest difference from the filter",
         "largest difference from a fresh run",
         "memory grown, MB",
         "us a step",
