@@ -124,5 +124,6 @@ def test_compiled(name, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_compiled_in_double_precision(float64, tmp_path):
     assert_the_same(learned_filter("EKF"), tmp_path)

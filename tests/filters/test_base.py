@@ -195,7 +195,7 @@ def test_float32_agrees_with_float64(float64):
 
 
 @pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
-@pytest.mark.parametrize("layer", ["dropout", "flipout"])
+@pytest.mark.parametrize("layer", ["dropout", pytest.param("flipout", marks=pytest.mark.slow)])
 def test_compiled_step_equals_eager(float64, layer):
     filter = toy_denkf("sensor", layer)
     td = filter.initialise(toy_frames((3,), resets=False))

@@ -40,7 +40,7 @@ def test_compiled_is_eager_forward_and_backward(dtype):
 
 
 @pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.slow)])
 def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
     filter, frames, out = toy_denkf(action=False).to(dtype), toy_frames((2, 2), masks=0, resets=False), []
     frames["measurement"] = frames["measurement"].to(dtype)

@@ -10,13 +10,12 @@ from pathlib import Path
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torch.export._trace import _export
 
 from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters._rejection import REJECTED
-from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler
+from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.modules._base import flat_noise
 
 
@@ -67,7 +66,7 @@ def export_step(
     Raises:
         KeyError: if an entry that the step reads is missing.
         ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
-        RuntimeError: if there is no C++ compiler.
+        RuntimeError: if there is no C++ compiler, or this torch cannot trace the step.
         OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
@@ -115,9 +114,7 @@ def export_step(
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
     try:
         with torch.no_grad():
-            # torch.export.export records above autograd: a Jacobian taken inside the step becomes a constant there, and
-            # an LSTM cell is compiled to other numbers. Below autograd, plain arithmetic is left of both.
-            program = _export(step, values, pre_dispatch=False, strict=False)
+            program = trace_below_autograd(step, values)
     finally:
         filter.train(was_training)
     package = io.BytesIO()  # torch's own writer ends the process where the disk is full
