@@ -1,4 +1,4 @@
-# `make demo` (watch it work), `make test` (everything CI runs), `make test-all` (and what compiles for long), `make docs`
+# `make demo` (watch it work), `make test` (everything CI runs), `make test-all` (and the slow tests), `make docs`
 # (the site, in docs/_build/html), `make bench` (speed, beside its peers), `make fuzz` and `make soak` (reliability),
 # `make test-nightly` (all tests beside the nightlies of torchrl and tensordict).
 PYTHON ?= python3
@@ -71,10 +71,8 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 	$(NIGHTLY_VENV)/bin/python -m pip uninstall --quiet --yes torchrl tensordict
 	touch $@
 
-# A tiny run of every study and example, two at a time; the long ones first.
 smoke: $(STAMP)
-	{ printf -- '-m benchmarks.%s\n' kitti ur5 g1 lorenz96 smoothing arms odometry reliability; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
-		sh -c 'echo "== {} --smoke" && $(BIN)/python {} --smoke || exit 255'
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.common.smoke
 
 # Damaged inputs at every border: about ten minutes. The tests run a sample.
 fuzz: $(STAMP)

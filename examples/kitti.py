@@ -74,7 +74,7 @@ def main() -> None:
     size, cache = (100, 300), args.out / "cache"
     if args.root is None:
         args.root = args.out / "drives"
-        write_drives(args.root, [*args.train, *args.test], frames=40 if args.smoke else 150, size=size)
+        write_drives(args.root, [*args.train, *args.test], frames=20 if args.smoke else 150, size=size)
 
     # The data set: optical flow and the road's correlation of all frames, made once and kept in the cache.
     flow = partial(with_motion, keep_images=False, cache=cache)

@@ -4,8 +4,8 @@ The filter draws nothing at random, so that what an environment returns follows 
 t+1 from that of t, the action and the frame; the belief after a reset is known; and what is handed on from step to
 step, and from batch to batch, must be what came out before.
 
-Each worker's environment has several rows, so that one exchange between processes moves steps of all of them. Steps are
-counted of each row: 16 rows that step once are 16 steps, and one exchange.
+Each process's environment has several rows, so that one exchange between processes moves steps of all of them. Steps are
+counted of each row: 64 rows that step once are 64 steps, and one exchange.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from torch_denkf.transforms import DEnKFTransform
 
 __all__ = ["LAYOUTS", "rows"]
 
-ENVIRONMENTS, ROWS = 4, 4  # processes of a ParallelEnv, and rows of each
-FRAMES = 3200  # steps of all rows in a batch
+ENVIRONMENTS, ROWS = 4, 16  # processes of a ParallelEnv, and rows of each
+FRAMES = 6400  # steps of all rows in a batch
 WORKERS = 2  # processes of a collector
-LENGTHS = [3, 5, 17, 23]  # of the episodes in each row: resets are partial
+LENGTHS = [3, 5, 17, 23] * (ROWS // 4)  # of the episodes in each row: resets are partial
 BELIEF = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
 CLOSE = 1e-4  # float32, another order of sums
 
