@@ -4,8 +4,8 @@ The filter draws nothing at random, so that what an environment returns follows 
 t+1 from that of t, the action and the frame; the belief after a reset is known; and what is handed on from step to
 step, and from batch to batch, must be what came out before.
 
-Each process's environment has several rows, so that one exchange between processes moves steps of all of them. Steps are
-counted of each row: 64 rows that step once are 64 steps, and one exchange.
+Each process's environment has several rows, so that one exchange between processes moves steps of all of them. Steps
+are counted of each row: 64 rows that step once are 64 steps, and one exchange.
 """
 
 from __future__ import annotations
