@@ -41,7 +41,7 @@ class Downhill(nn.Module):
 
 def parts(motion):
     """Transition, sensor, observation and noise of a filter that reads "reading" ``[*B, 2]``."""
-    noise = ConstantNoise([0.4, 0.2], in_key="reading")
+    noise = ConstantNoise([1.0, 0.8], in_key="reading")
     return {
         "transition": LearnedTransition(motion, residual=False),
         "sensor": None,
