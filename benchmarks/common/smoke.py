@@ -22,13 +22,18 @@ import torchrl.objectives  # noqa: F401  # what nearly all programs import
 import torch_denkf.filters  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
-STUDIES = ("kitti", "ur5", "g1", "lorenz96", "reliability", "arms", "smoothing", "odometry")  # the long ones first
+LONG = ("kitti", "ur5", "g1", "lorenz96")  # studies that come first
+ELSEWHERE = ("speed",)  # needs the libraries that it compares with, see tests/benchmarks/test_speed.py
 SIDE_BY_SIDE = 2
 
 
 def programs() -> list[str]:
     """Modules and files."""
-    return [f"benchmarks.{name}" for name in STUDIES] + [f"examples/{file.name}" for file in ROOT.glob("examples/*.py")]
+    found = {file.parent.name for file in ROOT.glob("benchmarks/*/__main__.py")} - set(ELSEWHERE)
+    studies = [*LONG, *sorted(found - set(LONG))]
+    return [f"benchmarks.{name}" for name in studies] + sorted(
+        f"examples/{file.name}" for file in ROOT.glob("examples/*.py")
+    )
 
 
 def run(program: str) -> None:

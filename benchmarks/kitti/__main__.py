@@ -24,7 +24,7 @@ def smoke(study: Study) -> Study:
     folder = Path(tempfile.mkdtemp(prefix="kitti-"))
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=53, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
-    settings = {"size": (50, 150), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
+    settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
     return replace(study, root=folder / "kitti", out=folder / "out", sensors=("flow", "image"), **settings)
 
 
