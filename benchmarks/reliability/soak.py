@@ -123,9 +123,9 @@ TITLES = {
     "kills": "Work that `kill -9` ended at random moments, and that was started again.",
     "disks": "Disks that are full (tmpfs) or read-only, and two processes that write to one place.",
     "layouts": (
-        "A filter inside environments, workers and collectors; each step compared with the same step by hand. Steps are "
-        f"counted of all rows: each of the {layouts.ENVIRONMENTS} processes of a ParallelEnv has {layouts.ROWS}, so that "
-        f"{layouts.ENVIRONMENTS * layouts.ROWS} steps are one exchange between processes."
+        "A filter inside environments, workers and collectors; each step compared with the same step by hand. Steps "
+        f"are counted of all rows: each of the {layouts.ENVIRONMENTS} processes of a ParallelEnv has {layouts.ROWS} "
+        f"rows, so that {layouts.ENVIRONMENTS * layouts.ROWS} steps are one exchange between processes."
     ),
 }
 
