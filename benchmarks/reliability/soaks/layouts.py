@@ -73,7 +73,7 @@ def _rollouts(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBas
     env = make()
     try:
         carry, steps = env.reset(), FRAMES // (ENVIRONMENTS * ROWS)
-        for _ in range(total // FRAMES):
+        for _ in range(-(-total // FRAMES)):
             out = env.rollout(
                 steps, auto_reset=False, tensordict=carry, break_when_any_done=False, return_contiguous=True
             )
