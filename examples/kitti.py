@@ -70,7 +70,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(2)
     if args.smoke:
-        args.out, args.train, args.test, args.updates = args.out.with_name("kitti-smoke"), ["00"], ["08"], (2, 2)
+        args.out, args.train, args.test, args.updates = args.out.with_name("kitti-tiny"), ["00"], ["08"], (2, 2)
     size, cache = (100, 300), args.out / "cache"
     if args.root is None:
         args.root = args.out / "drives"
