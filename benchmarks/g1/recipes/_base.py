@@ -9,8 +9,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from benchmarks.common.recipes import Recipe, Registry
-from benchmarks.g1.motion import FADING, AtRest, BiasedReading, Motion, transition
+from benchmarks.common.arms import ArmRecipe, AtRest
+from benchmarks.common.recipes import Registry
+from benchmarks.g1.motion import FADING, BiasedReading, Motion
 from benchmarks.g1.sensors import Statistics
 from benchmarks.g1.targets import Target
 from torch_denkf.filters import Filter
@@ -45,7 +46,7 @@ class RatesAndBias(SubModel):
         return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 
 
-class G1Recipe(Recipe):
+class G1Recipe(ArmRecipe):
     """A filter of D numbers of a robot, behind a trained sensor. All carry them in the first D entries of their mean.
 
     Args:
@@ -58,9 +59,7 @@ class G1Recipe(Recipe):
         ensemble_size: members of an ensemble.
     """
 
-    actions = False  # whether the motion reads the commands
     encoders = False  # whether some joints have noisy encoders
-    bias = True  # whether the state holds the sensor's slow errors
     members = MEMBERS
     longer = 1  # times as many updates as others
 
@@ -83,18 +82,14 @@ class G1Recipe(Recipe):
         return WHITE if self.bias else 1.0
 
     @property
-    def size(self) -> int:
-        """S, of the state."""
-        return self.target.size * (3 if self.bias else 2)
-
-    @property
     def noisy(self) -> list[int]:
         """Dimensions of the state that the process noise acts on: the numbers follow from their rates."""
         return list(range(self.target.size, self.size))
 
-    def transition(self) -> SubModel:
-        """The learned motion, with a copy of its pre-trained parameters."""
-        return transition(self.motion, self.bias)
+    @property
+    def rates(self) -> list[int]:
+        """Dimensions of the state that are rates."""
+        return list(range(self.target.size, 2 * self.target.size))
 
     def observation(self) -> SubModel:
         """H."""
@@ -105,10 +100,6 @@ class G1Recipe(Recipe):
         """What motion and bias do not know before training: accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
         return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
-
-    def process_noise(self) -> SubModel:
-        """Q of rates and bias, from the belief's mean."""
-        return ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> SubModel:
         motion, size = self.motion, self.target.size
@@ -134,14 +125,9 @@ class G1Recipe(Recipe):
         )
         return RatesAndBias(rates, slow)
 
-    @property
-    def state_scale(self) -> Tensor:
-        """Units of the loss; rates and biases do not count."""
-        return torch.cat([self.unit, torch.full((self.size - self.target.size,), torch.inf)])
-
     def _initial(self, std: Tensor, rates: float) -> TensorDictModuleBase:
         whole = torch.cat([std, rates * self.motion.rate, SLOW * self.error])[: self.size]
-        return AtRest(self.belief(whole), self.size)
+        return AtRest(self.belief(whole), self.size, self.target.size, "start")
 
     def build(self) -> Filter:
         """The filter, on readings; episodes begin somewhere where those of the training do."""
