@@ -31,7 +31,7 @@ from benchmarks.g1.readings import (
 from benchmarks.g1.recipes import FILTERS, G1Recipe
 from benchmarks.g1.recipes._base import MEMBERS
 from benchmarks.g1.recordings import Recordings, rows_of
-from benchmarks.g1.sensors import SENSORS
+from benchmarks.g1.sensors import SENSORS, encoding_size
 from benchmarks.g1.targets import TARGETS, Target
 from benchmarks.g1.training import FilterBudget, filter_error, train_filter
 from torch_denkf.filters import Filter
@@ -87,14 +87,14 @@ class Base:
     def _readings(self, role: str) -> dict[str, TensorDict]:
         """What the sensor reads of the episodes of a role, in all conditions."""
         trained, study = self.trained, self.study
-        sensor, _ = trained.trained
+        sensors, _ = trained.trained
         numbers, out = getattr(trained.roles, role), {}
         for condition in PICTURES:
             file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
             exact = role == "test"
             hand = None if file.exists() else trained.hand
-            codes = read_codes(sensor, study.data, hand, numbers, condition=condition, exact=exact, file=file)
-            out[condition] = with_readings(sensor, codes, self.target, MEMBERS, self.start.mean(0))
+            codes = read_codes(sensors, study.data, hand, numbers, condition=condition, exact=exact, file=file)
+            out[condition] = with_readings(sensors, codes, self.target, MEMBERS, self.start.mean(0))
         for condition in set(CONDITIONS) - set(PICTURES):
             out[condition] = fail(out["clean"], condition, self.black)
         return {condition: out[condition] for condition in CONDITIONS}
@@ -146,8 +146,8 @@ class Base:
     def train(self, name: str) -> tuple[G1Recipe, Filter]:
         """Trains a filter, or reads it."""
         kind = FILTERS[name]
-        sensor, facts = self.trained.trained
-        encoding = sensor.module["head"].layers[-1].in_features
+        sensors, facts = self.trained.trained
+        encoding = encoding_size(sensors)
         recipe = kind(
             self.target, facts, self.motion(kind.actions), self.error, self.start.std(0).clamp_min(1e-3), encoding
         )
