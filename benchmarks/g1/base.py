@@ -67,7 +67,8 @@ class TrainedSensor:
     def pool(self, rows: Tensor) -> FramePool:
         """Frames of some rows."""
         target = self.target[rows]
-        return FramePool(bytes_of(self.recordings.data, rows), target, self.hand(target[:, : len(ARM)]))
+        episode = self.recordings.data.storage[:]["episode"].flatten()[rows]
+        return FramePool(bytes_of(self.recordings.data, rows), target, self.hand(target[:, : len(ARM)]), episode)
 
     @cached_property
     def trained(self) -> tuple[list[ImageSensor], Statistics]:

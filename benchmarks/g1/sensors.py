@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.g1.disturbances import disturb
+from benchmarks.g1.disturbances import MARGIN, before_another, disturb
 from benchmarks.g1.recordings import FINGERS, JOINTS, READ
 from benchmarks.g1.trunk import SecondLookTrunk, Shrink
 from torch_denkf.functional import crps_ensemble
@@ -18,6 +18,7 @@ from torch_denkf.modules import ImageSensor, convolutional_trunk
 from torch_denkf.training import Stage, train_part
 
 SAMPLES = 16  # of a sensor while it is trained
+ELSEWHERE = 0.4  # of the training frames are put before the table of another episode
 # What a good sensor leaves: units of all losses. 1.15 degrees; a twentieth of the way of a finger.
 JOINT_UNIT, FINGER_UNIT = 0.02, 0.05
 UNIT = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((FINGERS,), FINGER_UNIT)])
@@ -132,21 +133,35 @@ class FramePool:
         pixels: uint8 ``[N, 3, H, W]``.
         target: what is to be read, ``[N, 13]``.
         place: where the hand is in the picture, ``[N, 2]``.
+        episode: ``[N]``.
     """
 
-    def __init__(self, pixels: Tensor, target: Tensor, place: Tensor):
-        self.pixels, self.target, self.place = pixels, target, place
+    def __init__(self, pixels: Tensor, target: Tensor, place: Tensor, episode: Tensor):
+        self.pixels, self.target, self.place, self.episode = pixels, target, place, episode
 
     def __len__(self) -> int:
         return len(self.target)
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random disturbed frames ``[batch]``."""
+        """Random disturbed frames ``[batch]``, some before the table of another episode."""
         index = torch.randint(len(self), (batch,), generator=generator)
         rows = {"target": self.target[index], "place": self.place[index]}
-        pixels, moved = disturb(self.pixels[index], self.place[index], generator)
+        pixels, moved = disturb(self._elsewhere(index, generator), self.place[index], generator)
         rows["place"] = rows["place"] + moved
         return TensorDict({**rows, "pixels": pixels}, batch_size=[batch])
+
+    def _elsewhere(self, index: Tensor, generator: torch.Generator) -> Tensor:
+        # A sensor knows its few episodes by their tables. Most of the others' hands are at about the same place.
+        pixels = self.pixels[index]
+        for k in (torch.rand(len(index), generator=generator) < ELSEWHERE).nonzero().flatten().tolist():
+            others = torch.randint(len(self), (400,), generator=generator)
+            near, least = torch.rand(2, generator=generator).tolist()
+            away = (self.place[others] - self.place[index[k]]).norm(dim=-1)
+            away = away + 10 * (self.episode[others] == self.episode[index[k]])
+            other = others[away.argmin()] if near < 0.7 else others[0]
+            margin = MARGIN[0] + (MARGIN[1] - MARGIN[0]) * least
+            pixels[k] = before_another(pixels[k], self.place[index[k]], self.pixels[other], margin)
+        return pixels
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.baselines import Baselines, at_phase, clock, smoothed
-from benchmarks.g1.disturbances import boxed, disturb, shifted
+from benchmarks.g1.disturbances import before_another, boxed, disturb, shifted
 from benchmarks.g1.motion import DELAYS, BiasedReading, Motion, delayed, with_rates
 from benchmarks.g1.readings import BLACK, CONDITIONS, PICTURES, Windows, black_readings, blackouts, fail
 from benchmarks.g1.recipes.denkf import TAPER, WithEncoders, localisation
@@ -87,6 +87,14 @@ def test_a_shifted_picture_and_a_box():
     assert (hidden[0] == 0).sum().item() == 3 * 20 * 20
     assert (hidden[0, 0, 20:40, 30:50] == 0).all()
     assert (hidden[1] == 0).sum().item() == 3 * 10 * 10  # a quarter of it is in the picture
+
+
+def test_an_arm_before_another_table():
+    arm, table = torch.full((3, 60, 80), 9, dtype=torch.uint8), torch.zeros(3, 60, 80, dtype=torch.uint8)
+    out = before_another(arm, torch.tensor([0.5, 0.0]), table, 0.25)  # the hand is in column 60 and row 30
+    assert (out[:, 10:, 40:] == 9).all()
+    assert int((out == 9).sum()) == 3 * 50 * 40
+    assert (before_another(arm, torch.tensor([-1.0, -1.0]), table, 0.1) == 9).all()
 
 
 def test_disturbed_frames_are_repeatable_and_keep_the_place():
