@@ -22,7 +22,7 @@ CHECKED = 1200  # frames that a sensor is validated on
 class SensorBudget:
     """Updates of a sensor, and frames in each; networks that read together, trained from different random numbers."""
 
-    glimpse: int = 2600
+    glimpse: int = 2400
     paper: int = 1000
     frames: int = 32
     networks: int = 2  # of `glimpse`; `paper` is one
