@@ -13,7 +13,7 @@ from benchmarks.common.recipes import Recipe
 from torch_denkf.modules import LearnedTransition, ScaledNoise, SubModel, run_module
 
 
-class ArmMotion(Protocol):
+class StateMotion(Protocol):
     """A network that moves a state: its first numbers are what the sensor reads, the others are rates.
 
     Attributes:
@@ -43,7 +43,7 @@ class WithBias(nn.Module):
         motion: of the state without them.
     """
 
-    def __init__(self, motion: ArmMotion):
+    def __init__(self, motion: StateMotion):
         super().__init__()
         self.motion = motion
         self.fading = nn.Parameter(torch.full((motion.read,), motion.fading).logit())
@@ -98,7 +98,7 @@ class ArmRecipe(Recipe):
 
     actions = False
     bias = True
-    motion: ArmMotion
+    motion: StateMotion
     process_std: Tensor
     noisy: list[int]
     rates: list[int]
