@@ -160,6 +160,13 @@ def with_readings(
     return out
 
 
+def standardised(readings: TensorDict, loc: Tensor, scale: Tensor) -> TensorDict:
+    """Readings whose encoding has mean zero and variance one where ``loc`` and ``scale`` were taken."""
+    sensor = readings["sensor"].copy()
+    sensor["encoding"] = ((sensor["encoding"] - loc) / scale).clamp(-5, 5)
+    return readings.copy().set("sensor", sensor)
+
+
 @torch.no_grad()
 def black_readings(sensors: Sequence[ImageSensor], target: Target, members: int) -> TensorDict:
     """What the sensor reads in a black picture, and whether such a picture counts as observed, ``[1, 1]``."""

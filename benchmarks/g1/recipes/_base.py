@@ -6,11 +6,13 @@ from collections import OrderedDict
 from copy import deepcopy
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from benchmarks.common.arms import ArmRecipe, AtRest
 from benchmarks.common.recipes import Registry
+from benchmarks.g1.baselines import SPREAD_CELLS
 from benchmarks.g1.motion import FADING, BiasedReading, Motion
 from benchmarks.g1.sensors import Statistics
 from benchmarks.g1.targets import Target
@@ -56,16 +58,26 @@ class G1Recipe(ArmRecipe):
         error: root mean square error of the sensor, ``[D]``, on episodes that it has not seen.
         start: standard deviation of where episodes begin, ``[D]``.
         encoding: features of the sensor's encoding.
-        ensemble_size: members of an ensemble.
+        spread: the variance of the sensor's errors as a function of the encoding, fitted before.
     """
 
     encoders = False  # whether some joints have noisy encoders
+    fitted = True  # whether R and the noise of the bias begin as the fitted variance of the sensor's errors
     members = MEMBERS
     longer = 1  # times as many updates as others
 
-    def __init__(self, target: Target, facts: Statistics, motion: Motion, error: Tensor, start: Tensor, encoding: int):
+    def __init__(
+        self,
+        target: Target,
+        facts: Statistics,
+        motion: Motion,
+        error: Tensor,
+        start: Tensor,
+        encoding: int,
+        spread: DiagonalNoise,
+    ):
         self.target, self.facts, self.motion = target, facts, deepcopy(motion)
-        self.error, self.start, self.encoding = error, start, encoding
+        self.error, self.start, self.encoding, self.spread = error, start, encoding, spread
         self.dims, self.unit = range(target.size), torch.full((target.size,), target.unit)
 
     def belief(self, std: Tensor) -> TensorDictModuleBase:
@@ -73,8 +85,16 @@ class G1Recipe(ArmRecipe):
         raise NotImplementedError
 
     def noise(self):
-        keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding")}
-        return ScaledNoise(DiagonalNoise(self.target.size, r=self.white * self.error, num_cells=(16,), **keys))
+        return ScaledNoise(self._of_sensor(self.white, ("sensor", "noise")))
+
+    def _of_sensor(self, share: float, out_key: NestedKey) -> DiagonalNoise:
+        """A share of the sensor's errors, from what it sees; before training as it was fitted."""
+        root = (self.spread.variance + self.spread.floor).sqrt() if self.fitted else self.error
+        keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding"), "out_key": out_key}
+        noise = DiagonalNoise(self.target.size, r=share * root, num_cells=SPREAD_CELLS, **keys)
+        if self.fitted:
+            noise.module.load_state_dict(self.spread.module.state_dict())
+        return noise
 
     @property
     def white(self) -> float:
@@ -115,14 +135,7 @@ class G1Recipe(ArmRecipe):
         )
         if not self.bias:
             return rates
-        slow = DiagonalNoise(
-            size,
-            r=self.process_std[size:],
-            num_cells=(16,),
-            in_features=self.encoding,
-            in_key=("sensor", "encoding"),
-            out_key=("forecast", "noise"),
-        )
+        slow = self._of_sensor((1 - FADING**2) ** 0.5 * SLOW, ("forecast", "noise"))
         return RatesAndBias(rates, slow)
 
     def _initial(self, std: Tensor, rates: float) -> TensorDictModuleBase:
