@@ -160,11 +160,9 @@ def with_readings(
     return out
 
 
-def standardised(readings: TensorDict, loc: Tensor, scale: Tensor) -> TensorDict:
-    """Readings whose encoding has mean zero and variance one where ``loc`` and ``scale`` were taken."""
-    sensor = readings["sensor"].copy()
-    sensor["encoding"] = ((sensor["encoding"] - loc) / scale).clamp(-5, 5)
-    return readings.copy().set("sensor", sensor)
+def standardised(encoding: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+    """An encoding ``[*, F]`` with mean zero and variance one where ``loc`` and ``scale`` were taken, within 5."""
+    return ((encoding - loc) / scale).clamp(-5, 5)
 
 
 @torch.no_grad()

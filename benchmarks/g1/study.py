@@ -108,10 +108,15 @@ class Base:
         seen = torch.cat([one["sensor", "encoding"][one["observed"].squeeze(-1)] for one in self._tune.values()])
         return seen.mean(0), seen.std(0).clamp_min(1e-3)
 
+    def _standardised(self, readings: TensorDict) -> TensorDict:
+        sensor = readings["sensor"].copy()
+        sensor["encoding"] = standardised(sensor["encoding"], *self._encoding)
+        return readings.copy().set("sensor", sensor)
+
     def _readings(self, role: str) -> dict[str, TensorDict]:
         """What the sensor reads of the episodes of a role, in all conditions."""
         pictures = self._tune if role == "tune" else self._pictures(role)
-        out = {condition: standardised(one, *self._encoding) for condition, one in pictures.items()}
+        out = {condition: self._standardised(one) for condition, one in pictures.items()}
         for condition in set(CONDITIONS) - set(PICTURES):
             out[condition] = fail(out["clean"], condition, self.black)
         return {condition: out[condition] for condition in CONDITIONS}
@@ -120,8 +125,7 @@ class Base:
     def black(self) -> TensorDict:
         """The reading of a black frame."""
         black = black_readings(self.trained.trained[0], self.target, MEMBERS)
-        loc, scale = self._encoding
-        return black.set("encoding", ((black["encoding"] - loc) / scale).clamp(-5, 5))
+        return black.set("encoding", standardised(black["encoding"], *self._encoding))
 
     @cached_property
     def tune(self) -> dict[str, TensorDict]:
