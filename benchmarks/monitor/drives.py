@@ -37,7 +37,7 @@ def stretches(frames: int) -> Tensor:
     return (number % PERIOD >= PERIOD - LENGTH) & (number < frames // PERIOD * PERIOD)
 
 
-def failing(root: Path, name: str, fault: str, cache: Path) -> TensorDict:
+def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1) -> TensorDict:
     """Readings of the trained sensor of a whole drive ``[N]`` with a fault, and whether a picture of the pair is of it.
 
     Args:
@@ -45,11 +45,13 @@ def failing(root: Path, name: str, fault: str, cache: Path) -> TensorDict:
         name: of the drive.
         fault: ``"clean"``, or of ``FAULTS`` or ``ALWAYS``.
         cache: folder in which readings are kept.
+        steps: between the two pictures of a pair.
     """
-    return cached(cache / f"{name}-{fault}", lambda: _compute(root, name, fault))
+    entry = f"{name}-{fault}" if steps == 1 else f"{name}-{fault}-{steps}"
+    return cached(cache / entry, lambda: _compute(root, name, fault, steps))
 
 
-def _compute(root: Path, name: str, fault: str) -> TensorDict:
+def _compute(root: Path, name: str, fault: str, steps: int) -> TensorDict:
     torch.set_num_threads(1)
     car = from_pretrained("car-odometry")
     drive = read_kitti_drive(root, name, size=car.settings.size, colour=False, cache=None).copy()
@@ -65,8 +67,8 @@ def _compute(root: Path, name: str, fault: str) -> TensorDict:
         hit = (image != before).flatten(1).any(-1)
     drive["image"] = image
     valid = drive["frame_valid"]
-    drive["steps"] = (valid & torch.cat([torch.zeros_like(valid[:1]), valid[:-1]])).long()
+    drive["steps"] = steps * (valid & torch.cat([torch.zeros_like(valid[:steps]), valid[:-steps]])).long()
     data = with_motion(drive, cache=None, keep_images=False)
     out = read_sensor(car.sensor, data, car.settings.longest)
-    pair = hit | torch.cat([hit[:1] & False, hit[:-1]])
+    pair = hit | torch.cat([hit[:steps] & False, hit[:-steps]])
     return out.set("fault", pair.unsqueeze(-1)).set("hit", hit.unsqueeze(-1))

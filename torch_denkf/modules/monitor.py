@@ -27,6 +27,7 @@ from torch_denkf.modules._calibration import IDENTITY, chi_square_table, empiric
 
 __all__ = ["InnovationMonitor", "MonitoredSensor"]
 
+_CLAIMS = 3  # steps whose claimed noise is averaged
 _STATE = ("terms", "last", "cusum", "claim", "p_value", "whiteness", "evidence")
 
 
@@ -54,8 +55,8 @@ class InnovationMonitor(SubModel):
       variable while the filter is right.
     * A *cumulative sum* of the normal scores of single steps: the fastest test for a change of a given size (Page 1954).
     * *Whiteness*: the correlation of successive normalised innovations over the window.
-    * A cumulative sum of the *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations
-      are then smaller than usual, not larger. It begins to count with :meth:`calibrate`.
+    * The *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations are then smaller
+      than usual, not larger. The mean of three steps' scores; it begins to count with :meth:`calibrate`.
 
     Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
     members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
@@ -70,7 +71,7 @@ class InnovationMonitor(SubModel):
     (key, sensor, ``p_value``)     ``[1]``   of the windowed normalised innovation squared
     (key, sensor, ``whiteness``)   ``[1]``   p-value of the correlation of successive innovations, two-sided
     (key, sensor, ``cusum``)       ``[1]``   cumulative sum, in standard normal numbers
-    (key, sensor, ``claim``)       ``[1]``   cumulative sum of the claimed noise, likewise
+    (key, sensor, ``claim``)       ``[3]``   scores of the claimed noise, the latest first
     (key, sensor, ``evidence``)    ``[1]``   the largest of all tests, as a multiple of its limit
     (key, ``alarm``)               ``[1]``   bool: some sensor's evidence exceeds 1
     (key, ``sensor``)              ``[1]``   int64: whose evidence is largest, by its place in ``sensors``; -1 without
@@ -181,9 +182,11 @@ class InnovationMonitor(SubModel):
         evidence = [cusum / self.cusum_limit[place], _logarithms(tests.p_value, limits[0])]
         claim = old["claim"]
         if noise is not None:
-            score = interpolate(_claimed(noise), *self.claims[place].to(dtype)).clamp(-self.largest, self.largest)
-            claim = self._sum(claim, score, seen, self.claim_limit[place])
-            evidence.append(claim / self.claim_limit[place])
+            # Nothing blurs the beginning of blindness: twice the bound, so that two steps decide.
+            most = 2 * self.largest
+            score = interpolate(_claimed(noise), *self.claims[place].to(dtype)).clamp(-most, most)
+            claim = torch.where(seen, torch.cat([score, claim[..., :-1]], -1), claim)
+            evidence.append(claim.mean(-1, keepdim=True) / self.claim_limit[place])
         if self.whiteness:
             evidence.append(_logarithms(tests.whiteness, limits[1]))
         size = torch.cat(evidence, -1).amax(-1, keepdim=True).to(dtype)
@@ -212,7 +215,8 @@ class InnovationMonitor(SubModel):
         zero, values = torch.zeros(*batch_size, 1, **make), []
         for sensor in self.sensors.values():
             values += [torch.zeros(*batch_size, self.window, 4, **make)]
-            values += [torch.zeros(*batch_size, sensor.observation_dim, **make), zero, zero]
+            values += [torch.zeros(*batch_size, sensor.observation_dim, **make), zero]
+            values += [torch.zeros(*batch_size, _CLAIMS, **make)]
             values += [torch.ones_like(zero), torch.ones_like(zero), zero]
         alarm = torch.zeros(*batch_size, 1, dtype=torch.bool, device=device)
         return [*values, alarm, torch.full_like(alarm, -1, dtype=torch.int64)]
@@ -255,7 +259,6 @@ class InnovationMonitor(SubModel):
             if sensor.noise_key is not None:
                 claimed = torch.cat([_claimed(part[2]) for part in parts]).squeeze(-1)
                 self.claims[place] = score_table(claimed.double())
-                self.claim_limit[place] = 1e6  # to be found now
         self._set_limits([self.replay(each) for each in clean], margin)
         return self
 
@@ -271,7 +274,11 @@ class InnovationMonitor(SubModel):
             self.whiteness_limit[place] = min(self.share, extreme("whiteness", self.share)) ** margin
             self.cusum_limit[place] = margin * max(strict, extreme("cusum", 1 - self.share))
             if sensor.noise_key is not None:
-                self.claim_limit[place] = margin * max(strict, extreme("claim", 1 - self.share))
+                means = [each[self.monitor_key, name, "claim"].double().mean(-1).flatten() for each in tests]
+                found = float(empirical_quantile(torch.cat(means), torch.tensor([1 - self.share])))
+                # The scores of successive frames may be one: then their mean is a normal number, too.
+                normal = -float(torch.special.ndtri(torch.tensor(self.share, dtype=torch.float64)))
+                self.claim_limit[place] = margin * max(normal, found)
 
     @torch.no_grad()
     def replay(self, recorded: TensorDictBase) -> TensorDictBase:
