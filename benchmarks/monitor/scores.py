@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import median
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-__all__ = ["auroc", "before_and_after", "detection", "spans_of"]
+__all__ = ["Run", "afterwards", "auroc", "detection", "false_alarms", "spans_of"]
 
-AFTER = 10  # steps after a fault in which an alarm is neither right nor wrong
+AFTER = 10  # steps after a fault in which an alarm is neither right nor wrong, and an error may settle
+
+
+class Run(NamedTuple):
+    """What a monitor said of one run; all ``[T]``.
+
+    Attributes:
+        evidence: of which 1 is the limit.
+        alarm: bool.
+        fault: bool: whether the reading of the step is of a fault.
+    """
+
+    evidence: Tensor
+    alarm: Tensor
+    fault: Tensor
 
 
 def spans_of(fault: Tensor) -> list[tuple[int, int]]:
@@ -25,37 +41,40 @@ def auroc(score: Tensor, positive: Tensor) -> float:
     return float(below.double().mean() / 2 / len(other))
 
 
-def recovering(fault: Tensor) -> Tensor:
-    """Steps of ``[*B, T]`` soon after a fault."""
-    soon = torch.zeros_like(fault)
-    for steps in range(1, AFTER + 1):
-        soon[..., steps:] |= fault[..., :-steps]
-    return soon & ~fault
+def detection(runs: Sequence[Run]) -> dict[str, float]:
+    """Scores of runs with faults.
 
-
-def detection(evidence: Tensor, alarm: Tensor, fault: Tensor) -> dict[str, float]:
-    """Scores of runs ``[K, T]`` with faults; the first step, which sees no reading, does not count.
+    Neither the first step, which sees no reading, nor the ten steps after a fault count.
 
     Returns:
         ``auroc`` of the evidence for "in a fault" against "not"; ``delay_steps``, the median of the steps from a
         fault's first to the first with an alarm, infinite where there is none; ``found``, the share of the faults that
         raise an alarm while they last.
     """
-    counts = ~recovering(fault)
-    counts[..., 0] = False
-    delays = []
-    for row_alarm, row_fault in zip(alarm, fault, strict=True):
-        for first, end in spans_of(row_fault):
-            hits = row_alarm[first:end].nonzero()
+    scores, labels, delays = [], [], []
+    for run in runs:
+        counts = torch.ones_like(run.fault)
+        counts[0] = False
+        for first, end in spans_of(run.fault):
+            counts[end : end + AFTER] = False
+            hits = run.alarm[first:end].nonzero()
             delays.append(float(hits[0]) if len(hits) else float("inf"))
-    return {
-        "auroc": auroc(evidence[counts], fault[counts]),
-        "delay_steps": median(delays),
-        "found": sum(delay < float("inf") for delay in delays) / len(delays),
-    }
+        counts |= run.fault
+        scores.append(run.evidence[counts])
+        labels.append(run.fault[counts])
+    found = sum(delay < float("inf") for delay in delays) / len(delays)
+    return {"auroc": auroc(torch.cat(scores), torch.cat(labels)), "delay_steps": median(delays), "found": found}
 
 
-def before_and_after(error: Tensor, fault: Tensor, steps: int = 20) -> Tensor:
-    """Errors ``[*K, T]`` of the steps soon after the faults of ``[T]``, but the first two: ``[*K, N]``."""
-    parts = [error[..., end + 2 : end + 2 + steps] for _, end in spans_of(fault) if end + 2 < error.shape[-1]]
-    return torch.cat(parts, -1)
+def false_alarms(runs: Sequence[Run]) -> dict[str, float]:
+    """Of runs without a fault, in 1,000 steps: alarms that are raised, and steps at which one is on."""
+    alarms = [run.alarm[1:] for run in runs]
+    steps = sum(len(alarm) for alarm in alarms)
+    raised = sum(len(spans_of(alarm)) for alarm in alarms)
+    on = sum(int(alarm.sum()) for alarm in alarms)
+    return {"false_alarms_per_1000": 1000 * raised / steps, "false_steps_per_1000": 1000 * on / steps}
+
+
+def afterwards(error: Tensor, fault: Tensor, steps: int = 20) -> Tensor:
+    """Of errors ``[*K, T]`` those of ``steps`` steps, from ten after each fault of ``[T]`` on: ``[*K, N]``."""
+    return torch.cat([error[..., end + AFTER : end + AFTER + steps] for _, end in spans_of(fault)], -1)

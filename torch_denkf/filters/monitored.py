@@ -84,6 +84,8 @@ class Gated(Filter):
         filter: of an ensemble, or of a mean and a covariance.
         observation_dim: components of the readings; by default as the filter's noise models say. By the place of the
             analysis where there are several.
+        places: of the analyses that get a gate; all by default. With other options for others, put one ``Gated`` around
+            another.
         **options: of all gates, see :class:`~torch_denkf.modules.GateOptions`. Of several the ``gate_key`` is followed
             by the analysis' place: ``"gate_camera"``.
 
@@ -104,10 +106,20 @@ class Gated(Filter):
     """
 
     def __init__(
-        self, filter: Filter, observation_dim: int | Mapping[str, int] | None = None, **options: Unpack[GateOptions]
+        self,
+        filter: Filter,
+        observation_dim: int | Mapping[str, int] | None = None,
+        *,
+        places: Sequence[str] | None = None,
+        **options: Unpack[GateOptions],
     ):
         modules = OrderedDict(named_modules_of(filter))
         found = [name for name, module in modules.items() if any(_analyses(module))]
+        several = len(found) + sum(isinstance(module, GatedAnalysis) for module in filter.modules()) > 1
+        if places is not None:
+            if unknown := [place for place in places if place not in found]:
+                raise ValueError(f"places names {unknown}; the filter has analyses at {found}")
+            found = list(places)
         if not found:
             raise TypeError(
                 f"{type(filter).__name__} has no analysis that a gate goes around: EnsembleAnalysis, "
@@ -118,7 +130,7 @@ class Gated(Filter):
             for analysis in _analyses(modules[name]):
                 own = observation_dim[name] if isinstance(observation_dim, Mapping) else observation_dim
                 dim = _dim(filter, analysis) if own is None else own
-                gate_key = key if len(found) == 1 else f"{key}_{name}"
+                gate_key = f"{key}_{name}" if several else key
                 gates.append(GatedAnalysis(analysis, dim, gate_key=gate_key, **options))
                 like = filter.like()
                 gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)

@@ -79,9 +79,11 @@ def cusum_threshold(run_length: float, reference: float = 0.5) -> float:
         5.0
     """
     check_number("run_length", run_length, above=2)
-    low, high = 1e-3, _LONGEST
-    if cusum_run_length(high, reference) < run_length:
-        raise ValueError(f"run_length {run_length:g} needs a threshold above {_LONGEST:g}; raise the reference")
+    low, high = 0.0, 0.5
+    while cusum_run_length(high, reference) < run_length:
+        low, high = high, 2 * high
+        if high > _LONGEST:
+            raise ValueError(f"run_length {run_length:g} needs a threshold above {_LONGEST:g}; raise the reference")
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if cusum_run_length(middle, reference) < run_length else (low, middle)

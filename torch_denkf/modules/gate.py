@@ -22,6 +22,7 @@ from torch_denkf.modules.past import InPlaceOf
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
+_USUAL = 0.05  # probability of a sum that opens a gate that is shut
 _LARGEST_FACTOR = 1e6  # on variances, up or down: what adaptation may reach
 
 
@@ -78,6 +79,8 @@ class GatedAnalysis(InPlaceOf):
     (key, ``part_nis``)       ``[K]``      of each component by itself
     ========================= ============ ============================================================================
 
+    A reading that was rejected is believed again when the sum falls to what one in twenty exceeds.
+
     The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. A filter needs the state
     to begin somewhere: :class:`~torch_denkf.filters.Gated` sees to that.
 
@@ -121,6 +124,7 @@ class GatedAnalysis(InPlaceOf):
     tables: Tensor
     slack: Tensor
     limits: Tensor
+    usual: Tensor
     claimed: Tensor | None
 
     def __init__(
@@ -178,6 +182,8 @@ class GatedAnalysis(InPlaceOf):
         most = window * observation_dim // self.parts_count
         limits = [torch.inf] + [chi_square_quantile(rate, n) if rate else torch.inf for n in range(1, most + 1)]
         self.register_buffer("limits", torch.tensor(limits))
+        usual = [chi_square_quantile(max(rate, _USUAL), n) for n in range(1, most + 1)]
+        self.register_buffer("usual", torch.tensor([torch.inf, *usual]))
 
     def noise_sizes(self, *values):
         """Those of the analysis."""
@@ -209,7 +215,9 @@ class GatedAnalysis(InPlaceOf):
         terms = torch.where(seen[..., None, :, None], torch.cat([term, terms[..., :-1, :, :]], -3), terms)
         if self.rate:
             evidence, total = terms.sum(-3).unbind(-1)
-            limit = (self.limits[total.long()] * self.slack).to(dtype)
+            # What was rejected is believed again when it fits well, not when it is just within the limit.
+            limits = torch.where(shut > 0, self.usual[total.long()], self.limits[total.long()] * self.slack)
+            limit = limits.to(dtype)
             factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)
             if self.response == "reject":
                 rejected = factor > 1

@@ -184,7 +184,7 @@ class InnovationMonitor(SubModel):
         if noise is not None:
             # Nothing blurs the beginning of blindness: twice the bound, so that two steps decide.
             most = 2 * self.largest
-            score = interpolate(_claimed(noise), *self.claims[place].to(dtype)).clamp(-most, most)
+            score = self.claim_score(name, noise).clamp(-most, most)
             claim = torch.where(seen, torch.cat([score, claim[..., :-1]], -1), claim)
             evidence.append(claim.mean(-1, keepdim=True) / self.claim_limit[place])
         if self.whiteness:
@@ -192,6 +192,14 @@ class InnovationMonitor(SubModel):
         size = torch.cat(evidence, -1).amax(-1, keepdim=True).to(dtype)
         values = (*window, cusum, claim, tests.p_value, tests.whiteness, size)
         return dict(zip(keys, values, strict=True))
+
+    def claim_score(self, name: str, noise: Tensor) -> Tensor:
+        """The standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
+
+        It is that of the mean logarithm, among those of the clean data that the monitor was calibrated on.
+        """
+        place = list(self.sensors).index(name)
+        return interpolate(_claimed(noise), *self.claims[place].to(noise.dtype))
 
     def _read(self, sensor: MonitoredSensor, entries) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         """Normalised innovation squared, innovation, claimed noise, and how many components were observed."""

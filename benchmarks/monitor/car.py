@@ -1,0 +1,144 @@
+"""The car's task: alarms, gates and paths on drives whose camera fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.monitor.drives import ALWAYS, FAULTS, believed_spans, car_filter, failing, filtered
+from benchmarks.monitor.scores import Run, afterwards, detection, false_alarms
+from torch_denkf.filters import Filter, Gated
+from torch_denkf.metrics import interval_coverage, kitti_endpoint_error
+from torch_denkf.modules import InnovationMonitor, MonitoredSensor
+from torch_denkf.odometry.car import VELOCITIES
+
+__all__ = ["clean_rows", "drive_rows", "gate_of", "monitor_of", "path_scores"]
+
+GATE = {"response": "reject", "window": 3, "rate": 1e-4, "patience": 30, "by_component": True}
+MARGIN = 2.0  # on what the clean drives show: they are few
+
+
+def monitor_of(clean: Sequence[TensorDict]) -> InnovationMonitor:
+    """A monitor, calibrated on beliefs of clean drives."""
+    sensor = MonitoredSensor("info", 2, ("forecast", "observed"), noise_key=("sensor", "noise"))
+    return InnovationMonitor({"camera": sensor}, window=3, reference=1.5).calibrate(clean, margin=MARGIN)
+
+
+def gate_of(model: Filter, clean: Sequence[TensorDict]) -> Filter:
+    """A gated filter, calibrated on clean drives' beliefs, which have what the gates saw."""
+    gated = Gated(model, 2, **GATE)
+    for gate in gated.gates:
+        gate.calibrate(clean, margin=MARGIN)
+    return gated
+
+
+def path_scores(beliefs: TensorDict) -> dict[str, float]:
+    """End point error over 100 steps, and what the 90 % intervals hold, of draws ``[K, N]``."""
+    window = min(100, beliefs.shape[1] - 1)
+    ends = [
+        float(kitti_endpoint_error(mean[:, :3].double(), truth[:, :3].double(), window=window).translation)
+        for mean, truth in zip(beliefs["belief", "mean"], beliefs["state"], strict=True)
+    ]
+    parts = (beliefs["belief", "mean"], beliefs["belief", "var"].clamp_min(1e-9), beliefs["state"])
+    held = interval_coverage(*(part[:, 1:, VELOCITIES].flatten(0, 1).double() for part in parts), level=0.9)
+    return {"m_per_m": fmean(ends), "held_v": float(held[0]), "held_theta_dot": float(held[1])}
+
+
+def drive_rows(
+    task: str, root: Path, drives: Sequence[str], validation: Sequence[TensorDict], cache: Path, draws: int
+) -> list[dict]:
+    """A row for each fault, over all drives.
+
+    Args:
+        task: ``"kitti-real"``, of whose drives each one's thresholds come from the others, too, because they are
+            another kind of picture than the rendered validation drives; or ``"kitti-rendered"``.
+        root: folder in KITTI's layout.
+        drives: names.
+        validation: clean readings of drives that are in no test.
+        cache: folder of readings.
+        draws: of the filter's noise.
+    """
+    car, model = car_filter()
+    unit = car.settings.unit
+    # Beliefs of a gate that does nothing: those of the filter, with what the gate saw.
+    watching = Gated(model, 2, **{**GATE, "rate": 0.0})
+    clean = [failing(root, name, "clean", cache) for name in drives]
+    others = filtered(watching, validation)
+    own = filtered(watching, clean, draws)
+    tools = []
+    for place in range(len(drives)):
+        known = [*others, *(own[n] for n in range(len(drives)) if n != place and task == "kitti-real")]
+        tools.append((monitor_of(known), gate_of(model, known)))
+    runs = [run for (monitor, _), belief in zip(tools, own, strict=True) for run in runs_of(monitor, belief)]
+    alarms = false_alarms(runs)
+    gated_clean = [filtered(gate, [each], draws)[0] for (_, gate), each in zip(tools, clean, strict=True)]
+    rows = [{"task": task, "fault": "none", **alarms, **compared(own, gated_clean)}]
+    for fault in FAULTS:
+        runs, errors, sound = [], [], []
+        readings = [failing(root, name, fault, cache) for name in drives]
+        beliefs = filtered(model, readings, draws)
+        for place, (reading, belief) in enumerate(zip(readings, beliefs, strict=True)):
+            hit = reading["fault"].squeeze(-1)
+            if not hit.any():
+                continue
+            monitor, gate = tools[place]
+            runs += runs_of(monitor, belief)
+            errors.append(afterwards(velocity_error(filtered(gate, [reading], draws)[0], unit), hit).flatten())
+            sound.append(afterwards(velocity_error(own[place], unit), hit).flatten())
+        ratio = float(torch.cat(errors).mean() / torch.cat(sound).mean())
+        rows.append({"task": task, "fault": fault, **detection(runs), **alarms, "error_ratio": ratio})
+    for fault in ALWAYS:
+        readings = [failing(root, name, fault, cache) for name in drives]
+        plain = filtered(model, readings, draws)
+        answered = []
+        for (monitor, gate), name, reading in zip(tools, drives, readings, strict=True):
+            if fault == "black-all":  # what the monitor does not believe is read again, over a longer span
+                spans = [reading, *(failing(root, name, fault, cache, steps) for steps in (2, 3))]
+                reading = believed_spans(spans, lambda each, m=monitor: doubted(model, m, each))
+            answered += filtered(gate, [reading], draws)
+        rows.append({"task": task, "fault": fault, **compared(plain, answered)})
+    return rows
+
+
+def clean_rows(
+    task: str, root: Path, drives: Sequence[str], validation: Sequence[TensorDict], cache: Path, draws: int
+) -> list[dict]:
+    """Path scores of drives without faults, one row; thresholds from the validation drives alone."""
+    _, model = car_filter()
+    gate = gate_of(model, filtered(Gated(model, 2, **{**GATE, "rate": 0.0}), validation))
+    readings = [failing(root, name, "clean", cache) for name in drives]
+    scores = compared(filtered(model, readings, draws), filtered(gate, readings, draws))
+    return [{"task": task, "fault": "none", **scores}]
+
+
+def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[str, float]:
+    """Path scores of the filter and of the gated one, means over the drives of at least 100 steps."""
+    out: dict[str, float] = {}
+    for suffix, beliefs in (("", plain), ("_gated", gated)):
+        scores = [path_scores(each) for each in beliefs if each.shape[1] > 100] or [path_scores(beliefs[0])]
+        out |= {name + suffix: fmean(score[name] for score in scores) for name in scores[0]}
+    return out
+
+
+def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
+    """What a monitor says of beliefs ``[K, N]``."""
+    said = monitor.replay(beliefs)["monitor"]
+    parts = (said["camera", "evidence"], said["alarm"], beliefs["fault"])
+    return [Run(*row) for row in zip(*(part.squeeze(-1) for part in parts), strict=True)]
+
+
+def velocity_error(beliefs: TensorDict, unit: Tensor) -> Tensor:
+    """Error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
+    return ((beliefs["belief", "mean"] - beliefs["state"])[..., VELOCITIES].abs() / unit).mean(-1)
+
+
+@torch.no_grad()
+def doubted(model: Filter, monitor: InnovationMonitor, reading: TensorDict) -> Tensor:
+    """Whether the sensor claims more noise of a reading than it ever does on clean data, ``[N]``."""
+    noise = model["noise"](reading.copy())["sensor", "noise"]
+    return (monitor.claim_score("camera", noise) > monitor.claim_limit[0]).squeeze(-1)
