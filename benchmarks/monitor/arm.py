@@ -103,7 +103,7 @@ def arm_rows(folder: Path, cache: Path, draws: int) -> list[dict]:
     rows = [{"task": "ur5", "fault": "none", **alarms, **errors(plain["none"], gated["none"])}]
     for fault in FAULTS:
         hit = tested[fault]["fault"][0, :, 0]
-        after, sound = (afterwards(error_of(each[name]), hit) for each, name in ((gated, fault), (plain, "none")))
+        after, sound = (afterwards(error_of(gated[name]), hit) for name in (fault, "none"))
         ratio = float(after.mean() / sound.mean())
         row = {**detection(runs_of(monitor, plain[fault])), **alarms, "error_ratio": ratio}
         rows.append({"task": "ur5", "fault": fault, **row, **errors(plain[fault], gated[fault], hit)})

@@ -105,8 +105,7 @@ def believed_spans(spans: Sequence[TensorDict], doubt: Callable[[TensorDict], Te
 
 @torch.no_grad()
 def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed: int = 0) -> list[TensorDict]:
-    """Beliefs on readings ``[N]`` each, ``[draws, N]``: from the true pose, with the velocities read first. Those of one
-    length run side by side."""
+    """Beliefs on readings ``[N]`` each, ``[draws, N]``, from the true pose on; those of one length run side by side."""
     groups: dict[int, list[int]] = defaultdict(list)
     for place, reading in enumerate(readings):
         groups[len(reading)].append(place)

@@ -101,8 +101,8 @@ def page(rows: Sequence[dict], study: Study) -> str:
             lines.append(line(row["task"], row["fault"], *cells, f"{row['error_ratio']:.3f}"))
     lines += [
         "",
-        "AUROC: of the monitor's evidence, by steps. Delay: the median over the faults. Error afterwards: with the gate, 10 to",
-        "30 steps after the fault, as a multiple of the same steps' error of a filter without gate and without fault.",
+        "AUROC: of the monitor's evidence, by steps. Delay: the median over the faults. Error afterwards: with the",
+        "gate, 10 to 30 steps after the fault, as a multiple of the same steps' error in a run without the fault.",
         "",
     ]
     lines += head("UR5", "error", "with the gate")
@@ -120,8 +120,9 @@ def page(rows: Sequence[dict], study: Study) -> str:
             lines.append(line(row["task"], row["fault"], *cells))
     lines += [
         "",
-        "End point error over 100 steps, and the truth's share in 90 % intervals. black-all: 30 % of the frames; what the monitor",
-        "doubts is read again over two or three steps. box-all: a box hides 5 % of each frame.",
+        "End point error over 100 steps, and the truth's share in 90 % intervals. black-all: 30 % of the frames;",
+        "with the gate, what the monitor doubts is read again over two or three steps. box-all: a box hides 5 % of each",
+        "frame.",
         "",
         f"* Command: `{command('monitor')}`; {study.draws} draws of the filter's noise.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",

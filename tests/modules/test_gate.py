@@ -88,7 +88,9 @@ def test_responses_are_their_closed_forms(value):
 def test_the_pull_of_an_outlier():
     """Student's falls with distance, Huber's stays, that of a rejected reading is none."""
     pull = {
-        response: [one_reading(still(1e-3, response=response, window=1), value)["belief", "mean"].item() for value in (20, 200)]
+        response: [
+            one_reading(still(1e-3, response=response, window=1), value)["belief", "mean"].item() for value in (20, 200)
+        ]
         for response in RESPONSES
     }
     assert pull["student"][1] < 0.2 * pull["student"][0]
@@ -234,7 +236,9 @@ def test_steps_without_a_reading_keep_the_state(name):
 @pytest.mark.parametrize("response", RESPONSES)
 def test_steps_sequences_and_environments_agree(response):
     F = torch.tensor([[1.0, 0.1], [-0.1, 0.9]])
-    kalman = KalmanFilter(F, 0.05 * torch.eye(2), torch.eye(2), 0.01 * torch.eye(2), mean=torch.zeros(2), cov=torch.eye(2))
+    kalman = KalmanFilter(
+        F, 0.05 * torch.eye(2), torch.eye(2), 0.01 * torch.eye(2), mean=torch.zeros(2), cov=torch.eye(2)
+    )
     gated = Gated(kalman, response=response, rate=0.2, patience=3, adapt_noise=0.1)  # acts often
     gated = Monitored(gated, InnovationMonitor({"gps": MonitoredSensor("gate", 2)}))
     env = LinearGaussianEnv(F, torch.eye(2), [0.3, 0.3], [0.3, 0.3], batch_size=[3], seed=0)
@@ -242,7 +246,13 @@ def test_steps_sequences_and_environments_agree(response):
     stream = torch.cat([rollout["observation"][:, :1], rollout["next", "observation"]], 1)
     sequence = gated.sequence(TensorDict({"observation": stream}, [3, 31]))[:, 1:]
     assert (sequence["gate", "factor"] > 1).any()
-    for key in (("belief", "mean"), ("gate", "terms"), ("gate", "shut"), ("gate", "log_noise"), ("monitor", "gps", "cusum")):
+    for key in (
+        ("belief", "mean"),
+        ("gate", "terms"),
+        ("gate", "shut"),
+        ("gate", "log_noise"),
+        ("monitor", "gps", "cusum"),
+    ):
         assert torch.allclose(rollout["next", *key], sequence[key], atol=1e-4), key
 
 

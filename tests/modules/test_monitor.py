@@ -107,7 +107,9 @@ def test_coloured_innovations_fail_whiteness_with_the_closed_form():
     for t in range(1, steps):
         rows.append(rho * rows[-1] + math.sqrt(1 - rho**2) * white[:, t])
     innovation = torch.stack(rows, 1)
-    data = TensorDict({"info": {"innovation": innovation, "nis": innovation.square().sum(-1, keepdim=True)}}, [runs, steps])
+    data = TensorDict(
+        {"info": {"innovation": innovation, "nis": innovation.square().sum(-1, keepdim=True)}}, [runs, steps]
+    )
     p = monitor(window=steps).replay(data)["monitor", "gps", "whiteness"][:, -1]
     z = torch.from_numpy(norm.isf(p.double().clamp_min(1e-30).numpy() / 2))
     assert z.median().item() == pytest.approx(rho * math.sqrt((steps - 1) * 2), rel=0.05)

@@ -46,7 +46,7 @@ def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: f
 
 
 def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, largest: float = 9.0) -> Tensor:
-    r"""One step of stochastic approximation: the logarithm of a factor on a variance grows while innovations are too large.
+    r"""One step of stochastic approximation: a factor on a variance grows while innovations are too large.
 
     :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` rests where the normalised innovation
     squared has its expected mean O (Robbins & Monro 1951), which it has with the true variance.
@@ -67,7 +67,7 @@ def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, larg
 
 
 def spread_about_mean(members: Tensor, factor: Tensor) -> Tensor:
-    """Members ``[*B, E, N]`` whose distance from their mean is multiplied by ``factor`` ``[*B, 1]``; bit-equal for 1."""
+    """Members ``[*B, E, N]``, their distances from the mean times ``factor`` ``[*B, 1]``; bit-equal for 1."""
     factor = factor.unsqueeze(-2)
     mean = members.mean(-2, keepdim=True)
     return torch.where(factor == 1, members, mean + factor * (members - mean))

@@ -20,7 +20,7 @@ def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:
 
 
 def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
-    """Knots and heights ``[2, N]`` that map ``nis`` ``[M]`` of clean data to chi-square values; beyond, the ratio stays."""
+    """Knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square values; beyond, the ratio stays."""
     levels = _levels(len(nis))
     measured = _rising(empirical_quantile(nis, levels).clamp_min(1e-9))
     expected = torch.tensor([chi_square_quantile(1 - level, freedom) for level in levels.tolist()])

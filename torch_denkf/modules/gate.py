@@ -144,8 +144,8 @@ class GatedAnalysis(InPlaceOf):
     ):
         if not isinstance(analysis, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
             raise TypeError(
-                f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around an "
-                "EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
+                f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around "
+                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
             )
         of_ensemble = isinstance(analysis, EnsembleUpdate)
         if by_component and not of_ensemble:
@@ -309,8 +309,8 @@ class GatedAnalysis(InPlaceOf):
         """Takes the distribution of the innovations, and of their windows, from clean data.
 
         Args:
-            clean: recordings ``[*B, T]``, time last: what the filter wrote with this gate at ``rate=0`` or inert enough,
-                with ``(gate_key, "part_nis")``; of several, each begins anew.
+            clean: recordings ``[*B, T]``, time last, of ``(gate_key, "part_nis")``: what the filter wrote while the gate
+                did nothing.
             margin: factor on the limits.
 
         Returns:

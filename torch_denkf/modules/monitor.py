@@ -53,7 +53,7 @@ class InnovationMonitor(SubModel):
 
     * The *normalised innovation squared* :math:`d^T S^{-1} d`, summed over a window of observed steps: a chi-square
       variable while the filter is right.
-    * A *cumulative sum* of the normal scores of single steps: the fastest test for a change of a given size (Page 1954).
+    * A *cumulative sum* of the normal scores of single steps: the fastest test for a change of one size (Page 1954).
     * *Whiteness*: the correlation of successive normalised innovations over the window.
     * The *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations are then smaller
       than usual, not larger. The mean of three steps' scores; it begins to count with :meth:`calibrate`.
