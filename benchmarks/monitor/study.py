@@ -121,8 +121,8 @@ def page(rows: Sequence[dict], study: Study) -> str:
     lines += [
         "",
         "End point error over 100 steps, and the truth's share in 90 % intervals. black-all: 30 % of the frames;",
-        "with the gate, what the monitor doubts is read again over two or three steps. box-all: a box hides 5 % of each",
-        "frame.",
+        "with the gate, what the monitor doubts is read again over two or three steps. box-all: a box hides 5 % of",
+        "each frame.",
         "",
         f"* Command: `{command('monitor')}`; {study.draws} draws of the filter's noise.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",

@@ -125,13 +125,13 @@ class Gated(Filter):
                 f"{type(filter).__name__} has no analysis that a gate goes around: EnsembleAnalysis, "
                 "LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
             )
-        key, gates = options.pop("gate_key", "gate"), []
+        key, gates = options.get("gate_key", "gate"), []
         for name in found:
             for analysis in _analyses(modules[name]):
                 own = observation_dim[name] if isinstance(observation_dim, Mapping) else observation_dim
                 dim = _dim(filter, analysis) if own is None else own
-                gate_key = f"{key}_{name}" if several else key
-                gates.append(GatedAnalysis(analysis, dim, gate_key=gate_key, **options))
+                own_options: GateOptions = {**options, "gate_key": f"{key}_{name}" if several else key}
+                gates.append(GatedAnalysis(analysis, dim, **own_options))
                 like = filter.like()
                 gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)
                 modules[name] = _with(modules[name], analysis, gates[-1])

@@ -238,8 +238,8 @@ class GatedAnalysis(InPlaceOf):
             log_noise = adapt(log_noise, calibrated, seen * freedom, self.adapt_noise).clamp(-bound, bound)
         if self.adapt_inflation:
             used = seen * freedom
-            total = (used.sum(-1, keepdim=True), (seen * calibrated).sum(-1, keepdim=True))
-            grown = adapt(log_inflation, total[1], total[0], self.adapt_inflation)
+            whole = (seen * calibrated).sum(-1, keepdim=True)
+            grown = adapt(log_inflation, whole, used.sum(-1, keepdim=True), self.adapt_inflation)
             log_inflation = grown.clamp(0, math.log(_LARGEST_FACTOR))
         own = (terms, shut, log_noise, log_inflation, factor, nis, innovation, part)
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
@@ -309,8 +309,8 @@ class GatedAnalysis(InPlaceOf):
         """Takes the distribution of the innovations, and of their windows, from clean data.
 
         Args:
-            clean: recordings ``[*B, T]``, time last, of ``(gate_key, "part_nis")``: what the filter wrote while the gate
-                did nothing.
+            clean: recordings ``[*B, T]``, time last, of ``(gate_key, "part_nis")``: what the filter wrote while the
+                gate did nothing.
             margin: factor on the limits.
 
         Returns:

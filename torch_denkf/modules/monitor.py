@@ -254,19 +254,19 @@ class InnovationMonitor(SubModel):
         """
         recordings = [_entries(each) for each in clean]
         for place, (name, sensor) in enumerate(self.sensors.items()):
-            parts = []
+            parts, claims = [], []
             for entries in recordings:
                 nis, innovation, noise, freedom = self._read(sensor, entries)
                 seen = (freedom > 0).squeeze(-1)
-                parts.append((nis.squeeze(-1)[seen], innovation[seen], noise if noise is None else noise[seen]))
-            nis, innovation = (torch.cat([part[n] for part in parts]).double() for n in (0, 1))
+                parts.append((nis.squeeze(-1)[seen], innovation[seen]))
+                claims += [] if noise is None else [_claimed(noise[seen]).squeeze(-1)]
+            nis, innovation = (torch.cat(column).double() for column in zip(*parts, strict=True))
             if len(nis) < 50:
                 raise ValueError(f"calibrate needs 50 steps at which {name!r} is observed; there are {len(nis)}")
             getattr(self, f"scale_{name}").copy_(innovation.square().mean(0).sqrt().clamp_min(1e-12))
             self.tables[place] = chi_square_table(nis, sensor.observation_dim)
-            if sensor.noise_key is not None:
-                claimed = torch.cat([_claimed(part[2]) for part in parts]).squeeze(-1)
-                self.claims[place] = score_table(claimed.double())
+            if claims:
+                self.claims[place] = score_table(torch.cat(claims).double())
         self._set_limits([self.replay(each) for each in clean], margin)
         return self
 
