@@ -22,6 +22,7 @@ __all__ = ["clean_rows", "drive_rows", "gate_of", "monitor_of", "path_scores"]
 
 GATE = {"response": "reject", "window": 3, "rate": 1e-4, "patience": 30, "by_component": True}
 MARGIN = 1.3  # on what the clean drives show: they are few
+OTHER_KIND = 2.0  # that of a gate whose clean drives are of another kind: rendered ones, for real frames
 
 
 def monitor_of(clean: Sequence[TensorDict]) -> InnovationMonitor:
@@ -30,11 +31,11 @@ def monitor_of(clean: Sequence[TensorDict]) -> InnovationMonitor:
     return InnovationMonitor({"camera": sensor}, window=3, reference=1.5).calibrate(clean, margin=MARGIN)
 
 
-def gate_of(model: Filter, clean: Sequence[TensorDict]) -> Filter:
+def gate_of(model: Filter, clean: Sequence[TensorDict], margin: float = MARGIN) -> Filter:
     """A gated filter, calibrated on clean drives' beliefs, which have what the gates saw."""
     gated = Gated(model, 2, **GATE)
     for gate in gated.gates:
-        gate.calibrate(clean, margin=MARGIN)
+        gate.calibrate(clean, margin=margin)
     return gated
 
 
@@ -73,7 +74,7 @@ def drive_rows(
     own = filtered(watching, clean, draws)
     if task == "kitti-real":
         known = [[*others, *own[:place], *own[place + 1 :]] for place in range(len(drives))]
-        tools = [(monitor_of(each), gate_of(model, each)) for each in known]
+        tools = [(monitor_of(each), gate_of(model, each, OTHER_KIND)) for each in known]
     else:
         tools = [(monitor_of(others), gate_of(model, others))] * len(drives)
     runs = [run for (monitor, _), belief in zip(tools, own, strict=True) for run in runs_of(monitor, belief)]
