@@ -136,7 +136,7 @@ def main() -> None:
     if study.smoke:
         out = Path(tempfile.mkdtemp(prefix="monitor-"))
         write_drives(out / "kitti", ["a", "b"], frames=70, size=(100, 300))
-        drives, tasks = ("c",), TASKS if study.tasks == TASKS else study.tasks
+        drives, tasks = ("a",), TASKS if study.tasks == TASKS else study.tasks
         study = replace(study, root=out / "kitti", out=out, rendered=drives, frames=70, draws=1, tasks=tasks)
     tasks = [task for task in study.tasks if task != "kitti-real" or study.root is not None]
     files = {task: study.out / "parts" / f"{task}.json" for task in tasks}
