@@ -36,9 +36,11 @@ from .filters import (
     BackpropKF,
     DEnKF,
     Filter,
+    Gated,
     KalmanFilter,
     LSTMFilter,
     MixtureParticleFilter,
+    Monitored,
     ParticleFilter,
 )
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
@@ -90,6 +92,7 @@ __all__ = [
     "Filter",
     "FilterTrainer",
     "FixedLag",
+    "Gated",
     "GaussianLoss",
     "IEnKS",
     "Images",
@@ -103,6 +106,7 @@ __all__ = [
     "MissingFrames",
     "MixtureParticleFilter",
     "MixtureLoss",
+    "Monitored",
     "ObservationLoss",
     "OccludingBox",
     "OpticalFlow",

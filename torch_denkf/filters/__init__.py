@@ -6,6 +6,7 @@ from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
 from torch_denkf.filters.kalman import KalmanFilter
+from torch_denkf.filters.monitored import Gated, Monitored
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
 from torch_denkf.filters.recurrent import LSTMFilter
 from torch_denkf.filters.ukf import UKF
@@ -23,4 +24,6 @@ __all__ = [
     "PFM",
     "LSTMFilter",
     "GaussianOptions",
+    "Gated",
+    "Monitored",
 ]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 from tensordict import NestedKey
 
-__all__ = ["FilterOptions"]
+if TYPE_CHECKING:
+    from torch_denkf.filters.base import Filter
+
+__all__ = ["FilterOptions", "options_of"]
 
 
 class FilterOptions(TypedDict, total=False):
@@ -20,3 +23,16 @@ class FilterOptions(TypedDict, total=False):
     variance_ceiling: float | None
     check_finite: bool
     reject: bool
+
+
+def options_of(filter: Filter) -> FilterOptions:
+    """The options that a filter was made with."""
+    return {
+        "control_keys": filter.control_keys,
+        "init_key": filter.init_key,
+        "update_at_reset": filter.update_at_reset,
+        "forecast_keys": filter.forecast_keys,
+        "variance_ceiling": filter.variance_ceiling,
+        "check_finite": filter.check_finite,
+        "reject": filter.reject,
+    }

@@ -2,7 +2,15 @@
 
 from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
 from torch_denkf.functional.angles import align_angles, mean_observation, wrap_angles
+from torch_denkf.functional.change_detection import cusum_run_length, cusum_step, cusum_threshold, normal_score
+from torch_denkf.functional.chi_square import (
+    chi_square_p_value,
+    chi_square_quantile,
+    detectable_bias,
+    noncentral_p_value,
+)
 from torch_denkf.functional.dropped_relu import dropped_relu
+from torch_denkf.functional.gating import Response, adapt, disbelief, spread_about_mean
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.linalg import (
@@ -18,6 +26,13 @@ from torch_denkf.functional.moments import (
     ensemble_cov,
     ensemble_mean,
     ensemble_var,
+)
+from torch_denkf.functional.monitoring import (
+    InnovationTests,
+    InnovationWindow,
+    innovation_tests,
+    interpolate,
+    observe,
 )
 from torch_denkf.functional.random_bits import (
     dropout_factor,
@@ -109,4 +124,21 @@ __all__ = [
     "weighted_var",
     "weighted_innovation",
     "crps_weighted",
+    "chi_square_p_value",
+    "chi_square_quantile",
+    "noncentral_p_value",
+    "detectable_bias",
+    "normal_score",
+    "cusum_step",
+    "cusum_run_length",
+    "cusum_threshold",
+    "InnovationWindow",
+    "InnovationTests",
+    "observe",
+    "innovation_tests",
+    "interpolate",
+    "Response",
+    "disbelief",
+    "adapt",
+    "spread_about_mean",
 ]

@@ -9,14 +9,17 @@ from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTrans
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.black import BlackIsMissing
+from torch_denkf.modules.carried import WithState
 from torch_denkf.modules.check import check_analysis
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
+from torch_denkf.modules.gate import GatedAnalysis, GateOptions
 from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
+from torch_denkf.modules.monitor import InnovationMonitor, MonitoredSensor
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise, MemberGain, ScaledNoise
 from torch_denkf.modules.observation import LearnedObservation, LinearObservation, Select
@@ -104,4 +107,9 @@ __all__ = [
     "EnsembleAnalysisKeys",
     "GaussianAnalysisOptions",
     "GaussianTransitionKeys",
+    "InnovationMonitor",
+    "MonitoredSensor",
+    "GatedAnalysis",
+    "GateOptions",
+    "WithState",
 ]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
+from torch_denkf.filters._options import options_of
 from torch_denkf.modules import ResampledTransition
 from torch_denkf.modules._base import named_modules_of
 from torch_denkf.modules._ensemble import EnsembleUpdate
@@ -132,19 +133,6 @@ def kind_of(filter: Filter) -> tuple[str, str]:
         f"{type(filter).__name__} carries {filter.carry_keys}; smoothing needs an ensemble, a mean and a covariance, "
         "or particles with log-weights behind a ResampledTransition."
     )
-
-
-def options_of(filter: Filter) -> dict:
-    """The options that a filter was made with."""
-    return {
-        "control_keys": filter.control_keys,
-        "init_key": filter.init_key,
-        "update_at_reset": filter.update_at_reset,
-        "forecast_keys": filter.forecast_keys,
-        "variance_ceiling": filter.variance_ceiling,
-        "check_finite": filter.check_finite,
-        "reject": filter.reject,
-    }
 
 
 def rebuilt(filter: Filter, changed: Mapping[str, TensorDictModuleBase]) -> Filter:

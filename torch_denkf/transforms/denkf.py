@@ -13,12 +13,13 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
-from torch_denkf.filters import Filter
+from torch_denkf.filters import Filter, Monitored
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters._steps import where_rows
+from torch_denkf.modules import InnovationMonitor
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
@@ -55,6 +56,8 @@ class DEnKFTransform(Transform):
         initial: the initial belief of a plain ``TensorDictSequential``.
         lag: fixed-lag smoothing: beside the belief of t what is believed of t - lag, ``("smoothed", "mean")``,
             ``("smoothed", "var")`` and what else :class:`~torch_denkf.smoothers.FixedLag` writes; ``None`` for none.
+        monitor: watches the innovations: beside the belief an alarm, and what speaks for it, see
+            :class:`~torch_denkf.modules.InnovationMonitor`; ``None`` for none.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
         store_ensemble: if ``False``, rollouts and collected data hold means and variances alone; the
             ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
@@ -93,6 +96,7 @@ class DEnKFTransform(Transform):
         *,
         initial: TensorDictModuleBase | None = None,
         lag: int | None = None,
+        monitor: InnovationMonitor | None = None,
         diagnostics: Sequence[NestedKey] = (),
         store_ensemble: bool = True,
         no_grad: bool = True,
@@ -110,6 +114,8 @@ class DEnKFTransform(Transform):
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
         if lag is not None:
             filter = FixedLag(filter, lag)
+        if monitor is not None:
+            filter = Monitored(filter, monitor)
         self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
         self._reject = filter.reject or not check_finite
         written = [*filter.out_keys, *([REJECTED] if self._reject else [])]

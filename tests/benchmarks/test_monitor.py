@@ -1,0 +1,72 @@
+"""The study's scores, against closed forms and scikit-free counts."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from benchmarks.monitor.drives import believed_spans, stretches
+from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
+from benchmarks.monitor.study import COLUMNS, Study, page
+
+
+def test_spans_are_first_and_behind_the_last():
+    fault = torch.tensor([0, 1, 1, 0, 0, 1]).bool()
+    assert spans_of(fault) == [(1, 3), (5, 6)]
+    assert spans_of(torch.zeros(4, dtype=torch.bool)) == []
+
+
+def test_auroc_counts_pairs():
+    score, positive = torch.tensor([3.0, 1.0, 2.0, 2.0]), torch.tensor([True, False, True, False])
+    assert auroc(score, positive) == pytest.approx((1 + 1 + 1 + 0.5) / 4)
+    torch.manual_seed(0)
+    normal = torch.randn(4000) + torch.tensor([0.0, 1.0]).repeat(2000)
+    expected = torch.special.ndtr(torch.tensor(0.5**0.5)).item()  # of two normal variables, one apart
+    assert auroc(normal, torch.tensor([False, True]).repeat(2000)) == pytest.approx(expected, abs=0.02)
+
+
+def test_detection_leaves_out_what_follows_a_fault():
+    fault = torch.zeros(40, dtype=torch.bool)
+    fault[10:20] = True
+    alarm = torch.zeros(40, dtype=torch.bool)
+    alarm[12:25] = True
+    found = detection([Run(alarm.float(), alarm, fault)])
+    assert found == {"auroc": pytest.approx(0.9), "delay_steps": 2.0, "found": 1.0}
+    assert false_alarms([Run(alarm.float(), alarm, fault)]) == {
+        "false_alarms_per_1000": pytest.approx(1000 / 39),
+        "false_steps_per_1000": pytest.approx(13000 / 39),
+    }
+    silent = detection([Run(torch.rand(40), torch.zeros(40, dtype=torch.bool), fault)])
+    assert silent["delay_steps"] == float("inf")
+    assert afterwards(torch.arange(40.0).unsqueeze(0), fault, 5).tolist() == [[30, 31, 32, 33, 34]]
+
+
+def test_faults_end_before_the_drive_does():
+    hit = stretches(200)
+    assert spans_of(hit) == [(40, 60), (100, 120), (160, 180)]
+    assert not stretches(51).any()
+
+
+def test_the_shortest_pair_that_is_believed():
+    def reading(steps):
+        entries = {"ensemble": torch.full((4, 2, 2), float(steps)), "encoding": torch.zeros(4, 3)}
+        seen = torch.ones(4, 1, dtype=torch.bool)
+        return TensorDict({"state": torch.zeros(4, 5), "observed": seen, "sensor": TensorDict(entries, [4])}, [4])
+
+    doubts = {1: [False, True, True, True], 2: [False, False, True, True], 3: [False, False, False, True]}
+    spans = [reading(steps) for steps in doubts]
+    chosen = believed_spans(spans, lambda each: torch.tensor(doubts[int(each["sensor", "ensemble"][0, 0, 0])]))
+    assert chosen["steps"].flatten().tolist() == [1, 2, 3, 0]
+    assert chosen["observed"].flatten().tolist() == [True, True, True, False]
+    assert chosen["sensor", "ensemble"][:3, 0, 0].tolist() == [1, 2, 3]
+
+
+def test_a_page_of_every_kind_of_row(tmp_path):
+    rows = [
+        {"task": "ur5", "fault": "none", "false_alarms_per_1000": 0.5, "error": 1.0, "error_gated": 1.1},
+        {"task": "kitti-real", "fault": "black", "auroc": 0.98, "delay_steps": 1.0, "found": 1.0},
+    ]
+    rows[1] |= {"false_alarms_per_1000": 0.5, "error_ratio": 1.02, "false_steps_per_1000": 0.5}
+    COLUMNS.write(rows, tmp_path / "monitor.csv")
+    assert sorted(COLUMNS.read(tmp_path / "monitor.csv"), key=COLUMNS.order) == sorted(rows, key=COLUMNS.order)
+    text = page(rows, Study())
+    assert "| kitti-real | black | 0.98 | 1 | 1 | 0.5 | 1.020 |" in text
