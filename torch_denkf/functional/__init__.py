@@ -2,6 +2,7 @@
 
 from torch_denkf.functional.analysis import Analysis, Scheme, Space, analyse
 from torch_denkf.functional.angles import align_angles, mean_observation, wrap_angles
+from torch_denkf.functional.continuous import discretise
 from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
@@ -66,6 +67,7 @@ __all__ = [
     "unscented_moments",
     "unscented_cross",
     "unscented_update",
+    "discretise",
     "wrap_angles",
     "align_angles",
     "mean_observation",

@@ -9,9 +9,12 @@ from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTrans
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.check import check_analysis
+from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
+from torch_denkf.modules.fused import JoinedObservation, JoinedReading, Renamed, StateObservation
 from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
+from torch_denkf.modules.joint_moments import JointForecast, PresentOfJoint, WithJointMoments
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
@@ -43,6 +46,9 @@ __all__ = [
     "LearnedTransition",
     "UnicycleTransition",
     "UnicycleMotion",
+    "ContinuousMotion",
+    "ContinuousNoise",
+    "NoisePerSecond",
     "PairObservation",
     "WithHistory",
     "ClonedPrior",
@@ -93,6 +99,13 @@ __all__ = [
     "CrossTransition",
     "MomentsPast",
     "LaggedMoments",
+    "WithJointMoments",
+    "JointForecast",
+    "PresentOfJoint",
+    "Renamed",
+    "StateObservation",
+    "JoinedObservation",
+    "JoinedReading",
     "WithMemory",
     "LSTMTransition",
     "LSTMUpdate",

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel, named_modules_of, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 
@@ -36,6 +36,8 @@ class InPlaceOf(SubModel):
 
     def parts(self):
         """Those of the module inside."""
+        if type(self.module) is TensorDictSequential:
+            return dict(named_modules_of(self.module))
         return self.module.parts() if isinstance(self.module, SubModel) else {}
 
 
