@@ -69,9 +69,7 @@ def test_a_kalman_filter_of_irregular_steps(float64, kind):
         glide.weight.data = motion.drift.clone()
         transition = LearnedTransition(glide, dt_key="dt")
     frames, prior = drives(3), MomentPrior(torch.zeros(2), torch.eye(2))
-    filter = FusedFilter(
-        transition, {"reading": FusedSensor(Select([0]), [R])}, initial=prior, process_noise=q
-    )
+    filter = FusedFilter(transition, {"reading": FusedSensor(Select([0]), [R])}, initial=prior, process_noise=q)
     out = filter.sequence(frames.copy())
     mean, cov = by_hand(frames)
     assert_close(out["belief", "mean"], mean, rtol=0, atol=1e-10)

@@ -240,7 +240,7 @@ def _guards(
         found = {key: None}
         for _, module in reversed([*frames, *update]):
             if not found.keys().isdisjoint(writes(module)):
-                found.update(dict.fromkeys(reads(module)[0]))
+                found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
     return guards_of(_in_front(parts, sources), sources)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Unpack
 
@@ -31,9 +31,11 @@ from torch_denkf.modules import (
     NoisyTransition,
     PresentOfJoint,
     Renamed,
+    SensorWeights,
     StateObservation,
     UKFAnalysis,
     UKFTransition,
+    WeightedNoise,
     WithEnsemblePast,
     WithJointMoments,
     as_process_noise,
@@ -63,6 +65,8 @@ class FusedSensor:
             the covariances all since.
         late: key of an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
         angles: components of the reading that are angles in radians.
+        features: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the data, or
+            one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
     """
 
@@ -74,6 +78,7 @@ class FusedSensor:
     delay: int = 0
     late: NestedKey | None = None
     angles: Sequence[int] = ()
+    features: NestedKey | None = None
     analysis: Callable[..., TensorDictModuleBase] | None = None
 
 
@@ -85,6 +90,7 @@ class _Wired:
     reading: NestedKey
     noise: NestedKey
     observed: NestedKey
+    features: NestedKey | None
 
 
 class FusedFilter(Filter):
@@ -117,8 +123,8 @@ class FusedFilter(Filter):
             :class:`~torch_denkf.modules.EnsembleAnalysis` takes them, ``partial(EnsembleAnalysis, "etkf")`` by default;
             for a mean and a covariance an observation model in front of them, as
             :class:`~torch_denkf.modules.EKFAnalysis`.
-        weights: how much each reading counts, e.g. :class:`~torch_denkf.modules.SensorAttention`; ``None``: as their
-            noise says.
+        weights: a network that says how much each reading counts, :class:`~torch_denkf.modules.SensorAttention`; the
+            weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
         lag: L; by default the largest delay.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite`` and ``reject`` of :class:`Filter`.
@@ -152,7 +158,7 @@ class FusedFilter(Filter):
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         joint: bool = False,
         analysis: Callable[..., TensorDictModuleBase] | None = None,
-        weights: TensorDictModuleBase | None = None,
+        weights: torch.nn.Module | None = None,
         lag: int | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
@@ -169,8 +175,8 @@ class FusedFilter(Filter):
             wired[name] = _wire(name, sensor)
             modules.update(wired[name].modules)
         age = -1 if kwargs.get("update_at_reset") else 0
-        size = getattr(initial, "state_dim", None)
-        if lag and size is None:
+        size = getattr(initial, "state_dim", 0)
+        if lag and not size:
             raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
         prefix = "forecast"
         if gaussian and lag:
@@ -189,18 +195,18 @@ class FusedFilter(Filter):
         if lag:
             modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief()
         super().__init__(modules, initial=initial, **kwargs)
-        self.sensors, self.lag, self.joint = tuple(sensors), lag, joint
+        self.sensors, self.lag, self.together = tuple(sensors), lag, joint or weights is not None
 
     def step(self, tensordict, *, without=()):
         """A step, see :meth:`Filter.step`.
 
         Raises:
-            ValueError: if the update is joint, and ``without`` names some readings but not all.
+            ValueError: if the update is joint, or sensors have weights, and ``without`` names some readings but not all.
         """
-        if self.joint and without and set(map(unravel_key, without)) != set(self.structure.readings):
+        if self.together and without and set(map(unravel_key, without)) != set(self.structure.readings):
             raise ValueError(
-                f"In a joint update step(without={list(without)}) cannot leave out single readings: hide them with their "
-                "masks, or leave out joint=True."
+                f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "
+                "hide them with their masks."
             )
         return super().step(tensordict, without=without)
 
@@ -215,7 +221,7 @@ class _Updates:
         analysis: makes an update.
     """
 
-    def __init__(self, gaussian: bool, lag: int, size: int | None, analysis: Callable[..., TensorDictModuleBase]):
+    def __init__(self, gaussian: bool, lag: int, size: int, analysis: Callable[..., TensorDictModuleBase]):
         self.gaussian, self.lag, self.size, self.analysis = gaussian, lag, size, analysis
 
     def in_turn(self, prefix, last, sensors, wired):
@@ -237,7 +243,11 @@ class _Updates:
         if own:
             raise ValueError(f"A joint update is one for all sensors, and {own} have an analysis of their own.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
-        keys = {"reading": ("sensor", "joint"), "noise": ("sensor", "joint_noise"), "observed": ("forecast", "observed")}
+        keys = {
+            "reading": ("sensor", "joint"),
+            "noise": ("sensor", "joint_noise"),
+            "observed": ("forecast", "observed"),
+        }
         join = JoinedReading(
             [wired[name].reading for name in sensors],
             [wired[name].noise for name in sensors],
@@ -250,8 +260,25 @@ class _Updates:
         return {"readings": join, **self._update("analysis", model, prefix, last, angles, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
-        """The sensors' noise after their weights."""
-        raise NotImplementedError
+        """The sensors' weights, and their noise after them."""
+        models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
+        modules = {
+            "weights": SensorWeights(
+                weights,
+                models,
+                {name: wired[name].reading for name in sensors},
+                {name: wired[name].noise for name in sensors},
+                {name: wired[name].features for name in sensors if wired[name].features is not None},
+                {name: sensor.angles for name, sensor in sensors.items()},
+                state_key=(prefix, "ensemble"),
+                moments=prefix if self.gaussian else None,
+            )
+        }
+        for name, sensor in sensors.items():
+            key, size = ("sensor", name, "weighted_noise"), _observation_dim(sensor)
+            modules[f"{name}_weighted"] = WeightedNoise(wired[name].noise, ("weight", name), key, observation_dim=size)
+            wired[name] = replace(wired[name], noise=key)
+        return modules
 
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: _Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")
@@ -348,7 +375,8 @@ def _wire(name: str, sensor: FusedSensor) -> _Wired:
         noise = ConstantNoise(noise)
     names[unravel_key(noise.out_keys[0])] = own
     modules[f"{name}_noise"] = Renamed(noise, names)
-    return _Wired(modules, reading, own, observed)
+    features = None if sensor.features is None else unravel_key(sensor.features)
+    return _Wired(modules, reading, own, observed, names.get(features, features))
 
 
 def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
@@ -366,6 +394,7 @@ def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
 
 
 def _observation_dim(sensor: FusedSensor) -> int | None:
-    if not isinstance(sensor.noise, torch.nn.Module):
-        return len(sensor.noise)
-    return getattr(sensor.noise, "observation_dim", getattr(sensor.noise, "dim", None))
+    noise = sensor.noise
+    if isinstance(noise, torch.nn.Module):
+        return getattr(noise, "observation_dim", getattr(noise, "dim", None))
+    return len(noise)

@@ -29,6 +29,7 @@ from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, Mom
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise, as_process_noise
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
+from torch_denkf.modules.sensor_weights import SensorAttention, SensorWeights, WeightedNoise
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -106,6 +107,9 @@ __all__ = [
     "StateObservation",
     "JoinedObservation",
     "JoinedReading",
+    "SensorAttention",
+    "SensorWeights",
+    "WeightedNoise",
     "WithMemory",
     "LSTMTransition",
     "LSTMUpdate",

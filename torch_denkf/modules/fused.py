@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torch_denkf.functional import mean_observation
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module, writes
+from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module, writes
 from torch_denkf.modules.past import InPlaceOf
 
 __all__ = ["JoinedObservation", "JoinedReading", "Renamed", "StateObservation"]
@@ -131,6 +131,12 @@ class StateObservation(InPlaceOf):
         key, out_key = unravel_key(self.module.in_keys[0]), unravel_key(self.module.out_keys[0])
         return {self.predicted_key: run_module(self.module, {**entries, key: states}, call)[out_key], **written}
 
+    def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
+        """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        written = run_module(self, entries, call)
+        mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
+        return written[self.predicted_key], mask
+
     def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
         """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
@@ -156,9 +162,7 @@ class JoinedObservation(SubModel):
         observed_key: the mask ``[*B, O]``.
     """
 
-    def __init__(
-        self, models: Mapping[str, StateObservation], *, predicted_key: NestedKey, observed_key: NestedKey
-    ):
+    def __init__(self, models: Mapping[str, StateObservation], *, predicted_key: NestedKey, observed_key: NestedKey):
         needed, optional = ({} for _ in range(2))
         for model in models.values():
             must, may = reads(model)
@@ -176,11 +180,9 @@ class JoinedObservation(SubModel):
         """The predicted observations, and the mask."""
         predicted, masks = [], []
         for name, model in self.module.items():
-            written = run_module(model, entries, call.part(name))
-            predicted.append(written[model.predicted_key])
-            seen = written.get(unravel_key(model.out_keys[-1])) if model.state_dim is not None else None
-            seen = entries.get(model.observed_key) if seen is None else seen
-            like = predicted[-1][..., 0, :]
+            values, seen = model.seen(entries, call.part(name))
+            predicted.append(values)
+            like = values[..., 0, :]
             masks.append(torch.ones_like(like, dtype=torch.bool) if seen is None else seen.expand(like.shape))
         return self.by_key((torch.cat(predicted, -1), torch.cat(masks, -1)))
 

@@ -98,9 +98,7 @@ class PresentOfJoint(SubModel):
     """
 
     def __init__(self, size: int, joint_key: str = "joint"):
-        out_keys: list[NestedKey] = [
-            ("belief", name) for name in ("mean", "cov", "var", "joint_mean", "joint_cov")
-        ]
+        out_keys: list[NestedKey] = [("belief", name) for name in ("mean", "cov", "var", "joint_mean", "joint_cov")]
         out_keys += [("smoothed", name) for name in _SMOOTHED]
         super().__init__(nn.Identity(), [(joint_key, "mean"), (joint_key, "cov"), ("smoothed", "age")], out_keys)
         self.size = size

@@ -97,9 +97,10 @@ class LearnedTransition(MemberNetwork):
         register_location(self, "action_loc", action_loc)
         register_scale(self, "action_scale", action_scale)
 
-    def compute(self, state, *others, noise):
+    def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble."""
-        action = None if self.action_key is None else others[0]
+        if self.action_key is None:  # then what is read second is the length of the step
+            action, dt = None, action
         features = state if self.loc is None else state - self.loc
         if self.scale is not None:
             features = features / self.scale
@@ -111,8 +112,8 @@ class LearnedTransition(MemberNetwork):
         change = self._run(features, noise)
         if self.scale is not None:
             change = change * self.scale
-        if self.dt_key is not None:
-            change = change * others[-1].to(change.dtype).unsqueeze(-2)
+        if dt is not None:
+            change = change * dt.to(change.dtype).unsqueeze(-2)
         if self.residual:
             return state + change
         return change if self.loc is None else change + self.loc
