@@ -70,7 +70,7 @@ def finer(angles: Tensor) -> Tensor:
     return path.flatten(1, 2)
 
 
-def arm_task(*, demos: int = 6, steps: int = 120) -> Task:
+def arm_task(*, demos: int = 3, steps: int = 75) -> Task:
     """The task, with as many demonstrations for training as for the test.
 
     Args:

@@ -29,6 +29,7 @@ COLUMNS = Columns(
 )
 METHODS = ("plain", "weights")
 SECONDS = 3.0  # that a sensor fails
+WINDOW, BATCH = 50, 32  # steps of a training window, and windows in an update
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Study:
 
     kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
     out: Path = Path("runs/fusion")
-    demos: int = 6  # of the UR5, for training and for the test each
-    updates: tuple[int, int] = (30, 80)  # of the noise and of the weights
+    demos: int = 3  # of the UR5, for training and for the test each
+    updates: tuple[int, int] = (10, 60)  # of the noise and of the weights
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?
 
@@ -85,13 +86,14 @@ def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
             never = rms(by_case[others, "as it is"][:, span])
             out.append({**row, "error": rms(error[:, span]), "error_without": never})
             out[-1]["error_ratio"] = out[-1]["error"] / never
-    for name in task.sensors:
-        data = delayed(task.test, name, task.late[name])
-        for heed in (False, True):
-            error = rms(task.error(run(task.build(None, heed), data)))
-            text = f"{name}: {1e3 * task.late[name] / task.rate:.0f} ms late, {'heeded' if heed else 'ignored'}"
-            out.append({"task": task.name, "method": "plain", "sensors": " + ".join(task.sensors), "condition": text})
-            out[-1]["error"] = error
+    late = [delayed(task.test, name, task.late[name]) for name in task.sensors]
+    for heed in (False, True):
+        errors = task.error(run(task.build(None, heed), torch.cat(late))).split(len(task.test))
+        for name, data, error in zip(task.sensors, late, errors, strict=True):
+            milliseconds = 1e3 * int(data[f"{name}_late"].max()) / task.rate
+            text = f"{name}: {milliseconds:.0f} ms late, {'heeded' if heed else 'ignored'}"
+            row = {"task": task.name, "method": "plain", "sensors": " + ".join(task.sensors), "condition": text}
+            out.append({**row, "error": rms(error)})
     return out
 
 
@@ -109,18 +111,16 @@ def job(name: str, study: Study) -> list[dict]:
     """All of one task."""
     torch.set_num_threads(1)
     if name == "UR5":
-        task = arm_task(demos=2, steps=12) if study.smoke else arm_task(demos=study.demos)
-        window = 60
+        task = arm_task(demos=2, steps=3) if study.smoke else arm_task(demos=study.demos)
     else:
-        task = car_task(study.kitti, frames=30) if study.smoke else car_task(study.kitti)
-        window = 100
+        task = car_task(study.kitti, frames=6) if study.smoke else car_task(study.kitti)
     weights, file = make_weights(task), study.out / f"{name}.pt"
     if file.exists():
         saved = read_checkpoint(file)
         task.parts.load_state_dict(saved["parts"])
         weights.load_state_dict(saved["weights"])
     else:
-        train(task, weights, updates=study.updates, window=window, batch=4 if study.smoke else 24)
+        train(task, weights, updates=study.updates, window=16 if study.smoke else WINDOW, batch=BATCH)
         write_checkpoint(file, {"parts": task.parts.state_dict(), "weights": weights.state_dict()})
     return rows(task, weights)
 

@@ -94,7 +94,7 @@ def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64)
     assert_close(attention(values, both, {"b": torch.randn(5, 3)}), torch.full((5, 2), 0.1 + 0.9 / (1 + torch.e**-4)))
     with torch.no_grad():
         for parameter in attention.parameters():
-            parameter.add_(torch.randn_like(parameter))
+            parameter.add_(0.3 * torch.randn_like(parameter))
     first, second = (attention(values, alone, {"b": torch.randn(5, 3)}) for _ in range(2))
     assert first[:, 0].equal(second[:, 0]), "b is not observed"
     changed = [attention(values, both, {"b": torch.randn(5, 3)}) for _ in range(2)]
