@@ -65,7 +65,7 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 
 # A tiny run of every study and example, two at a time; the long ones first.
 smoke: $(STAMP)
-	{ printf -- '-m benchmarks.%s\n' kitti ur5 g1 lorenz96 smoothing arms odometry reliability; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
+	{ printf -- '-m benchmarks.%s\n' kitti ur5 g1 lorenz96 smoothing fusion arms odometry reliability; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
 		sh -c 'echo "== {} --smoke" && $(BIN)/python {} --smoke || exit 255'
 
 # Damaged inputs at every border: about ten minutes. The tests run a sample.

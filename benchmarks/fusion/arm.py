@@ -109,7 +109,9 @@ def arm_task(*, demos: int = 3, steps: int = 75) -> Task:
         return FusedFilter(motion, sensors, initial=MomentPrior(mean, start), weights=weights)
 
     def loss(out: TensorDict) -> Tensor:
-        mean, var, truth = (value[..., :JOINTS] for value in (out["belief", "mean"], out["belief", "var"], out["state"]))
+        mean, var, truth = (
+            value[..., :JOINTS] for value in (out["belief", "mean"], out["belief", "var"], out["state"])
+        )
         return crps_gaussian(mean, var, truth).mean() / 0.02
 
     def error(out: TensorDict) -> Tensor:

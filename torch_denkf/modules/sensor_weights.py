@@ -167,7 +167,9 @@ class SensorWeights(SubModel):
     def on_entries(self, entries, call):
         """The weights."""
         if self.moments is not None:
-            points = _points(self.required(entries, (self.moments, "mean")), self.required(entries, (self.moments, "cov")))
+            points = _points(
+                self.required(entries, (self.moments, "mean")), self.required(entries, (self.moments, "cov"))
+            )
             entries = {**entries, self.state_key: points}
         size, innovations, seen = len(call.batch_size), {}, []
         for name, model in self.module["models"].items():
@@ -179,7 +181,9 @@ class SensorWeights(SubModel):
             predicted, observed = model.seen(entries, call._replace(sample=False).part(name))
             mean = ensemble_mean(predicted)
             innovation = wrap_angles(reading - mean, self.angles[name])
-            observed = torch.ones_like(reading, dtype=torch.bool) if observed is None else observed.expand(reading.shape)
+            observed = (
+                torch.ones_like(reading, dtype=torch.bool) if observed is None else observed.expand(reading.shape)
+            )
             spread = (ensemble_var(predicted, mean) + torch.where(observed, variance, 1)).sqrt()
             innovations[name] = torch.where(observed, innovation, 0) / spread
             seen.append(observed.any(-1))
