@@ -120,7 +120,7 @@ def main() -> None:
 
     # The laser reads two metres too little while somebody is in its beam, and nobody says so. The weights learn from
     # the score of the belief, and see nothing but innovations.
-    weights = SensorAttention({name: 1 for name in NOISE})
+    weights = SensorAttention(dict.fromkeys(NOISE, 1))
     learning = make(delay=0, weights=weights)
     loss = GaussianLoss(learning, transition=0.0, sensor=0.0)
     optimiser = torch.optim.Adam(weights.parameters(), 1e-2)

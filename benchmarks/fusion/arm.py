@@ -26,7 +26,7 @@ TASKS = ("pick", "push", "put_down")
 
 @torch.no_grad()
 def record(demos: int, steps: int, seed: int) -> TensorDict:
-    """Demonstrations at 100 Hz, ``[demos, 8 steps]``: truth, what the shipped sensor reads of the pictures, readings."""
+    """Demonstrations at 100 Hz, ``[demos, 8 steps]``: truth, readings, what the shipped sensor reads of pictures."""
     sensor, rows = from_pretrained("ur5-table")["sensor"], []
     for number in range(demos):
         env = UR5TableEnv(TASKS[number % 3], size=(64, 64), seed=seed + number, max_steps=steps)

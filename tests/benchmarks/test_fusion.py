@@ -41,7 +41,7 @@ def test_faults_are_where_they_are_said_to_be(task):
     for fault in ("frozen", "offset", "noise"):
         out = faulty(task, task.test, "wheels", fault, begin, end, generator)
         change = out["wheels"] - task.test["wheels"]
-        assert (change[:, :10] == 0).all() and (change[:, 20:] == 0).all()
+        assert (change[:, [*range(10), *range(20, 35)]] == 0).all()
         if fault == "offset":
             assert_close(change[:, 10:20], task.offsets["wheels"].expand(2, 10, 2))
         if fault == "frozen":

@@ -96,7 +96,7 @@ def test_an_ensemble_of_irregular_steps(float64):
 
 
 def test_noise_per_second_adds_up_over_steps_of_any_length(float64):
-    """A random walk over one second, in one step or in many, has the same covariance; also that of a vehicle's speed."""
+    """A random walk over one second, in one step or in many, has the same covariance."""
     walk = ConstantNoise([0.5, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     variances = [
         NoisePerSecond(walk)(TensorDict({"dt": torch.tensor([dt]), "belief": {"mean": torch.zeros(2)}}))

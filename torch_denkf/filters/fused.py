@@ -40,7 +40,7 @@ from torch_denkf.modules import (
     WithJointMoments,
     as_process_noise,
 )
-from torch_denkf.modules._base import check_module, reads, writes
+from torch_denkf.modules._base import check_module, writes
 from torch_denkf.modules._gaussian import GaussianTransition
 
 __all__ = ["FusedFilter", "FusedSensor"]
@@ -65,8 +65,8 @@ class FusedSensor:
             the covariances all since.
         late: key of an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
         angles: components of the reading that are angles in radians.
-        features: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the data, or
-            one that ``sensor`` writes, such as its encoding, under the sensor's own key.
+        features: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the data,
+            or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
     """
 
@@ -112,8 +112,8 @@ class FusedFilter(Filter):
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
 
     Args:
-        transition: forecasts an ensemble; or, for a mean and a covariance, :class:`~torch_denkf.modules.LinearTransition`,
-            :class:`~torch_denkf.modules.EKFTransition` or :class:`~torch_denkf.modules.UKFTransition`, or a transition
+        transition: forecasts an ensemble; or, for a mean and a covariance,
+            :class:`~torch_denkf.modules.LinearTransition`, :class:`~torch_denkf.modules.EKFTransition` or :class:`~torch_denkf.modules.UKFTransition`, or a transition
             of ensembles, which becomes that of an extended Kalman filter.
         sensors: by name, in the order of their updates.
         initial: the initial belief.
@@ -201,7 +201,7 @@ class FusedFilter(Filter):
         """A step, see :meth:`Filter.step`.
 
         Raises:
-            ValueError: if the update is joint, or sensors have weights, and ``without`` names some readings but not all.
+            ValueError: if the update is joint, or sensors have weights, and ``without`` names some readings, not all.
         """
         if self.together and without and set(map(unravel_key, without)) != set(self.structure.readings):
             raise ValueError(
