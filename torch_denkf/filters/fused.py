@@ -113,8 +113,9 @@ class FusedFilter(Filter):
 
     Args:
         transition: forecasts an ensemble; or, for a mean and a covariance,
-            :class:`~torch_denkf.modules.LinearTransition`, :class:`~torch_denkf.modules.EKFTransition` or :class:`~torch_denkf.modules.UKFTransition`, or a transition
-            of ensembles, which becomes that of an extended Kalman filter.
+            :class:`~torch_denkf.modules.LinearTransition`, :class:`~torch_denkf.modules.EKFTransition` or
+            :class:`~torch_denkf.modules.UKFTransition`, or a transition of ensembles, which becomes that of an extended
+            Kalman filter.
         sensors: by name, in the order of their updates.
         initial: the initial belief.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q.
