@@ -15,6 +15,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
+from torch._subclasses.fake_tensor import FakeTensor
 
 __all__ = [
     "check_count",
@@ -26,6 +28,7 @@ __all__ = [
     "check_shape",
     "check_square",
     "check_values",
+    "has_values",
     "read_lines",
 ]
 
@@ -287,9 +290,25 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
         )
 
 
+def has_values(tensor: Tensor) -> bool:
+    """Whether a tensor's values can be looked at: not on "meta", of a fake tensor, under vmap, or in a traced graph.
+
+    Example:
+        >>> has_values(torch.ones(2)), has_values(torch.ones(2, device="meta"))
+        (True, False)
+    """
+    if torch.compiler.is_compiling() or tensor.is_meta or isinstance(tensor, FakeTensor):
+        return False
+    while is_functorch_wrapped_tensor(tensor):
+        if is_batchedtensor(tensor):
+            return False
+        tensor = get_unwrapped(tensor)
+    return True
+
+
 def _has_values(tensor: Tensor) -> bool:
-    """Whether a constant's values can be looked at: not on "meta", of a fake tensor, or while a graph is traced."""
-    return type(tensor) in (Tensor, torch.nn.Parameter) and not tensor.is_meta and not torch.compiler.is_compiling()
+    """Likewise, of a constant; one of another class of tensors may know more than to be read."""
+    return type(tensor) in (Tensor, torch.nn.Parameter) and has_values(tensor)
 
 
 def _range(above=None, least=None, below=None, most=None, infinite: bool = False) -> str:

@@ -1,4 +1,8 @@
-"""Locks that end with the process that holds them, however it ends."""
+"""Locks that end with the process that holds them, however it ends.
+
+The library filelock makes the file that it is asked about. Whoever sweeps what killed processes left must not: a folder
+without its lock would look as if it were in use.
+"""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from torch_denkf._files import write_text
+from torch_denkf._workers import follow_parent
 
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:
@@ -21,12 +22,13 @@ def once(file: Path, rows: Callable[[], list[dict]]) -> None:
 
 
 def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: str) -> None:
-    """Makes all calls, each in one of some fresh processes; raises what a call raised."""
+    """Makes all calls, each in one of some fresh processes, which end with this one; raises what a call raised."""
     if processes < 2:
         for call in tqdm(calls, desc=title, disable=None):
             call()
         return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(processes, context, initializer=follow_parent, initargs=(False,)) as pool:
         futures = [pool.submit(call) for call in calls]
         for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
             future.result()

@@ -24,6 +24,7 @@ BORDERS = (
     "filters_made",
     "sub_models",
     "filters_fed",
+    "smoothers",
     "kitti",
     "lerobot",
     "ur5",

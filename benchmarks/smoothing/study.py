@@ -14,7 +14,7 @@ import torch
 from benchmarks.common.arguments import command, parse, processor
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import Columns, head, line, pick, write_page
-from benchmarks.smoothing import against_dapper, ours
+from benchmarks.smoothing import against_dapper, ours, paths, real
 from benchmarks.smoothing.cases import CASES
 
 COLUMNS = Columns(
@@ -36,12 +36,17 @@ COLUMNS = Columns(
 
 @dataclass(frozen=True)
 class Study:
-    """Smoothers on Lorenz-63 and Lorenz-96, and DAPPER on the same truth and readings where it is installed."""
+    """Smoothers on Lorenz-63 and Lorenz-96, and DAPPER on the same truth and readings where it is installed.
+
+    With --real: smoothers behind the package's trained sensors, on the UR5 and, with --root, on KITTI.
+    """
 
     out: Path = Path("runs/smoothing")
     seeds: int = 4
     cycles: int = 2000  # of which the first 64 (Lorenz-63) or 133 (Lorenz-96) do not count
     processes: int = 1
+    real: bool = False  # recordings in the place of chaotic systems
+    root: Path | None = None  # of --real: folder with KITTI's sequences and poses
     smoke: bool = False  # a few cycles: does it run?
 
 
@@ -104,6 +109,9 @@ def main() -> None:
     study = parse(Study)
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="smoothing-")), cycles=26, seeds=2)
+    if study.real:
+        run_real(study)
+        return
     seeds, parts = list(range(study.seeds)), study.out / "parts"
     jobs: dict[Path, partial] = {
         parts / f"{case.name}.json": partial(ours.rows, case, seeds, study.cycles) for case in CASES
@@ -117,6 +125,18 @@ def main() -> None:
     rows = joined(read_rows(jobs))
     COLUMNS.write(rows, study.out / "smoothing.csv")
     write_page(page(rows, study), study.out / "smoothing.md")
+
+
+def run_real(study: Study) -> None:
+    """The part on recordings."""
+    jobs, ways = real.jobs(study.root, study.out, study.smoke)
+    calls = [partial(one_file, file, rows) for file, rows in {**jobs, **ways}.items()]
+    side_by_side(calls, study.processes, "smoothing")
+    rows, way_rows = read_rows(jobs), read_rows(ways)
+    real.COLUMNS.write(rows, study.out / "smoothing_real.csv")
+    if way_rows:
+        paths.COLUMNS.write(way_rows, study.out / "smoothing_paths.csv")
+    write_page(real.page(rows, way_rows), study.out / "smoothing_real.md")
 
 
 def joined(rows: Sequence[dict]) -> list[dict]:

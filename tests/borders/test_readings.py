@@ -6,13 +6,15 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torchrl.envs import ExcludeTransform, TransformedEnv, check_env_specs
 
 from tests.filters.factories import M, S, linear_denkf, linear_kalman, linear_system, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
+from torch_denkf._checks import has_values
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import DEnKF, Filter, LSTMFilter, ParticleFilter
+from torch_denkf.filters import DEnKF, Filter, LSTMFilter, ParticleFilter, _checks
 from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
@@ -402,3 +404,39 @@ def test_weights_that_are_not_a_number_stay_so(resample):
     assert after[0].isnan().all()
     assert moved[1].equal(expected[0][1])
     assert after[1].equal(expected[1][1])
+
+
+def test_only_what_nobody_can_look_at_is_passed_over(monkeypatch):
+    """Under vmap and of tensors without values nothing is said; a real error of torch is one."""
+    filter = linear_denkf()
+
+    def means(observation):
+        return filter.sequence(TensorDict({"observation": observation}, observation.shape[:-1]))["belief", "mean"]
+
+    readings = torch.randn(3, 4, 5, 2)
+    readings[1, 2, 3] = torch.nan
+    torch.vmap(means)(readings)
+    torch.func.vmap(torch.func.jacrev(means))(readings[:, 0])
+    with pytest.raises(ValueError, match="observation"):
+        means(readings)
+    with pytest.raises(ValueError, match="observation"):
+        torch.func.jacrev(means)(readings[1])
+
+    def broken(*_):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(_checks, "rejected_keys", broken)
+    torch.vmap(means)(readings)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        means(readings)
+
+
+def test_whether_values_can_be_looked_at():
+    seen = []
+    torch.vmap(lambda row: seen.append(has_values(row)) or row)(torch.zeros(2))
+    torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum())(torch.zeros(2))
+    torch.vmap(torch.func.grad(lambda row: seen.append(has_values(row)) or row.sum()))(torch.zeros(2, 2))
+    with FakeTensorMode():
+        seen.append(has_values(torch.zeros(2)))
+    seen += [has_values(torch.zeros(2, device="meta")), has_values(torch.zeros(2))]
+    assert seen == [False, True, False, False, False, True]

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 
 from torch_denkf.cli.cache import main as denkf_cache
+from torch_denkf.data import cache_entry
 from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget, sweep
 from torch_denkf.data.cache_entry import END, MANIFEST, DamagedEntry, check_entry, open_entry
 
@@ -83,7 +85,10 @@ def test_what_is_filled_in_place_is_the_same(tmp_path, entry):
 
     other = tmp_path / "cache" / "other-0123456789abcdef"
     assert same(cached_in_place(other, fill), content())
-    assert (other / MANIFEST).read_bytes() == (entry / MANIFEST).read_bytes()
+    listed, wanted = (json.loads(json.loads((at / MANIFEST).read_text())["content"]) for at in (other, entry))
+    for about in (*listed["tensors"].values(), *wanted["tensors"].values()):
+        assert about.pop("written") > 0
+    assert listed == wanted
 
 
 def test_writing_to_an_opened_entry_changes_no_file(entry):
@@ -111,7 +116,7 @@ def test_workers_get_the_file_and_what_was_written_to_it(entry):
 def damage(entry, how):
     file = entry / "pixels.bin"
     size = file.stat().st_size
-    flipped = {"head": 5, "tail": size - 5}
+    flipped = {"head": 5, "middle": size // 2, "tail": size - 5}
     if how == "cut":
         os.truncate(file, size // 2)
     elif how == "cut, then filled with zeros":
@@ -158,6 +163,7 @@ WAYS = (
     "gone",
     "a folder",
     "head",
+    "middle",
     "tail",
     "small file",
     "no manifest",
@@ -183,7 +189,10 @@ def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
 
 def test_every_byte_counts_for_the_whole_check(entry, capsys):
     check_entry(entry)
-    flip(entry / "pixels.bin", 2 * END)  # in the middle: opening does not read it
+    file = entry / "pixels.bin"
+    times = file.stat()
+    flip(file, 2 * END)
+    os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))  # as on a disk that rots: opening cannot know
     cached(entry, never)
     with pytest.raises(DamagedEntry, match=r"pixels.bin does not have its checksum"):
         check_entry(entry)
@@ -193,6 +202,27 @@ def test_every_byte_counts_for_the_whole_check(entry, capsys):
     assert denkf_cache(["clear", "--damaged", *words]) == 0
     assert os.listdir(entry.parent) == []
     assert denkf_cache(["check", *words]) == 0
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_a_copy_is_compared_as_a_whole_once(entry, monkeypatch, writable):
+    copy = entry.with_name(f"{NAME[:-1]}0")
+    shutil.copytree(entry, copy, copy_function=shutil.copyfile)  # other times of writing
+    if not writable:
+
+        def refuse(*_):
+            raise OSError(30, "Read-only file system")
+
+        monkeypatch.setattr(cache_entry, "_write_manifest", refuse)
+    summed, whole = [], cache_entry._whole
+    monkeypatch.setattr(cache_entry, "_whole", lambda stream: summed.append(Path(stream.name)) or whole(stream))
+    assert same(cached(copy, never), content())
+    assert sorted(summed) == sorted(copy.glob("*.bin"))
+    summed.clear()
+    assert same(cached(copy, never), content())
+    monkeypatch.setattr(cache_entry, "_COMPARED", {})  # as in another process
+    assert same(cached(copy, never), content())
+    assert len(summed) == (0 if writable else len(list(copy.glob("*.bin"))))
 
 
 def test_nothing_that_was_planted_is_executed(entry, tmp_path):

@@ -233,15 +233,15 @@ def test_compiled_functions_are_the_eager_ones():
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="EnRTS smooths an ensemble"):
+    with pytest.raises(TypeError, match="EnRTS takes a filter with an ensemble"):
         EnRTS(linear_kalman())
-    with pytest.raises(TypeError, match="EnKS smooths an ensemble"):
+    with pytest.raises(TypeError, match="EnKS takes a filter with an ensemble"):
         EnKS(linear_kalman())
-    with pytest.raises(TypeError, match="has an ensemble"):
+    with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF has none"):
         RTSSmoother(linear_denkf())
     with pytest.raises(ValueError, match="at least 1"):
         FixedLag(linear_denkf(), 0)
-    with pytest.raises(ValueError, match="0 or more"):
+    with pytest.raises(ValueError, match="lag must be a whole number, at least 0; got -1"):
         EnRTS(linear_denkf(), -1)
     with pytest.raises(TypeError, match="carries a past already"):
         FixedLag(FixedLag(linear_denkf(), 2), 2)

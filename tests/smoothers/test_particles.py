@@ -114,7 +114,7 @@ def test_each_step_uses_the_action_that_led_into_it(float64, previous):
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="smooths particles"):
+    with pytest.raises(TypeError, match="takes a filter with particles"):
         ParticleSmoother(linear_denkf())
     F, Q, H, R = linear_system()
     own = ParticleFilter(

@@ -11,10 +11,12 @@ from torchrl.record.loggers import CSVLogger
 from torchrl.trainers import ClearCudaCache, CountFramesLog, EarlyStopping, LogScalar
 
 from tests.training.problem import make_trainer
-from torch_denkf.filters import KalmanFilter
-from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.filters import EKF, KalmanFilter
+from torch_denkf.modules import ConstantNoise, LearnedTransition, MomentPrior, Select
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.training import FilterTrainer, Stage, read_checkpoint
-from torch_denkf.training.update import seed_update
+from torch_denkf.training.distributed import Processes
+from torch_denkf.training.update import Updates, seed_update
 
 
 def rows(out, name):
@@ -100,6 +102,64 @@ def test_too_many_that_are_not_finite(tmp_path):
     twin.load_state_dict(state["model"])
     assert all(torch.equal(one, other) for one, other in zip(net.parameters(), twin.parameters(), strict=True))
     assert all(torch.isfinite(p).all() and p.requires_grad for p in net.parameters())
+
+
+def small_filter():
+    """An EKF of two states with a transition that is trained."""
+    return EKF(
+        transition=LearnedTransition(nn.Linear(2, 2)),
+        sensor=None,
+        observation=Select([0, 1]),
+        noise=ConstantNoise([0.5, 0.5], in_key="observation"),
+        initial=MomentPrior(torch.zeros(2), torch.eye(2)),
+        process_noise=[0.1, 0.1],
+        observation_key="observation",
+    )
+
+
+def filter_stage(filter, spoil, updates=6):
+    """A filter on drawn sequences; the batches of the updates in ``spoil`` hold a reading that is NaN."""
+    drawn = iter(range(10**6))
+
+    def sample(generator, length):
+        batch = TensorDict({}, [4, 5])
+        for name in ("observation", "state"):
+            batch[name] = torch.randn(4, 5, 2, generator=generator)
+        if next(drawn) in spoil:
+            batch["observation"][1, 2, 0] = torch.nan
+        return batch
+
+    return Stage("fit", GaussianLoss(filter, state=1.0), sample, updates, lr=0.01)
+
+
+def test_readings_that_a_filter_refuses_are_left_out_and_said_once(tmp_path, caplog):
+    filter, twin = small_filter(), small_filter()
+    twin.load_state_dict(filter.state_dict())
+    trainer = FilterTrainer(filter, [filter_stage(filter, (1, 2, 4))], out=tmp_path / "a", device="cpu", log_every=3)
+    with caplog.at_level("WARNING", "torch_denkf"):
+        result = trainer.fit()["fit"]
+    assert result["skipped"] == 3
+    assert rows(tmp_path / "a", "fit/skipped") == [(3, 2.0), (6, 3.0)]
+    (record,) = caplog.records
+    assert "Stage 'fit', update 2 is left out" in record.getMessage()
+    assert "['observation']" in record.getMessage()
+    # Those that are left out leave no trace: three updates with the batches of the others end at the same parameters.
+    stage = filter_stage(twin, ())
+    updates = Updates(stage, stage.groups(twin), Processes("cpu"))
+    for update in (0, 3, 5):
+        assert updates.step(stage.sample(seed_update(0, 0, update), None))
+    for one, other in zip(filter.parameters(), twin.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_too_many_refused_in_a_row_end_it_with_the_key(tmp_path):
+    filter = small_filter()
+    trainer = FilterTrainer(
+        filter, [filter_stage(filter, range(2, 20), 20)], out=tmp_path, device="cpu", save_every=1, max_skipped=3
+    )
+    with pytest.raises(FloatingPointError, match=r"update 6: .* in 4 updates in a row.*\['observation'\]"):
+        trainer.fit()
+    assert read_checkpoint(tmp_path / "last.pt")["updates"]["in_a_row"] == 3
 
 
 def test_the_likelihood_reaches_its_maximum(tmp_path, float64):

@@ -7,12 +7,14 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv, check_env_specs
 
-from tests.filters.factories import assert_equal, linear_kalman
+from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
+from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.smoothers import EnKS, FixedLag, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
 
 LAG = 2
+CONTROL = torch.tensor([[1.0], [-0.5]])
 KEYS = [("smoothed", name) for name in ("mean", "var", "age")]
 FILTERS = {"ensemble": envs.fixed_filter, "Kalman": linear_kalman}
 
@@ -77,3 +79,31 @@ def test_what_is_stored_without_the_ensemble():
 def test_a_filter_that_cannot_be_smoothed_is_refused():
     with pytest.raises(TypeError, match="carries a past already"):
         DEnKFTransform(FixedLag(envs.fixed_filter(), 2), lag=2)
+
+
+def controlled_env(**kwargs):
+    """Actions drive the system, and the Kalman filter knows how."""
+    F, Q, H, R = linear_system()
+    plain = LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), control=CONTROL, missing=0.3, **kwargs)
+    return TransformedEnv(plain, DEnKFTransform(linear_kalman(control=CONTROL), lag=LAG))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_past_knows_the_actions_that_led_to_it(workers):
+    if workers:
+        env = ParallelEnv(workers, controlled_env, create_env_kwargs=[{"max_steps": 4}, {"max_steps": 7, "seed": 1}])
+    else:
+        env = controlled_env(batch_size=[2], max_steps=[4, 7])
+    try:
+        rollout = TransformedEnv(env, InitTracker()).rollout(12, break_when_any_done=False)
+    finally:
+        env.close()
+    frames = rollout.select("observation", "observed", "is_init", "action")
+    online = FixedLag(linear_kalman(control=CONTROL), LAG).sequence(frames.copy())
+    assert_equal(rollout, online, [*KEYS, ("smoothed", "cov")], atol=1e-4)
+    whole = RTSSmoother(linear_kalman(control=CONTROL), LAG)(frames.copy())
+    for row, t in (rollout["smoothed", "age"].squeeze(-1) == LAG).nonzero().tolist():
+        now, then = rollout["smoothed", "mean"][row, t], whole["smoothed", "mean"][row, t - LAG]
+        torch.testing.assert_close(now, then, rtol=0, atol=1e-4)
+    without = RTSSmoother(linear_kalman(), LAG)(frames.exclude("action"))
+    assert (without["smoothed", "mean"] - whole["smoothed", "mean"]).abs().max() > 0.1

@@ -7,9 +7,10 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
-__all__ = ["Command", "say", "whole"]
+__all__ = ["Command", "filled", "path", "say", "whole"]
 
 
 class _Parser(argparse.ArgumentParser):
@@ -121,6 +122,28 @@ def whole(least: int) -> Callable[[str], int]:
 
     read.__name__ = "whole number"  # argparse names it for what is no number
     return read
+
+
+def filled(text: str) -> str:
+    """The type of an argument that must not be empty, as that of a variable of the shell that is not set.
+
+    Example:
+        >>> filled("runs/car")
+        'runs/car'
+    """
+    if not text:
+        raise argparse.ArgumentTypeError("must not be empty")
+    return text
+
+
+def path(text: str) -> Path:
+    """The type of an argument that names a file or folder.
+
+    Example:
+        >>> path("runs/car").name
+        'car'
+    """
+    return Path(filled(text))
 
 
 def say(text: str) -> None:

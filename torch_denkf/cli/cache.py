@@ -21,7 +21,7 @@ import argparse
 import time
 from pathlib import Path
 
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, path, say
 
 __all__ = ["main"]
 
@@ -35,7 +35,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         choices=("list", "check", "clear"),
         help="list entries, compare them with their checksums, or remove them",
     )
-    add("--folder", type=Path, help="of the cache; $TORCH_DENKF_CACHE, or else ~/.cache/torch_denkf, by default")
+    add("--folder", type=path, help="of the cache; $TORCH_DENKF_CACHE, or else ~/.cache/torch_denkf, by default")
     add("--damaged", action="store_true", help="clear: only what is damaged, or of an earlier version")
     add("--older-than", type=float, metavar="DAYS", help="clear: only what was written before so many days")
 

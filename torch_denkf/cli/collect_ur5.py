@@ -26,7 +26,7 @@ import sys
 from pathlib import Path
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, path, say, whole
 from torch_denkf.data.ur5 import files
 from torch_denkf.envs.ur5.collect import EPISODE, collect_ur5_demos
 from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
@@ -36,10 +36,10 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", required=True, type=Path, help="folder of the demos")
+    add("--out", required=True, type=path, help="folder of the demos")
     add("--demos", type=int, default=2000, help="that the folder shall have")
     add("--size", nargs="+", type=int, default=[224], metavar="PX", help="one side, or height and width")
-    add("--frames", type=int, default=0, help="random steps of each demo to draw; 0 for all")
+    add("--frames", type=whole(0), default=0, help="random steps of each demo to draw; 0 for all")
     add("--no-pixels", action="store_true", help="states and actions alone")
     add("--domain", choices=DOMAIN_NAMES, default="sim", help="of the environment")
     add("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="in turn")
@@ -80,8 +80,11 @@ def _verify(root: Path) -> int:
     if not entries:
         raise FileNotFoundError(f"no demos in {root}: no {files.MANIFEST}, or an empty one")
     wrong = [text for text in (files.what_is_wrong(root, entry) for entry in entries) if text is not None]
+    listed = {entry.file for entry in entries}
+    others = sorted(file.name for file in root.glob(files.PATTERN) if file.name not in listed)
+    wrong += [f"{root / name} is not listed in {files.MANIFEST}; {files.AGAIN}" for name in others]
     sys.stderr.write("".join(f"{text}\n" for text in wrong))
-    found = f"{len(wrong)} are missing or damaged" if wrong else "all checksums are right"
+    found = f"{len(wrong)} are missing, damaged or not listed" if wrong else "all checksums are right"
     say(f"{len(entries)} demos in {root}: {found}")
     return 1 if wrong else 0
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -29,8 +29,8 @@ _NAMES = {
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", type=Path, default=Path("runs/demo"), help="folder for demo.png and demo.gif")
-    add("--root", type=Path, help="folder in KITTI's layout; without it a drive is rendered")
+    add("--out", type=path, default=Path("runs/demo"), help="folder for demo.png and demo.gif")
+    add("--root", type=path, help="folder in KITTI's layout; without it a drive is rendered")
     add("--drive", help="name of a drive below --root")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera of --root over the road, m")
     add("--frames", type=int, default=240, help="of the drive, at most")

@@ -10,10 +10,9 @@ See :func:`torch_denkf.odometry.evaluate_car_filter`, which does the work.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from torch_denkf._files import write_text
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, filled, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -21,10 +20,15 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
-    add("--root", required=True, type=Path, help="folder in KITTI's layout, with sequences/ and poses/")
+    add(
+        "--checkpoint",
+        type=filled,
+        default="car-odometry",
+        help="that of the library, or a folder that denkf train left",
+    )
+    add("--root", required=True, type=path, help="folder in KITTI's layout, with sequences/ and poses/")
     add("--drives", nargs="+", metavar="NAME", help="drives below --root; all by default")
-    add("--out", type=Path, help="folder for evaluation.csv and evaluation.md, and a cache of the optical flow")
+    add("--out", type=path, help="folder for evaluation.csv and evaluation.md, and a cache of the optical flow")
     add("--camera", help="folder of the images; the first that has any by default")
     add("--size", nargs=2, type=int, metavar=("H", "W"), help="to scale images to; that of the training by default")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m")
@@ -49,7 +53,11 @@ def _run(args: argparse.Namespace) -> None:
     car = load_car(args.checkpoint)
     drives = args.drives or list_kitti_drives(args.root)
     if not drives:
-        raise FileNotFoundError(f"no drive below {args.root} has both images and poses")
+        lacking = ", ".join(sorted(f"poses/{folder.name}.txt" for folder in (args.root / "sequences").glob("*/")))
+        raise FileNotFoundError(
+            f"no drive below --root {args.root} has both images and poses; expected images in sequences/NAME/image_2 "
+            f"and {lacking or 'poses/NAME.txt'}"
+        )
     rows, _ = evaluate_car_filter(
         car,
         args.root,

@@ -21,7 +21,7 @@ from pathlib import Path
 from statistics import median
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, filled, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -32,19 +32,24 @@ _UNEVEN = 0.2
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("frames", type=Path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
+    add("frames", type=path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
     add(
         "--calibration",
         required=True,
-        type=Path,
+        type=path,
         metavar="FILE",
         help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
     )
-    add("--checkpoint", default="car-odometry", help="that of the library, or a folder that denkf train left")
-    add("--out", required=True, type=Path, help="folder for path.csv, trajectory files and pictures")
+    add(
+        "--checkpoint",
+        type=filled,
+        default="car-odometry",
+        help="that of the library, or a folder that denkf train left",
+    )
+    add("--out", required=True, type=path, help="folder for path.csv, trajectory files and pictures")
     add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
     add("--fps", type=float, help="frames in a second; by default that of a video, or the times of its frames")
-    add("--times", type=Path, metavar="FILE", help="a time in s for each frame, a row each")
+    add("--times", type=path, metavar="FILE", help="a time in s for each frame, a row each")
     add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
     add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
     add("--seed", type=whole(0), default=0, help="of the filter's noise")

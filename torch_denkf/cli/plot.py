@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch_denkf._files import replacing
-from torch_denkf.cli._command import Command, say
+from torch_denkf.cli._command import Command, path, say
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,6 @@ def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
     from torch_denkf.plots import plot_bands, plot_path
 
     path = read_path(file)
-    out.mkdir(parents=True, exist_ok=True)
     files = [out / "path.png", out / "bands.png"]
     _save(plot_path(path, spread="ellipses", forward_up=True, level=level), files[0])
     names, factors = ["v, m/s", "theta_dot, deg/s"], [1.0, math.degrees(1)]
@@ -62,8 +61,8 @@ def _save(axes: Axes, file: Path) -> None:
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("path", type=Path, metavar="FOLDER_OR_CSV", help="that denkf odometry left")
-    add("--out", type=Path, help="folder for path.png and bands.png; that of the path by default")
+    add("path", type=path, metavar="FOLDER_OR_CSV", help="that denkf odometry left")
+    add("--out", type=path, help="folder for path.png and bands.png; that of the path by default")
     add("--level", type=float, default=0.9, help="probability of the bands and ellipses")
 
 

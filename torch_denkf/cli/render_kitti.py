@@ -20,7 +20,7 @@ import argparse
 import os
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, path, say, whole
 from torch_denkf.data.kitti.render import GREY_OR_COLOUR, render_drives
 from torch_denkf.simulation.street.camera import KITTI_FOCAL
 
@@ -29,8 +29,8 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", required=True, help="folder that gets sequences/ and poses/")
-    add("--poses", help="folder of pose files NAME.txt; without it the drives are invented")
+    add("--out", required=True, type=path, help="folder that gets sequences/ and poses/")
+    add("--poses", type=path, help="folder of pose files NAME.txt; without it the drives are invented")
     add("--names", nargs="+", help="drives: all pose files, or 00 to 10 when invented")
     add("--size", nargs=2, type=int, default=(50, 150), metavar=("H", "W"), help="of the images, such as --size 50 150")
     add("--frames", type=int, help="at most so many images a drive; 300 when invented")

@@ -11,9 +11,8 @@ See :func:`torch_denkf.odometry.train_car_filter`, which does the work.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from torch_denkf.cli._command import Command, say, whole
+from torch_denkf.cli._command import Command, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -21,8 +20,8 @@ __all__ = ["main"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", required=True, type=Path, help="folder of the filter, with everything that its training needs")
-    add("--root", type=Path, help="folder of recorded drives in KITTI's layout, with sequences/ and poses/")
+    add("--out", required=True, type=path, help="folder of the filter, with everything that its training needs")
+    add("--root", type=path, help="folder of recorded drives in KITTI's layout, with sequences/ and poses/")
     add("--drives", nargs="+", metavar="NAME", help="drives below --root to learn from; all by default")
     add("--test", nargs="+", default=[], metavar="NAME", help="drives below --root that must not be seen")
     add("--rendered", type=int, default=0, metavar="N", help="drives to render and learn from, too")

@@ -2,7 +2,7 @@
 
 ::
 
-    ENTRY/manifest.json      format, batch sizes, and of each tensor: file, dtype, shape, bytes, checksums
+    ENTRY/manifest.json      format, batch sizes, and of each tensor: dtype, shape, bytes, checksums, time of writing
     ENTRY/NAME.bin           a tensor's bytes in C order, little endian; NAME is its key, nested ones joined by dots
 
 Nothing else is read, and nothing that is read can hold code.
@@ -24,7 +24,7 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict, is_leaf_nontensor
 from torch import Tensor
 
-from torch_denkf._files import reserve, sync
+from torch_denkf._files import reserve, sync, write_text
 
 __all__ = [
     "MANIFEST",
@@ -47,6 +47,8 @@ _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32, torch.float64)
 }
+#: Files that this process has compared as a whole, and when they had been written to.
+_COMPARED: dict[str, int] = {}
 _MAP = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 
 
@@ -127,19 +129,23 @@ def seal_entry(folder: Path, content: TensorDict) -> None:
         file = folder / f"{'.'.join(name)}.bin"
         sync(file)
         with file.open("rb") as stream:
-            sums = {"crc32": _whole(stream), "ends": _ends(stream)}
+            sums = {"crc32": _whole(stream), "ends": _ends(stream), "written": os.fstat(stream.fileno()).st_mtime_ns}
         shape = {"dtype": str(tensor.dtype).removeprefix("torch."), "shape": list(tensor.shape)}
         tensors[".".join(name)] = {**shape, "bytes": file.stat().st_size, **sums}
     sizes = {".".join(name): list(size) for name, size in _batch_sizes(content)}
-    text = json.dumps({"format": FORMAT, "batch_sizes": sizes, "tensors": tensors})
-    file = folder / MANIFEST
-    file.write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
-    sync(file)
-    sync(folder)
+    _write_manifest(folder, {"format": FORMAT, "batch_sizes": sizes, "tensors": tensors})
+
+
+def _write_manifest(folder: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content)
+    write_text(folder / MANIFEST, json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
 
 
 def open_entry(folder: Path) -> TensorDict:
-    """Maps the tensors of an entry, after a look at sizes and at both ends of each file.
+    """Maps the tensors of an entry, after a look at each file's size, time of writing, and both ends.
+
+    A file that was written to since the entry was sealed is compared as a whole with its checksum, once: where it is
+    sound, as after a copy, the manifest gets the new time.
 
     Raises:
         DamagedEntry: if something is wrong; says what.
@@ -147,16 +153,21 @@ def open_entry(folder: Path) -> TensorDict:
     """
     content = _read_manifest(folder)
     try:
-        out = TensorDict({}, content["batch_sizes"][""], device="cpu")
+        out, renewed = TensorDict({}, content["batch_sizes"][""], device="cpu"), False
         for name, about in content["tensors"].items():
             file = folder / f"{name}.bin"
-            _check(file, about, whole=False)
+            written = _check(file, about, whole=False)
+            if written != about.get("written"):
+                about["written"], renewed = written, True
             out.set(tuple(name.split(".")), CachedTensor.from_filename(file, _DTYPES[about["dtype"]], about["shape"]))
         for name, size in content["batch_sizes"].items():
             if name:
                 out.get(tuple(name.split("."))).batch_size = size
     except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
         raise DamagedEntry(f"{folder / MANIFEST} does not fit its files ({error})") from error
+    if renewed:
+        with contextlib.suppress(OSError):  # a cache that may only be read is compared again by the next process
+            _write_manifest(folder, content)
     return out.lock_()
 
 
@@ -202,15 +213,21 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     return content
 
 
-def _check(file: Path, about: dict[str, Any], whole: bool) -> None:
+def _check(file: Path, about: dict[str, Any], whole: bool) -> int:
+    """Compares a file with what the manifest says; when it was written to last, ns."""
     try:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             expected = torch.Size(about["shape"]).numel() * _DTYPES[about["dtype"]].itemsize
             if not size == about["bytes"] == expected:
                 raise DamagedEntry(f"{file} has {size} bytes instead of {expected}")
+            written = os.fstat(stream.fileno()).st_mtime_ns
+            whole = whole or written not in (about.get("written"), _COMPARED.get(str(file)))
             if _ends(stream) != about["ends"] or (whole and _whole(stream) != about["crc32"]):
                 raise DamagedEntry(f"{file} does not have its checksum")
+            if whole:
+                _COMPARED[str(file)] = written
+            return written
     except OSError as error:
         raise DamagedEntry(f"{file} cannot be read ({error.strerror})") from error
 

@@ -9,17 +9,24 @@ import numpy as np
 __all__ = ["MOST_WRONG", "filled", "increasing", "sound"]
 
 STILL = 0.1  # a step that is shorter, in median steps, is none: the stamp was written twice
+FARTHEST = 1e9  # median steps from the other stamps, beyond which a stamp is none: years, at a camera's rate
 MOST_WRONG = 0.1  # a share of times that are wrong, up to which the others are trusted
 
 
 def sound(times: np.ndarray) -> np.ndarray:
-    """Stamps that are finite and increase, and not by next to nothing, bool ``[N]``.
+    """Stamps that are finite and increase, not by next to nothing, and not by more than any clock does, bool ``[N]``.
 
     Examples:
         >>> sound(np.array([0.0, np.nan, 2.0, 2.001, 3.0, 1e9, 4.0])).tolist()
         [True, False, True, False, True, False, True]
+        >>> sound(np.array([0.0, 1.0, 2.0, 1e300])).tolist()
+        [True, True, True, False]
     """
     finite = np.flatnonzero(np.isfinite(times))
+    with np.errstate(over="ignore"):
+        far = np.abs(times[finite] - np.median(times[finite])) if len(finite) else times[finite]
+        usual = np.median(np.abs(np.diff(times[finite]))) if len(finite) > 1 else np.inf
+    finite = finite[far <= FARTHEST * usual]
     good = finite[increasing(times[finite])]
     steps = np.diff(times[good])
     if len(steps):

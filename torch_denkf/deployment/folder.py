@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
-from torch import nn
+from torch import Tensor, nn
 
 import torch_denkf
 from torch_denkf._files import replacing
@@ -55,6 +55,9 @@ def save_folder(
         >>> load_folder(folder, {"line": lambda size: nn.Linear(size, 1)})
         Linear(in_features=2, out_features=1, bias=True)
     """
+    for name, value in (("settings", settings), ("training", training)):
+        if value is not None and not isinstance(value, Mapping):
+            raise TypeError(f"{name} must be a dictionary of plain values; got {value!r}"[:200])
     folder = Path(folder).expanduser()
     versions = {"torch_denkf": torch_denkf.__version__, "torch": str(torch.__version__)}
     config = {"format": FORMAT, "builder": builder, "settings": dict(settings), "sha256": ""}
@@ -132,18 +135,28 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
         weights = load_file(file)
     except (SafetensorError, ValueError) as error:
         raise ValueError(f"{file} cannot be read ({error}); restore it from a copy, or train anew") from error
-    trained = [name for name, _ in model.named_parameters()]  # a constant may be infinite, where nothing limits it
-    strange = [name for name in trained if name in weights and not weights[name].isfinite().all()]
-    strange += [name for name, value in weights.items() if value.is_floating_point() and value.isnan().any()]
-    strange += [name for name in trained if name in weights and not weights[name].is_floating_point()]
+    made = model.state_dict()
+    strange = [name for name, value in weights.items() if name in made and not _fits(value, made[name])]
     if strange:
-        raise ValueError(f"{file} holds NaN, infinity or whole numbers in {strange[:3]}; restore it, or train anew")
+        raise ValueError(
+            f"{file} holds NaN, infinity or whole numbers in {strange[:3]}, where {CONFIG} makes none; restore it from "
+            "a copy, or train anew"
+        )
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{file} does not fit {CONFIG} beside it: {reason}") from error
     return model.eval()
+
+
+def _fits(value: Tensor, made: Tensor) -> bool:
+    """Whether numbers are of the same kind as those that were built, and infinite only where these are."""
+    if value.is_floating_point() != made.is_floating_point():
+        return False
+    if value.shape != made.shape:  # for load_state_dict to say
+        return True
+    return not bool((~value.isfinite() & ~(made.isinf() & (value == made))).any())
 
 
 def _sha256(file: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import index
 from typing import ClassVar, Literal
 
 import torch
@@ -180,9 +181,14 @@ def _numbers(data: EpisodeReplay, episodes: Sequence[int | str] | int | str | No
     numbers = {episode.name: number for number, episode in enumerate(data.episodes)}
     chosen = []
     for asked in [episodes] if isinstance(episodes, (int, str)) else episodes:
-        number = numbers.get(asked) if isinstance(asked, str) else int(asked)
+        if not isinstance(asked, str) and not hasattr(asked, "__index__"):
+            raise TypeError(f"episodes= are numbers or names; got {asked!r}")
+        number = numbers.get(asked) if isinstance(asked, str) else index(asked)
         if number is None or not 0 <= number < len(numbers):
-            raise KeyError(f"no episode {asked!r} among {len(numbers)} of the data set, such as {list(numbers)[:8]}")
+            raise KeyError(
+                f"no episode {asked!r} among {len(numbers)} of the data set, such as {list(numbers)[:8]}; choose "
+                "episodes= among these, by number or name"
+            )
         chosen.append(number)
     if not chosen:
         raise ValueError("episodes is empty; leave it out for all")

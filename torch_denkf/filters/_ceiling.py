@@ -10,6 +10,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
+from torch_denkf._checks import has_values
 from torch_denkf.filters._said import say_once
 from torch_denkf.modules._base import Entries
 
@@ -89,9 +90,6 @@ def _variances(belief: Iterable[NestedKey]) -> list[NestedKey]:
 
 def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
     """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
-    if torch.compiler.is_compiling() or variance.is_cuda:
+    if variance.is_cuda or not has_values(variance):
         return None
-    try:
-        return bool((variance > ceiling).any())
-    except RuntimeError:  # under vmap a number has no value
-        return None
+    return bool((variance > ceiling).any())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
+from torch_denkf._checks import has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
 from torch_denkf.filters._structure import Structure, previous_key
 from torch_denkf.modules._base import Entries, random_parts
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
 __all__ = [
+    "AbsurdReading",
     "check_inputs",
     "refuse_absurd_readings",
     "refuse_non_finite",
@@ -23,6 +25,10 @@ __all__ = [
     "refuse_unknown_noise",
     "refuse_unknown_readings",
 ]
+
+
+class AbsurdReading(ValueError):
+    """A reading in a sequence that cannot be true, and that no mask hides; the message names its key."""
 
 
 def check_inputs(
@@ -98,13 +104,13 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
 
 
 def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:
-    """Raises a ``ValueError`` where readings of a sequence are not finite, or absurdly large, and no mask hides it."""
-    try:
-        absurd = rejected_keys(structure.guards, entries)
-    except RuntimeError:  # under vmap nobody can look at values
+    """Raises :class:`AbsurdReading` where readings of a sequence are not finite, or absurdly large, and not masked."""
+    looked_at = [key for guard in structure.guards for key in (guard.mask, *guard.whole, *guard.components)]
+    if not all(has_values(entries[key]) for key in looked_at if key in entries):
         return
+    absurd = rejected_keys(structure.guards, entries)
     if absurd:
-        raise ValueError(
+        raise AbsurdReading(
             f"There is NaN, infinity or more than {LARGEST_READING:g} in {absurd}, and no mask hides it. Give one "
             f"({list(structure.optional)}), or pass reject=True to the filter, which counts such readings as missing; "
             "check_finite=False switches this off."

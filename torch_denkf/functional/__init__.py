@@ -29,6 +29,7 @@ from torch_denkf.functional.random_bits import (
 )
 from torch_denkf.functional.resampling import effective_sample_size, jitter_copies, soft_resample, systematic_resample
 from torch_denkf.functional.scores import crps_ensemble, crps_gaussian, energy_score
+from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.functional.smoothing import rts_smooth, rts_step, smoothing_gain
 from torch_denkf.functional.smoothing_ensemble import enrts_smooth, enrts_step
 from torch_denkf.functional.smoothing_iterated import iterated_smoothing
@@ -50,6 +51,7 @@ __all__ = [
     "Scheme",
     "Space",
     "analyse",
+    "analyse_sharded",
     "ensemble_mean",
     "ensemble_anomalies",
     "ensemble_var",

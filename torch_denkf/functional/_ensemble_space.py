@@ -8,6 +8,7 @@ result is as large as the ensemble.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import overload
 
 import torch
@@ -75,11 +76,15 @@ def analyse_in_tiles(
     observed: Tensor | None = None,
     perturbation: Tensor | None = None,
     rotation: Tensor | None = None,
+    total: Callable[..., list[Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What :func:`~torch_denkf.functional.analyse` does in ensemble space, without gradients, in little memory.
 
     Beside the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
     ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.
+
+    With ``total`` the columns are a share of all there are, and it adds up sums over columns with those of the other
+    shares: it takes and returns them as tensors ``[*B, ...]``.
     """
     tiles = _Tiles(forecast, predicted, observation, noise, scheme, observed, perturbation)
     size, dim = predicted.shape[-2:]
@@ -88,6 +93,7 @@ def analyse_in_tiles(
     right = forecast.new_zeros(*batch, size, 1 if scheme == "etkf" else size)
     innovation = torch.empty_like(noise)
     log_noise = count = forecast.new_zeros(*batch, 1)
+    square = forecast.new_zeros(*batch, 1, dtype=torch.double)
     for start in range(0, dim, columns):
         part = slice(start, start + columns)
         normalised, mean_shift, shift = tiles(part, innovation[..., part])
@@ -96,14 +102,21 @@ def analyse_in_tiles(
         variance, mask = tiles.noise_and_mask(part)
         log_noise = log_noise + variance.log().sum(-1, keepdim=True)
         count = count + (variance.shape[-1] if mask is None else mask.sum(-1, keepdim=True))
+        if total is not None:
+            square += mean_shift.double().square().sum(-1)
+    if total is not None:
+        gram, right, log_noise, count, square = total(gram, right, log_noise, count, square)
 
     weights, root, log_det = solve_ensemble_space(gram, right, square_root=scheme == "etkf")
     mean_weights = weights.mean(-2, keepdim=True)
     # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
     nis = mean_weights.square().sum(-1)
-    for start in range(0, dim, columns):
+    for start in range(0, 0 if total is not None else dim, columns):
         normalised, mean_shift, _ = tiles(slice(start, start + columns))
         nis = nis + (mean_shift - mean_weights @ normalised).square().sum(-1)
+    if total is not None:  # the same as a difference, which needs no second sum over all shares
+        explained = mean_weights.double() @ right.double().mean(-1, keepdim=True)
+        nis = (square - explained.squeeze(-1)).to(forecast.dtype)
 
     if root is not None and rotation is not None:
         root = rotation @ root

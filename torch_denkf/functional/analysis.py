@@ -107,17 +107,27 @@ def analyse(
         >>> print(f"{result.ensemble.mean():.2f} {result.ensemble.var():.2f}")
         2.00 1.00
     """
-    _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space)
+    check_analysis_arguments(
+        forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space
+    )
     size, dim = predicted.shape[-2:]
     has_samples = observation.ndim == forecast.ndim
     in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
     if not in_observation_space:
         columns = columns_in_a_tile(forecast, predicted, observation, noise, perturbation)
         if columns is not None:
-            rest = {"observed": observed, "perturbation": perturbation, "rotation": rotation}
-            return Analysis(
-                *analyse_in_tiles(forecast, predicted, observation, noise, scheme=scheme, columns=columns, **rest)
+            tiled = analyse_in_tiles(
+                forecast,
+                predicted,
+                observation,
+                noise,
+                scheme=scheme,
+                columns=columns,
+                observed=observed,
+                perturbation=perturbation,
+                rotation=rotation,
             )
+            return Analysis(*tiled)
 
     if observed is not None:  # masked components: anomalies and innovation 0, variance 1
         members_observed = observed.unsqueeze(-2)
@@ -216,7 +226,10 @@ def _log_det(factor: Tensor) -> Tensor:
     return 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
 
 
-def _check(forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space) -> None:
+def check_analysis_arguments(
+    forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space
+) -> None:
+    """Refuses arguments of :func:`analyse` that do not fit each other."""
     check_ensemble("forecast", forecast, min_size=2)
     check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
     check_mask("observed", observed)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_shape
+from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional.linalg import semidefinite_solve
 
 
@@ -150,6 +150,6 @@ def rts_smooth(
 
 
 def check_lag(lag: int | None) -> None:
-    """Raise ``ValueError`` for a negative lag."""
-    if lag is not None and lag < 0:
-        raise ValueError(f"lag counts the later readings that are used, 0 or more, or None for all; got {lag}.")
+    """Raise unless ``lag`` is ``None`` or a whole number, 0 or more."""
+    if lag is not None:
+        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is for all")

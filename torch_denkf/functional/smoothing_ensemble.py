@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_ensemble, check_shape
+from torch_denkf._checks import check_ensemble, check_number, check_shape
 from torch_denkf.functional.linalg import cholesky, semidefinite_solve
 from torch_denkf.functional.moments import ensemble_anomalies
 from torch_denkf.functional.smoothing import check_lag
@@ -50,21 +50,24 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     check_ensemble("ensemble", ensemble, min_size=2)
     for name, value in (("forecast", forecast), ("smoothed", smoothed)):
         check_shape(name, value, ensemble.shape, "[*B, E, S]")
-    if not 0 < damping <= 1:
-        raise ValueError(f"damping is a factor on the gain, above 0 and at most 1; got {damping}.")
+    check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
+    # Where all members are alike, what they have beside their mean is rounding, and no direction to learn from.
+    spread = forecast_anomalies.square().mean(-2, keepdim=True).detach().sqrt()
+    alike = spread <= 4 * torch.finfo(forecast.dtype).eps * forecast.abs().amax(-2, keepdim=True).detach()
+    forecast_anomalies = torch.where(alike, 0, forecast_anomalies)
     shift = damping * (smoothed - forecast)
     if dim < size:
         cross = forecast_anomalies.mT @ anomalies
         return ensemble + shift @ semidefinite_solve(forecast_anomalies.mT @ forecast_anomalies, cross)
     # In units of the spread, so that metres and milliradians count alike. The anomalies sum to zero: the eigenvalue of
     # the vector of ones is free, and at the mean of the diagonal the system keeps its digits.
-    spread = forecast_anomalies.square().mean(-2, keepdim=True).detach().sqrt()
-    scale = torch.where(spread > 0, 1 / torch.where(spread > 0, spread, 1), 0)
+    scale = torch.where(alike, 0, 1 / torch.where(alike, 1, spread))
     scaled = forecast_anomalies * scale
     gram = scaled @ scaled.mT
     level = gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+    level = torch.where(level > 0, level, 1)  # members without any spread: nothing is learned, and nothing is singular
     ridge = 10 * size * torch.finfo(gram.dtype).eps
     identity = torch.eye(size, dtype=gram.dtype, device=gram.device)
     factor = cholesky(gram + level * (1 / size + ridge * identity))

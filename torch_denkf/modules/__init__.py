@@ -30,6 +30,7 @@ from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, Unicyc
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.sensor_weights import SensorAttention, SensorWeights, WeightedNoise
+from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -72,6 +73,7 @@ __all__ = [
     "FromSensor",
     "EnsembleAnalysis",
     "LocalEnsembleAnalysis",
+    "ShardedEnsembleAnalysis",
     "MomentPrior",
     "LinearTransition",
     "KalmanAnalysis",

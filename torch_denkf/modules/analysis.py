@@ -128,7 +128,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         if self.inflation != 1.0:
             inflated = inflate(ensemble, self.inflation)
             if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
-                inflated = torch.where(observed.any(-1)[..., None, None], inflated, ensemble)
+                inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean = ensemble_mean(ensemble)
         cov = (ensemble_cov(ensemble),) if self.covariance else ()
@@ -154,6 +154,10 @@ class EnsembleAnalysis(EnsembleUpdate):
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
         moved = self._analyse(past.flatten(-2), predicted, observation, variance, observed, noise, taper)
         return moved.ensemble.unflatten(-1, past.shape[-2:])
+
+    def _any(self, observed):
+        """Where anything is observed, ``[*B]``."""
+        return observed.any(-1)
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, taper) -> Analysis:
         if self.scheme == "perturbed" and noise is None:

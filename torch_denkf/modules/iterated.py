@@ -9,8 +9,9 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var, inflate, iterated_smoothing, random_rotation
-from torch_denkf.modules._base import Call, Entries, SubModel, random_parts, reads, run_module
+from torch_denkf.modules._base import Call, Entries, SubModel, check_module, random_parts, reads, run_module
 from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.past import InPlaceOf, copy_sizes
@@ -37,6 +38,7 @@ class WithSmoothed(InPlaceOf):
     """
 
     def __init__(self, initial: TensorDictModuleBase, *, belief_key: str = "belief", smoothed_key: str = "smoothed"):
+        check_module("initial", initial)
         needed, optional = reads(initial)
         own = [(smoothed_key, name) for name in _SMOOTHED]
         super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
@@ -99,6 +101,10 @@ class IteratedAnalysis(SubModel):
         smoothed_key: str = "smoothed",
         info_key: str = "info",
     ):
+        check_module("transition", transition)
+        check_module("observation", observation)
+        check_count("iterations", iterations)
+        check_number("inflation", inflation, above=0)
         _refuse_other_noise(transition, observation)
         self_made = [ensemble_key, *map(unravel_key, transition.out_keys)]
         further, optional = further_keys([transition, observation], [*self_made, sensor_key, noise_variance_key])

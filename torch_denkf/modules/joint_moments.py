@@ -8,28 +8,26 @@ is that of readings in their order.
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional import smoothing_gain
-from torch_denkf.modules._base import SubModel, reads, run_module
-from torch_denkf.modules.past import InPlaceOf, check_positive_lag, copy_sizes
+from torch_denkf.modules._base import SubModel, run_module
+from torch_denkf.modules.past import WithPast
 
 __all__ = ["JointForecast", "PresentOfJoint", "WithJointMoments"]
 
-_SMOOTHED = ("mean", "cov", "var", "age")
 
-
-class WithJointMoments(InPlaceOf):
+class WithJointMoments(WithPast):
     """An initial mean and covariance with a past: L states that are the first one.
 
     Args:
-        initial: writes ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "cov")`` ``[*B, S, S]``.
-        lag: L. Under ``("belief", "joint_mean")`` ``[*B, (L + 1) S]`` and ``("belief", "joint_cov")`` stand the
-            present and the past states, the latest first; under ``("smoothed", ...)`` the oldest, see
-            :class:`LaggedMoments`.
+        initial: writes ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]``.
+        lag: L.
         age: see :class:`WithEnsemblePast`.
+        belief_key: prefix of what ``initial`` writes, and of ``joint_mean`` ``[*B, (L + 1) S]`` and ``joint_cov`` of the
+            present and the past states, the latest first.
+        smoothed_key: prefix of ``mean``, ``cov``, ``var`` and ``age`` of the oldest, see :class:`LaggedMoments`.
 
     Raises:
         ValueError: if ``lag`` is not positive.
@@ -42,23 +40,18 @@ class WithJointMoments(InPlaceOf):
         torch.Size([8, 8])
     """
 
-    def __init__(self, initial: TensorDictModuleBase, lag: int, *, age: int = 0):
-        check_positive_lag(lag)
-        needed, optional = reads(initial)
-        own = [("belief", "joint_mean"), ("belief", "joint_cov"), *(("smoothed", name) for name in _SMOOTHED)]
-        super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
-        self.lag, self.age = lag, age
-        copy_sizes(initial, self)
+    PAST = ("joint_mean", "joint_cov")
+    SMOOTHED = ("mean", "cov", "var", "age")
 
     def on_entries(self, entries, call):
         """The belief and its past."""
         written = run_module(self.module, entries, call)
-        mean, cov = written["belief", "mean"], written["belief", "cov"]
+        mean, cov = written[self.belief_key, "mean"], written[self.belief_key, "cov"]
         count = self.lag + 1
         joint = mean.repeat(*[1] * len(call.batch_size), count), cov.repeat(*[1] * len(call.batch_size), count, count)
         age = torch.full((*call.batch_size, 1), self.age, device=mean.device)
         own = (*joint, mean, cov, cov.diagonal(dim1=-2, dim2=-1), age)
-        return {**written, **dict(zip(map(unravel_key, self.out_keys[-6:]), own, strict=True))}
+        return {**written, **dict(zip(self._own, own, strict=True))}
 
 
 class JointForecast(SubModel):
@@ -99,7 +92,7 @@ class PresentOfJoint(SubModel):
 
     def __init__(self, size: int, joint_key: str = "joint"):
         out_keys: list[NestedKey] = [("belief", name) for name in ("mean", "cov", "var", "joint_mean", "joint_cov")]
-        out_keys += [("smoothed", name) for name in _SMOOTHED]
+        out_keys += [("smoothed", name) for name in WithJointMoments.SMOOTHED]
         super().__init__(nn.Identity(), [(joint_key, "mean"), (joint_key, "cov"), ("smoothed", "age")], out_keys)
         self.size = size
 

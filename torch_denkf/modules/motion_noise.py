@@ -39,7 +39,7 @@ class NoisyTransition(SubModel):
 
     Raises:
         KeyError: if an entry is missing.
-        ValueError: if ``noise`` does not write one variance for each dimension.
+        ValueError: if ``noise`` does not write one variance for each dimension, or ``dims`` names one twice.
 
     Reference:
         Learned motion noise of a particle filter: Jonschkowski, Rastogi & Brock 2018, arXiv:1805.11122 (there a
@@ -81,7 +81,7 @@ class NoisyTransition(SubModel):
         )
         self.log_weight_key = unravel_key(log_weight_key)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
-        check_dims("dims", dims or ())
+        check_dims("dims", dims or (), once=True)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):

@@ -225,7 +225,7 @@ class MemberGain(SubModel):
         """The samples, each with its member's gain."""
         if samples.shape[-2:] != self.quantiles.shape:
             raise ValueError(
-                f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}]; "
-                f"{self.in_keys[0]!r} has shape {list(samples.shape)}."
+                f"MemberGain was made for samples [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
+                f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(samples.shape)}."
             )
         return samples * (self.log_std.exp() * self.quantiles).exp()

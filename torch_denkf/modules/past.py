@@ -9,17 +9,21 @@ The past of the first steps of an episode is the episode's first state.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
+from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel, named_modules_of, reads, run_module
+from torch_denkf.modules._base import SubModel, check_module, named_modules_of, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 
-__all__ = ["EnsemblePast", "LaggedAnalysis", "LaggedBelief", "WithEnsemblePast"]
+__all__ = ["EnsemblePast", "LaggedAnalysis", "LaggedBelief", "WithEnsemblePast", "WithPast"]
 
 
 class InPlaceOf(SubModel):
@@ -41,7 +45,44 @@ class InPlaceOf(SubModel):
         return self.module.parts() if isinstance(self.module, SubModel) else {}
 
 
-class WithEnsemblePast(InPlaceOf):
+class WithPast(InPlaceOf):
+    """An initial belief, its past and what is smoothed of it; a subclass says which entries these are.
+
+    Args:
+        initial: writes the belief.
+        lag: L.
+        age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
+            updated with its own frame.
+        belief_key: prefix of the belief and of its past.
+        smoothed_key: prefix of what is smoothed.
+
+    Raises:
+        ValueError: if ``lag`` is not positive.
+    """
+
+    #: Last names of the past's entries, and of the smoothed ones.
+    PAST: ClassVar[tuple[str, ...]] = ()
+    SMOOTHED: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(
+        self,
+        initial: TensorDictModuleBase,
+        lag: int,
+        *,
+        age: int = 0,
+        belief_key: str = "belief",
+        smoothed_key: str = "smoothed",
+    ):
+        check_positive_lag(lag)
+        check_module("initial", initial)
+        needed, optional = reads(initial)
+        own = [*((belief_key, name) for name in self.PAST), *((smoothed_key, name) for name in self.SMOOTHED)]
+        super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
+        self.lag, self.age, self.belief_key, self._own = lag, age, belief_key, list(map(unravel_key, own))
+        copy_sizes(initial, self)
+
+
+class WithEnsemblePast(WithPast):
     """An initial belief with a past: L copies of its members.
 
     Args:
@@ -63,31 +104,18 @@ class WithEnsemblePast(InPlaceOf):
         torch.Size([4, 3, 1])
     """
 
-    def __init__(
-        self,
-        initial: TensorDictModuleBase,
-        lag: int,
-        *,
-        age: int = 0,
-        belief_key: str = "belief",
-        smoothed_key: str = "smoothed",
-    ):
-        check_positive_lag(lag)
-        needed, optional = reads(initial)
-        own = [(belief_key, "past"), *((smoothed_key, name) for name in ("ensemble", "mean", "var", "age"))]
-        super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
-        self.lag, self.age = lag, age
-        self.ensemble_key, self.log_weight_key = (belief_key, "ensemble"), (belief_key, "log_weight")
-        copy_sizes(initial, self)
+    PAST = ("past",)
+    SMOOTHED = ("ensemble", "mean", "var", "age")
 
     def on_entries(self, entries, call):
         """The belief and its past."""
         written = run_module(self.module, entries, call)
-        ensemble, log_weight = written[self.ensemble_key], written.get(self.log_weight_key)
+        ensemble = written[self.belief_key, "ensemble"]
+        log_weight = written.get((self.belief_key, "log_weight"))
         past = ensemble.unsqueeze(-2).repeat_interleave(self.lag, -2)
         age = torch.full((*call.batch_size, 1), self.age, device=ensemble.device)
         own = (past, ensemble, *moments_of(ensemble, log_weight), age)
-        return {**written, **dict(zip(map(unravel_key, self.out_keys[-5:]), own, strict=True))}
+        return {**written, **dict(zip(self._own, own, strict=True))}
 
 
 class EnsemblePast(SubModel):
@@ -205,8 +233,14 @@ class LaggedBelief(SubModel):
 
     def compute(self, past, age, log_weight=None):
         """The past, and the belief of its oldest state."""
+        check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
         return past, ensemble, *moments_of(ensemble, log_weight), (age + 1).clamp(max=past.shape[-2])
+
+
+def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
+    """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
+    check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
 
 
 def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -218,9 +252,8 @@ def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple
 
 
 def check_positive_lag(lag: int) -> None:
-    """Raise ``ValueError`` unless there is something to look back at."""
-    if lag < 1:
-        raise ValueError(f"lag counts the steps to look back, at least 1; got {lag}.")
+    """Raise unless there is something to look back at."""
+    check_count("lag", lag, cure="It counts the steps to look back")
 
 
 def copy_sizes(initial: nn.Module, owner: nn.Module) -> None:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import smoothing_gain
 from torch_denkf.modules._base import SubModel, reads, run_module
 from torch_denkf.modules._gaussian import GaussianTransition
 from torch_denkf.modules.kalman import LinearTransition
-from torch_denkf.modules.past import InPlaceOf, check_positive_lag, copy_sizes
+from torch_denkf.modules.past import InPlaceOf, WithPast, check_age
 
 __all__ = ["CrossTransition", "LaggedMoments", "MomentsPast", "WithMomentsPast"]
 
@@ -62,7 +61,7 @@ class CrossTransition(InPlaceOf):
         return {**written, unravel_key(self.out_keys[-1]): cross}
 
 
-class WithMomentsPast(InPlaceOf):
+class WithMomentsPast(WithPast):
     """An initial mean and covariance with a past: L copies of them.
 
     Args:
@@ -84,21 +83,8 @@ class WithMomentsPast(InPlaceOf):
         torch.Size([3, 2, 2])
     """
 
-    def __init__(
-        self,
-        initial: TensorDictModuleBase,
-        lag: int,
-        *,
-        age: int = 0,
-        belief_key: str = "belief",
-        smoothed_key: str = "smoothed",
-    ):
-        check_positive_lag(lag)
-        needed, optional = reads(initial)
-        own = [*((belief_key, name) for name in _PAST), *((smoothed_key, name) for name in _SMOOTHED)]
-        super().__init__(initial, needed, [*initial.out_keys, *own], optional_keys=optional)
-        self.lag, self.age, self.belief_key = lag, age, belief_key
-        copy_sizes(initial, self)
+    PAST = _PAST
+    SMOOTHED = ("mean", "cov", "var", "age")
 
     def on_entries(self, entries, call):
         """The belief and its past: the state itself, of which nothing is left open."""
@@ -108,10 +94,7 @@ class WithMomentsPast(InPlaceOf):
         past = [torch.stack([value] * self.lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
         age = torch.full((*call.batch_size, 1), self.age, device=mean.device)
         own = (*past, mean, cov, cov.diagonal(dim1=-2, dim2=-1), age)
-        return {**written, **dict(zip(map(unravel_key, self.out_keys[-7:]), own, strict=True))}
-
-
-_SMOOTHED = ("mean", "cov", "var", "age")
+        return {**written, **dict(zip(self._own, own, strict=True))}
 
 
 class MomentsPast(SubModel):
@@ -138,6 +121,7 @@ class MomentsPast(SubModel):
 
     def compute(self, mean, cov, forecast_cov, cross, past_mean, past_cov, past_gain, age):
         """The past."""
+        check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
         identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
@@ -171,7 +155,8 @@ class LaggedMoments(SubModel):
     ):
         in_keys = [(belief_key, "mean"), (belief_key, "cov"), (forecast_key, "mean")]
         in_keys += [*((past_key, name) for name in ("mean", "cov", "gain")), (smoothed_key, "age")]
-        out_keys = [*((belief_key, name) for name in _PAST), *((smoothed_key, name) for name in _SMOOTHED)]
+        out_keys = [(belief_key, name) for name in WithMomentsPast.PAST]
+        out_keys += [(smoothed_key, name) for name in WithMomentsPast.SMOOTHED]
         super().__init__(nn.Identity(), in_keys, out_keys)
 
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_count
+from torch_denkf._checks import check_count, has_values
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._tensors import as_vector, register_location, register_scale
 from torch_denkf.modules._trunk import activation_bytes, couples_frames, in_chunks, reduced_precision
@@ -233,10 +233,9 @@ class ImageSensor(_Sensor):
         return measurement
 
     def _look(self, pixels: torch.Tensor) -> None:
-        try:
-            largest = float(pixels.detach().abs().nan_to_num().max())
-        except RuntimeError:  # no pixels, or under vmap, where a number has no value
+        if not pixels.numel() or not has_values(pixels):
             return
+        largest = float(pixels.detach().abs().nan_to_num().max())
         self._looked = largest > 0  # specs are tried out on zeros
         if largest > _TOO_BRIGHT:
             warnings.warn(

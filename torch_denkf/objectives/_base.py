@@ -38,7 +38,8 @@ class FilterLoss(LossModule):
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score, or a scale that is not positive, or infinite in all dimensions.
+        ValueError: on an unknown score, or a scale that is not positive, infinite in all dimensions, or of another
+            length than what is scored.
     """
 
     @dataclass
@@ -92,6 +93,8 @@ class FilterLoss(LossModule):
         for name, scale in (("state_scale", state_scale), ("observation_scale", observation_scale)):
             self.register_scale(name, scale)
             scale = getattr(self, name)
+            if scale is not None and scale.ndim > 1:
+                raise ValueError(f"{name} is one number a dimension; got {list(scale.shape)}.")
             if scale is not None and not ((scale > 0).all() and scale.isfinite().any()):
                 raise ValueError(
                     f"{name} is positive, and infinite where a dimension does not count; one must. Got {scale}."
@@ -170,9 +173,15 @@ class FilterLoss(LossModule):
         return self._scaled("observation", wrap_angles(estimate - target, self.observation_angles))
 
     def _scaled(self, name: str, errors: Tensor) -> Tensor:
-        scale = self._scale(name)
-        errors = self._counting(name, errors)
-        return errors if scale is None else errors / scale
+        scale = getattr(self, f"{name}_scale")
+        if scale is None:
+            return errors
+        if scale.numel() not in (1, errors.shape[-1]):
+            raise ValueError(
+                f"{name}_scale has {scale.numel()} entries, but {errors.shape[-1]} dimensions of the {name} are "
+                "scored; pass one entry for each"
+            )
+        return self._counting(name, errors) / self._counting(name, scale)
 
     def _scale(self, name: str) -> Tensor | None:
         """The scale of the dimensions that count."""

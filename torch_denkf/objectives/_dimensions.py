@@ -56,9 +56,19 @@ class DimensionsLoss(SequenceLoss):
             angles = [position for position, dim in enumerate(dims) if dim in angles]
         super().__init__(filter, weights, state_scale=state_scale, angles=angles, **kwargs)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
+        self._last_dim = max(dims, default=-1) if dims is not None else -1
 
     def _errors(self, estimate: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Scaled errors of the dimensions that count."""
+        """Scaled errors of the dimensions that count.
+
+        Raises:
+            ValueError: if one of ``dims`` is beyond the true state's.
+        """
+        if self._last_dim >= target.shape[-1]:
+            raise ValueError(
+                f"dims={self.dims.tolist()} names dimension {self._last_dim}, but the true state "
+                f"{self.tensor_keys.state!r} has {target.shape[-1]}, from 0; choose among these"
+            )
         estimate = estimate[..., : target.shape[-1]]
         if self.dims is not None:
             estimate, target = estimate.index_select(-1, self.dims), target.index_select(-1, self.dims)

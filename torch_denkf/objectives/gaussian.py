@@ -101,8 +101,9 @@ class GaussianLoss(DimensionsLoss):
 
     def _score(self, out: TensorDictBase, prefix: str, target: torch.Tensor) -> torch.Tensor:
         mean, cov = self._entry(out, (prefix, "mean")), self._entry(out, (prefix, "cov"))
+        errors = self._errors(mean, target)
         cov = cov[..., : target.shape[-1], : target.shape[-1]]
         if self.dims is not None:
             cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
         cov = self._counting("state", cov, -1, -2)
-        return score_gaussian(self._errors(mean, target), cov, self.score, self._scale("state"))
+        return score_gaussian(errors, cov, self.score, self._scale("state"))

@@ -109,8 +109,8 @@ class MixtureLoss(DimensionsLoss):
         weights = dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True))
         super().__init__(filter, weights, score=score, **options)
         self.register_scale("component_std", component_std)
-        if not (self.component_std > 0).all():
-            raise ValueError(f"component_std is the width of each component, positive; got {component_std}.")
+        if not ((self.component_std > 0) & self.component_std.isfinite()).all():
+            raise ValueError(f"component_std is the width of each component, positive and finite; got {component_std}.")
         dims = options.get("dims")
         if dims is not None and self.component_std.numel() not in (1, len(dims)):
             raise ValueError(f"component_std has one entry for each of dims={list(dims)}; got {component_std}.")

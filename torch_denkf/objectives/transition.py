@@ -10,6 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf._checks import check_count
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules._base import reads
@@ -37,7 +38,7 @@ class TransitionLoss(PartLoss):
             transition without noise has no spread but ``spread``: teach it by ``"mse"``.
         spread: standard deviation around the truth, in the state's units: a number or ``[S]``. Members are drawn anew
             in each call.
-        members: E; by default as many as the initial belief has.
+        members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
         state_scale: ``[S]``; errors of the state are divided by it, so that dimensions with different units count
             alike. A dimension with infinite scale does not count: means are taken over the others.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
@@ -45,8 +46,8 @@ class TransitionLoss(PartLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score, a scale that is not positive, a negative spread, a filter that carries neither
-            members nor moments, a batch without time, or slices that are not marked.
+        ValueError: on an unknown score, a scale that is not positive, a negative spread, too few members, a filter that
+            carries neither members nor moments, a batch without time, or slices that are not marked.
         KeyError: if an entry is missing.
 
     Example:
@@ -81,13 +82,17 @@ class TransitionLoss(PartLoss):
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
         self.SCORES = MEMBER_SCORES if has_members(filter, belief) else GAUSSIAN_SCORES
+        if members is not None:
+            check_count(
+                "members", members, least=1 if score == "mse" else 2, cure='One member has no spread: score it by "mse"'
+            )
         super().__init__(
             filter, {"transition": 1.0}, score=score, state_scale=state_scale, angles=angles, reduction=reduction
         )
         self.belief, self.members = belief, members_of(filter, members) if has_members(filter, belief) else None
         self.register_scale("spread", spread)
-        if not (self.spread >= 0).all():
-            raise ValueError(f"spread is a standard deviation, not negative; got {spread}.")
+        if not ((self.spread >= 0) & self.spread.isfinite()).all():
+            raise ValueError(f"spread is a standard deviation, finite and not negative; got {spread}.")
 
     def _trained(self):
         return [self.filter.transition_module]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_denkf.vision import ROAD_PITCHES, ROAD_SHIFTS, CanonicalCamera, focus_of_expansion, image_motion
 
-__all__ = ["CarCamera"]
+__all__ = ["CarCamera", "check_frame"]
 
 _WATCHED = 40  # moving pairs on which camera and calibration are judged
 _MOVING = 0.012  # mean flow, in tangents: a car that stands tells nothing
@@ -22,6 +22,18 @@ _LEAST_CORRELATION = 0.95  # of the road, median; 0.97 to 0.99 on KITTI, 0.94 an
 _LEAST_VIEW = 0.85  # share of the field of view that the sensor was trained with
 _FASTEST = 3.0  # m a pair, where the sensor's range ends
 _PITCH_MARGIN = 0.01  # rad
+
+
+def check_frame(frame: object, number: int) -> None:
+    """Raise unless this is an image as OpenCV has it.
+
+    Raises:
+        ValueError: if it is no array, or one of another shape or dtype; names the frame.
+    """
+    if not isinstance(frame, np.ndarray):
+        raise ValueError(f"frame {number} is a {type(frame).__name__}; pass an array, uint8 [H, W] or [H, W, 3]")
+    if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or (frame.ndim == 3 and frame.shape[2] != 3):
+        raise ValueError(f"frame {number} is {frame.dtype} {list(frame.shape)}; pass uint8 [H, W] or [H, W, 3]")
 
 
 class CarCamera:
@@ -67,8 +79,6 @@ class CarCamera:
 
     def image(self, frame: np.ndarray, number: int) -> np.ndarray:
         """Grey, at the training's resolution."""
-        if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or (frame.ndim == 3 and frame.shape[2] != 3):
-            raise ValueError(f"frame {number} is {frame.dtype} {list(frame.shape)}; pass uint8 [H, W] or [H, W, 3]")
         if frame.shape[:2] != self.shape:
             raise ValueError(f"frame {number} is {list(frame.shape[:2])}, the first one {list(self.shape)}")
         grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)

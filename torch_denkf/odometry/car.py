@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from tensordict.nn import TensorDictSequential
@@ -205,4 +205,7 @@ def car_filter(settings: CarSettings | None = None, **changes) -> CarFilter:
         >>> car.sequence(TensorDict(frames, [6]))["belief", "mean"].shape
         torch.Size([6, 5])
     """
+    known = [field.name for field in fields(CarSettings)]
+    if unknown := [name for name in changes if name not in known]:
+        raise TypeError(f"{', '.join(unknown)} is no setting of a car filter; there are {', '.join(known)}")
     return CarFilter(replace(settings or CarSettings(), **changes))

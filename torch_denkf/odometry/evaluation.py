@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._checks import check_number
 from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
 from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_devkit_error, kitti_endpoint_error
@@ -94,11 +95,12 @@ def evaluate_car_filter(
 
     Raises:
         FileNotFoundError: if a drive is not there.
-        ValueError: if a share, a number of draws or a window is out of range, or a drive's frame time is not that of
-            the filter.
+        ValueError: if a share, a number of draws, a window or the pitch is out of range, or a drive's frame time is not
+            that of the filter.
     """
     if not 0 <= missing < 1 or draws < 1 or window < 1:
         raise ValueError(f"missing is in [0, 1), draws and window at least 1; got {missing}, {draws} and {window}")
+    check_number("pitch", pitch, least=-0.5, most=0.5, cure="It is how far the camera looks up, in rad")
     longest, rows, beliefs = car.settings.longest, [], {}
     with progress_bar("evaluating", len(drives), unit=" drives", shown=progress) as bar:
         for name in drives:

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf._checks import read_lines
 from torch_denkf._files import clear_errors, sync
 from torch_denkf.functional import ensemble_cov
 from torch_denkf.odometry.tracking import TrackedBelief
@@ -97,16 +98,15 @@ def read_path(file: str | Path) -> TensorDict:
     file = Path(file)
     if not file.is_file():
         raise FileNotFoundError(f"no path {file}; `denkf odometry` leaves a path.csv")
-    with file.open(newline="") as stream:
-        reader = csv.DictReader(stream)
-        if missing := [name for name in PATH_COLUMNS if name not in (reader.fieldnames or ())]:
-            raise ValueError(f"{file} has no columns {', '.join(missing)}; pass a path.csv of `denkf odometry`")
-        rows = []
-        for row in reader:
-            try:
-                rows.append([float(row[name]) for name in PATH_COLUMNS])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{file}:{reader.line_num}: expected {len(PATH_COLUMNS)} numbers ({error})") from error
+    reader = csv.DictReader(read_lines(file))
+    if missing := [name for name in PATH_COLUMNS if name not in (reader.fieldnames or ())]:
+        raise ValueError(f"{file} has no columns {', '.join(missing)}; pass a path.csv of `denkf odometry`")
+    rows = []
+    for row in reader:
+        try:
+            rows.append([float(row[name]) for name in PATH_COLUMNS])
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{file}:{reader.line_num}: expected {len(PATH_COLUMNS)} numbers ({error})") from error
     if not rows:
         raise ValueError(f"{file} has no rows")
     table = torch.tensor(rows, dtype=torch.float64)

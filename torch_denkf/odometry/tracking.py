@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import check_number
-from torch_denkf.odometry.camera import CarCamera
+from torch_denkf.odometry.camera import CarCamera, check_frame
 from torch_denkf.odometry.car import VELOCITIES, CarFilter
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
 
@@ -113,11 +113,17 @@ def track(
         raise ValueError("pass times or fps, not both")
     if fps is not None and not 0 < fps < np.inf:
         raise ValueError(f"fps is the number of frames in a second; got {fps}")
-    if black_level is not None:
-        if not 0 <= black_level <= 255:
-            raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
-        frames = (None if frame is None or _is_black(frame, black_level) else frame for frame in frames)
-    return _track(car, frames, calibration, times, fps, height, pitch, seed)
+    if black_level is not None and not 0 <= black_level <= 255:
+        raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
+    return _track(car, _seen(frames, black_level), calibration, times, fps, height, pitch, seed)
+
+
+def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Iterator[np.ndarray | None]:
+    """The frames, ``None`` for those that are missing or black."""
+    for number, frame in enumerate(frames):
+        if frame is not None:
+            check_frame(frame, number)
+        yield None if frame is None or (black_level is not None and _is_black(frame, black_level)) else frame
 
 
 def _is_black(frame: np.ndarray, level: int) -> bool:
@@ -149,8 +155,9 @@ def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterato
         if run is None:
             continue
         if step - done > _LONGEST_GAP:
+            told = "" if times is None else f". Its time is {time:.10g}: times are in s"
             raise ValueError(
-                f"{step - done} steps without a frame before frame {number}; track what comes after the gap apart"
+                f"{step - done} steps without a frame before frame {number}; track what comes after the gap apart{told}"
             )
         for _ in range(step - done - 1):
             run.step(None, 0)
@@ -175,7 +182,10 @@ def _clock(times: Iterable[float] | None, fps: float | None, dt: float) -> tuple
     if times is None:
         period = dt if fps is None else 1 / fps
         return _Clock(dt, period), (number * period for number in count())
-    known = [float(time) for time in times]  # numbers alone: a day at 10 Hz is 7 MB
+    try:
+        known = [float(time) for time in times]  # numbers alone: a day at 10 Hz is 7 MB
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"times are those of the frames in s, a number each ({error})") from error
     period = median(after - before for before, after in pairwise(known)) if len(known) > 1 else dt
     if not all(after > before for before, after in pairwise(known)):
         at = next(n for n, (before, after) in enumerate(pairwise(known), start=1) if not after > before)

@@ -109,8 +109,8 @@ def train_car_filter(
 
     Raises:
         FileNotFoundError: if there are no drives below ``root``.
-        ValueError: if there are too few drives, drives of different frame times, windows longer than the drives, or a
-            training with other settings in ``out``.
+        ValueError: if there are too few drives, names of drives without a root, drives of different frame times,
+            windows longer than the drives, or a training with other settings in ``out``.
 
     Example:
         >>> import tempfile
@@ -121,6 +121,9 @@ def train_car_filter(
     """
     check_number("height", height, above=0, cure="It is that of the recording camera over the road, in m")
     check_count("seed", seed, least=0)
+    named = {name: list(given) for name, given in (("drives", drives), ("leave_out", leave_out)) if given}
+    if root is None and named:
+        raise ValueError(f"{named} name recorded drives, but there is no folder of them; pass root (--root), too")
     out, updates, longest = Path(out).expanduser(), updates or Updates(), CarSettings.longest
     common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache"}
     recorded = recorded_drives(root, drives, leave_out, height=height, **common) if root is not None else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -44,12 +45,15 @@ def from_pretrained(
 
     Raises:
         FileNotFoundError: if there is no filter of that name and no such folder, or the weights are missing.
+        TypeError: if ``name_or_folder`` is neither text nor a path.
         ValueError: if a file is damaged, changed, of another format, or does not fit the other; the message names it.
 
     Example:
         >>> from_pretrained("car-odometry").settings.dt
         0.103
     """
+    if not isinstance(name_or_folder, str | os.PathLike):
+        raise TypeError(f"name_or_folder is a name or a path, such as 'car-odometry'; got {name_or_folder!r}")
     folder = Path(name_or_folder).expanduser()
     if str(name_or_folder) in available():  # a folder of that name is loaded as "./car-odometry"
         folder = _WEIGHTS / str(name_or_folder)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf._checks import check_number
+
 
 def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
     """Time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
@@ -47,7 +49,8 @@ def lorenz96_step(state: Tensor, dt: float = 0.05, forcing: float | Tensor = 8.0
         The state ``dt`` later, ``[..., N]``.
 
     Raises:
-        ValueError: if there are fewer than four variables.
+        TypeError: if ``dt`` is no number.
+        ValueError: if there are fewer than four variables, or ``dt`` is not positive and finite.
 
     Examples:
         >>> import torch
@@ -55,6 +58,7 @@ def lorenz96_step(state: Tensor, dt: float = 0.05, forcing: float | Tensor = 8.0
         >>> state.shape
         torch.Size([4])
     """
+    check_number("dt", dt, above=0, cure="It is a step in time units, such as 0.05")
     k1 = lorenz96_tendency(state, forcing)
     k2 = lorenz96_tendency(state + dt / 2 * k1, forcing)
     k3 = lorenz96_tendency(state + dt / 2 * k2, forcing)

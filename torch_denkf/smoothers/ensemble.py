@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
 from torch_denkf.filters._structure import submodels
 from torch_denkf.functional import enrts_smooth
@@ -30,7 +31,8 @@ class EnRTS(Smoother):
 
     Raises:
         TypeError: for a filter without an ensemble.
-        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own.
+        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own; or a
+            damping that is not in (0, 1].
 
     Reference:
         Raanes, "On the ensemble Rauch-Tung-Striebel smoother and its equivalence to the ensemble Kalman smoother",
@@ -48,7 +50,9 @@ class EnRTS(Smoother):
     def __init__(self, filter: Filter, lag: int | None = None, *, damping: float = 1.0):
         kind, prefix = kind_of(filter)
         if kind != "ensemble":
-            raise TypeError(f"EnRTS smooths an ensemble; {type(filter).__name__} carries {filter.carry_keys}.")
+            raise TypeError(
+                f"EnRTS takes a filter with an ensemble; {type(filter).__name__} carries {filter.carry_keys}."
+            )
         if any(getattr(part, "rotate", False) for part in submodels(filter)):
             raise ValueError(
                 "An analysis with rotate=True gives each member another's place, so that EnRTS cannot tell what a "
@@ -56,6 +60,7 @@ class EnRTS(Smoother):
             )
         keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
+        check_number("damping", damping, above=0, most=1, cure="It is a factor on each gain")
         self.damping = damping
 
     def _smooth(self, entries, follows, out):
@@ -94,7 +99,9 @@ class EnKS(Smoother):
     def __init__(self, filter: Filter, lag: int | None = None):
         kind, self.prefix = kind_of(filter)
         if kind != "ensemble":
-            raise TypeError(f"EnKS smooths an ensemble; {type(filter).__name__} carries {filter.carry_keys}.")
+            raise TypeError(
+                f"EnKS takes a filter with an ensemble; {type(filter).__name__} carries {filter.carry_keys}."
+            )
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
         self._filter_for(2)  # refuses what a lag cannot be added to

@@ -114,6 +114,8 @@ def kind_of(filter: Filter) -> tuple[str, str]:
     Raises:
         TypeError: for a filter that cannot be smoothed.
     """
+    if not isinstance(filter, Filter):
+        raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
     carry = [key for key in filter.carry_keys if isinstance(key, tuple) and len(key) == 2]
     transition = filter.transition_module
     for prefix in dict.fromkeys(key[0] for key in carry):

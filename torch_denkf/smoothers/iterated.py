@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.modules import NoisyTransition, as_process_noise
+from torch_denkf.modules._base import check_module
 from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
 
 __all__ = ["IEnKS"]
@@ -85,6 +86,9 @@ class IEnKS(Filter):
             raise ValueError("IEnKS corrects the state before a step: the first frame has none, so no update_at_reset.")
         if observation_key is None and sensor is None:
             raise ValueError("Without a sensor, say where the reading is: observation_key=...")
+        check_module("noise", noise)
+        if sensor is not None:
+            check_module("sensor", sensor)
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
         reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key

@@ -62,7 +62,9 @@ class ParticleSmoother(Smoother):
         kind, prefix = kind_of(filter)
         transition = filter.transition_module
         if kind != "particles" or not isinstance(transition, ResampledTransition):
-            raise TypeError(f"ParticleSmoother smooths particles; {type(filter).__name__} carries {filter.carry_keys}.")
+            raise TypeError(
+                f"ParticleSmoother takes a filter with particles; {type(filter).__name__} carries {filter.carry_keys}."
+            )
         motion = transition.module
         if not isinstance(motion, NoisyTransition) or motion.before or motion.dims is not None:
             raise TypeError(

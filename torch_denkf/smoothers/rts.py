@@ -45,7 +45,9 @@ class RTSSmoother(Smoother):
     def __init__(self, filter: Filter, lag: int | None = None):
         kind, prefix = kind_of(filter)
         if kind != "moments":
-            raise TypeError(f"RTSSmoother smooths a mean and a covariance; {type(filter).__name__} has an ensemble.")
+            raise TypeError(
+                f"RTSSmoother takes a filter with a mean and a covariance; {type(filter).__name__} has none."
+            )
         self.place = filter.structure.transition[0]
         forecast = filter.structure.forecast_of[prefix, "mean"][0]
         self.cross_key = (forecast, "cross")

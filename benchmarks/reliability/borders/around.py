@@ -30,7 +30,7 @@ from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
 from torch_denkf import envs, objectives, odometry, transforms, vision
 from torch_denkf.data import Episode, EpisodeReplay, bridge_gaps
-from torch_denkf.functional import sigma_points
+from torch_denkf.functional import sigma_points, unscented_moments, unscented_weights
 from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 NAN = float("nan")
@@ -231,6 +231,17 @@ def _tracked(**given: Any) -> Any:
     return list(odometry.track(car, **settings))
 
 
+def _no_moments(points: torch.Tensor) -> bool:
+    """What functions of tensors promise where an element of a batch has no result: that it is NaN, and no other one.
+
+    They look at no values, which under ``torch.compile`` and on a GPU would cost more than they do. Of sigma points
+    without a covariance nothing finite may be left in their moments.
+    """
+    moments = unscented_moments(points, unscented_weights(2))
+    sound = sigma_points(torch.zeros(2), torch.eye(2))
+    return all(bool(value[1].isnan().all()) for value in moments) and torch.equal(points[0], sound)
+
+
 def _car() -> list[Subject]:
     frame = np.zeros((24, 72, 3), np.uint8)
     frames = {
@@ -298,16 +309,18 @@ def _car() -> list[Subject]:
         Subject(
             "sigma_points",
             sigma_points,
-            lambda: {"mean": torch.zeros(2), "cov": torch.eye(2)},
+            lambda: {"mean": torch.zeros(2, 2), "cov": torch.eye(2).expand(2, 2, 2)},
             {
                 "cov": {
-                    "negative": -torch.eye(2),
-                    "nan": torch.full((2, 2), NAN),
-                    "a row more": torch.eye(3, 2),
+                    "negative": torch.stack([torch.eye(2), -torch.eye(2)]),
+                    "indefinite": torch.stack([torch.eye(2), torch.tensor([[1.0, 2.0], [2.0, 1.0]])]),
+                    "nan": torch.stack([torch.eye(2), torch.full((2, 2), NAN)]),
+                    "a row more": torch.eye(3, 2).expand(2, 3, 2),
                 },
                 "alpha": {"zero": 0.0, "nan": NAN},
                 "kappa": {"minus the dimension": -2.0, "nan": NAN},
             },
+            right={"cov": _no_moments},
         ),
         Subject(
             "lorenz96_step",

@@ -206,6 +206,12 @@ def _read(
             f"{poses_file} has {len(poses)} poses, for frames 0 to {len(poses) - 1}, but the first image in "
             f"{folder / camera} is number {min(files)}; the first pose row belongs to frame 000000"
         )
+    if len(numbers) < len(files):
+        warnings.warn(
+            f"{poses_file} has {len(poses)} poses; {len(files) - len(numbers)} of {len(files)} images in "
+            f"{folder / camera} come after them and are left out. Is the file cut?",
+            stacklevel=4,
+        )
     first, last = min(numbers), max(numbers)
     rows = last - first + 1
     clock = read_times(folder / "times.txt", last + 1)

@@ -15,6 +15,7 @@ from torch_denkf._checks import read_lines
 from torch_denkf._files import replacing
 
 FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart
+LONGEST_FOCAL = 1e6  # pixels: a view of a minute of arc
 ROTATION = 0.01  # how far R R^T may be from I: files of two digits pass
 
 
@@ -107,7 +108,8 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: where the camera's row is missing or malformed, or a focal length is not positive.
+        ValueError: where the camera's row is missing or malformed, a focal length is not positive, or no camera has
+            such numbers.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no calibration at {file}; expected rows 'P0: ...' to 'P3: ...' of 12 numbers")
@@ -116,10 +118,15 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
         words = line.split()
         if words and words[0] == key:
             matrix = _numbers(words[1:], 12, f"{file}:{number}", "a 3x4 projection matrix, row by row")
-            if min(matrix[0], matrix[5]) <= 0:
+            if not 0 < min(matrix[0], matrix[5]) <= max(matrix[0], matrix[5]) <= LONGEST_FOCAL:
                 raise ValueError(
-                    f"{file}:{number}: the focal lengths fx and fy must be positive pixels, got {matrix[0]:g} and "
-                    f"{matrix[5]:g}; they are the first and the sixth number of {key!r}"
+                    f"{file}:{number}: the focal lengths fx and fy must be positive pixels, up to {LONGEST_FOCAL:g}, "
+                    f"got {matrix[0]:g} and {matrix[5]:g}; they are the first and the sixth number of {key!r}"
+                )
+            if max(abs(matrix[2]), abs(matrix[6])) > LONGEST_FOCAL:
+                raise ValueError(
+                    f"{file}:{number}: the principal point ({matrix[2]:g}, {matrix[6]:g}) is in pixels, up to "
+                    f"{LONGEST_FOCAL:g} from the corner; cx and cy are the third and the seventh number of {key!r}"
                 )
             return matrix[[0, 5, 2, 6]]
     raise ValueError(f"{file} has no row {key!r}, the projection of {camera}; add it or choose another camera")

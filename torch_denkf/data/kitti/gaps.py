@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf._checks import check_count
 from torch_denkf.data.kitti.clock import GAP
 
 __all__ = ["bridge_gaps", "steps_between"]
@@ -28,7 +29,8 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
         begins; 0 where the frame is missing, or none is there before it within reach.
 
     Raises:
-        ValueError: if ``longest`` is not positive.
+        TypeError: if ``longest`` is no whole number.
+        ValueError: if it is not positive.
 
     No pair reaches over a gap in the drive's times, which shows in its ``"dt"``.
 
@@ -37,8 +39,7 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
         >>> bridge_gaps(drive)["steps"].flatten().tolist()
         [0, 1, 0, 0, 3, 1, 0, 0, 0, 0]
     """
-    if longest < 1:
-        raise ValueError(f"longest counts the steps between the frames of a pair, at least 1; got {longest}")
+    check_count("longest", longest, cure="It counts the steps between the frames of a pair")
     steps = steps_between(drive["frame_valid"].squeeze(-1), longest)
     after = after_gap(drive)
     if after is not None:

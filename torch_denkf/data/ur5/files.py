@@ -30,6 +30,7 @@ from torch_denkf.simulation.ur5.names import DOMAIN_NAMES, TASKS
 
 COLLECTION = "collection.json"
 MANIFEST = "demos.jsonl"
+PATTERN = "demo-*.npz"
 COMMAND = "denkf collect-ur5"
 MOST_BYTES = 1 << 32  # of one demo, unpacked: 350 pictures of 2,000 x 2,000
 _MOST_ROWS = 10**6  # of one demo

@@ -164,7 +164,7 @@ def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> Tenso
     return torch.stack(parts)
 
 
-def _behind_sensor(model: UR5TableFilter) -> Filter:
+def behind_sensor(model: UR5TableFilter) -> Filter:
     """The same filter for readings that the sensor has made before."""
     names = [name for name in model.module if name != "sensor"]
     parts = {name: model[name] for name in names}
@@ -179,7 +179,7 @@ def _train_filter(
     out: Path,
     trainer: dict[str, Any],
 ) -> None:
-    behind = _behind_sensor(model)
+    behind = behind_sensor(model)
     loss = DEnKFLoss(behind, state=1.0, transition=0.5, sensor=0.0, state_scale=UNIT)
 
     def sample(generator: torch.Generator, _):
@@ -232,7 +232,7 @@ def evaluate_ur5_table(
     readings = read_demos(model, whole)
     generator = torch.Generator().manual_seed(0)
     readings["observed"] = torch.rand(*readings.shape, 1, generator=generator) >= missing
-    out = _believe(_behind_sensor(model), readings)
+    out = _believe(behind_sensor(model), readings)
     truth = out["state"]
     estimates: Sequence[tuple[str, Tensor]] = [
         ("filter", out["belief", "mean"]),

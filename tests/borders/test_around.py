@@ -1,0 +1,185 @@
+"""What losses, smoothers, cars, replays and saved folders refuse: the message names the argument and has its value."""
+
+import hashlib
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
+
+from tests.borders.test_constructors import NAN, refuses
+from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.particle_for_tests import bootstrap
+from torch_denkf.data import Episode, EpisodeReplay, bridge_gaps
+from torch_denkf.deployment.folder import WEIGHTS, load_folder, save_folder
+from torch_denkf.envs import ReplayEnv
+from torch_denkf.modules import LearnedTransition, MemberGain, NoisyTransition
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
+from torch_denkf.odometry import car_filter, evaluate_car_filter, track, train_car_filter
+from torch_denkf.pretrained import from_pretrained, save_pretrained
+from torch_denkf.simulation.lorenz96 import lorenz96_step
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
+
+INF = math.inf
+
+
+def scored(make, **options):
+    """A loss of a batch of two dimensions."""
+    loss = make(**options)
+    return loss(TensorDict({"observation": torch.zeros(2, 3, 2), "state": torch.zeros(2, 3, 2)}, [2, 3]))
+
+
+def ensemble_loss(**options):
+    return DEnKFLoss(linear_denkf("etkf"), sensor=0.0, **options)
+
+
+def gaussian_loss(**options):
+    return GaussianLoss(linear_kalman(), sensor=0.0, **options)
+
+
+def mixture_loss(**options):
+    return MixtureLoss(bootstrap(8, resampling="soft"), **options)
+
+
+def one_step(**options):
+    return TransitionLoss(linear_denkf("etkf"), **options)
+
+
+LOSSES = [
+    *[(make, {"state_scale": [1.0] * 3}, "3 entries", "2 dimensions") for make in (ensemble_loss, gaussian_loss)],
+    *[(make, {"state_scale": [1.0] * 3}, "3 entries", "2 dimensions") for make in (mixture_loss, one_step)],
+    (gaussian_loss, {"state_scale": torch.ones(2, 3)}, "one number a dimension", "[2, 3]"),
+    (gaussian_loss, {"state_scale": [1.0, INF, 1.0]}, "3 entries"),
+    (gaussian_loss, {"dims": [0, 2]}, "[0, 2]", "has 2"),
+    (mixture_loss, {"dims": [5]}, "[5]", "has 2"),
+    (mixture_loss, {"component_std": INF}, "got inf"),
+    (one_step, {"spread": INF}, "got inf"),
+    (one_step, {"members": 0}, "got 0"),
+    (one_step, {"members": 1}, "got 1", "mse"),
+]
+
+
+@pytest.mark.parametrize("case", LOSSES, ids=lambda case: f"{case[0].__name__}-{case[1]}")
+def test_losses(case):
+    make, options, *words = case
+    refuses(lambda: scored(make, **options), *options, *words)
+
+
+def test_a_scale_of_one_number_and_one_member_for_the_mean_pass():
+    one, two = (scored(gaussian_loss, state_scale=scale)["loss_state"] for scale in ([2.0], [2.0, 2.0]))
+    assert torch.equal(one, two)
+    assert scored(one_step, members=1, score="mse")["loss_transition"].isfinite()
+
+
+STILL = LearnedTransition(torch.nn.Linear(2, 2))
+NOISE = linear_denkf("etkf")["noise"]
+REFUSED = {
+    "a dimension twice": (lambda: NoisyTransition(STILL, NOISE, [0, 0]), "dims", "[0, 0]"),
+    "lag": (lambda: RTSSmoother(linear_kalman(), -1), "lag", "got -1"),
+    "no lag": (lambda: FixedLag(linear_kalman(), 0), "lag", "got 0"),
+    "damping": (lambda: EnRTS(linear_denkf("etkf"), damping=1.5), "damping", "got 1.5"),
+    "gaps": (lambda: bridge_gaps(TensorDict({}), 0), "longest", "got 0"),
+    "step": (lambda: lorenz96_step(torch.zeros(4), dt=-0.05), "dt", "got -0.05"),
+    "step nan": (lambda: lorenz96_step(torch.zeros(4), dt=NAN), "dt", "got nan"),
+    "pitch": (lambda: evaluate_car_filter(None, "nowhere", ["00"], pitch=NAN), "pitch", "got nan"),
+    "no root": (lambda: train_car_filter("out", rendered=3, leave_out=["09"]), "{'leave_out': ['09']}", "--root"),
+}
+WRONG_TYPES = {
+    "lag": (lambda: RTSSmoother(linear_kalman(), 1.5), "lag", "1.5"),
+    "lag, text": (lambda: EnKS(linear_denkf("etkf"), "x"), "lag", "'x'"),
+    "filter": (lambda: FixedLag(None, 2), "filter", "None"),
+    "gaps": (lambda: bridge_gaps(TensorDict({}), 1.5), "longest", "1.5"),
+    "settings": (lambda: car_filter(colour="red"), "colour", "dt"),
+    "a number for a name": (lambda: from_pretrained(3), "name_or_folder", "3"),
+    "text for settings": (
+        lambda: save_pretrained(torch.nn.Linear(1, 1), "nowhere", builder="x", settings="x"),
+        "settings",
+        "'x'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+def test_refused(case):
+    refuses(*case)
+
+
+@pytest.mark.parametrize("case", WRONG_TYPES.values(), ids=WRONG_TYPES)
+def test_wrong_types(case):
+    refuses(*case, error=TypeError)
+
+
+@pytest.mark.parametrize("make", [RTSSmoother, EnRTS, EnKS, ParticleSmoother])
+def test_smoothers_of_another_belief(make):
+    other = linear_denkf("etkf") if make is RTSSmoother else linear_kalman()
+    with pytest.raises(TypeError, match=f"{make.__name__} takes a filter with"):
+        make(other)
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (2,)])
+@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
+def test_an_age_of_another_shape(make, shape):
+    filter = FixedLag(make(), 2)
+    row = filter.initialise(TensorDict({"observation": torch.zeros(2, 2)}, [2]))
+    row["smoothed", "age"] = torch.zeros(shape, dtype=torch.int64)
+    with pytest.raises(ValueError, match="age of what is smoothed must be"):
+        filter.step(row)
+
+
+def test_samples_of_another_size_name_the_standard_deviations():
+    with pytest.raises(ValueError, match="entries of std"):
+        MemberGain([0.1] * 3, ensemble_size=8)(TensorDict({("sensor", "ensemble"): torch.zeros(8, 2)}))
+
+
+FRAME = np.zeros((24, 72, 3), np.uint8)
+TRACKED = {
+    "text": ({"frames": ["a", "b"]}, "frame 0 is a str"),
+    "text, looked at for black": ({"frames": [FRAME, "b"], "black_level": 3}, "frame 1 is a str"),
+    "times": ({"times": ["a", "b", "c"]}, "times are those of the frames"),
+    "a day": (
+        {"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1]},
+        "steps without a frame before frame 2.*Its time is 86400",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TRACKED.values(), ids=TRACKED)
+def test_track(case):
+    given, match = case
+    with pytest.raises(ValueError, match=match):
+        list(track(car_filter(ensemble_size=4), **{"frames": [FRAME] * 3, "calibration": (42, 42, 35, 11), **given}))
+
+
+@pytest.mark.parametrize(("asked", "error"), [("z", KeyError), (7, KeyError), (-1, KeyError), (1.5, TypeError)])
+def test_episodes(asked, error):
+    step = torch.arange(10).unsqueeze(-1)
+    rows = TensorDict({"step": step, "time": 0.1 * step, "state": torch.rand(10, 2)}, [10])
+    data = EpisodeReplay(rows, [Episode("a", 0, 10)], for_tests=lambda episode: False)
+    with pytest.raises(error, match=f"episodes= .*{asked!r}|{asked!r}.*episodes= among"):
+        ReplayEnv(data, episodes=[asked])
+
+
+@pytest.mark.parametrize("change", [lambda value: value + INF, lambda value: value.long(), lambda value: value * NAN])
+@pytest.mark.parametrize("name", ["weight", "constant"])
+def test_weights_of_another_kind(tmp_path, name, change):
+    def build():
+        model = torch.nn.Linear(2, 2)
+        model.register_buffer("constant", torch.ones(2))
+        model.register_buffer("hidden", torch.tensor([1.0, INF]))
+        return model
+
+    save_folder(build(), tmp_path, builder="line", settings={})
+    load_folder(tmp_path, {"line": build})  # where what is built is infinite, what is stored may be
+    weights = load_file(tmp_path / WEIGHTS)
+    broken = build()
+    weights[name] = change(weights[name])
+    save_folder(broken, tmp_path, builder="line", settings={})
+    save_file(weights, tmp_path / WEIGHTS)
+    config = (tmp_path / "config.json").read_text()
+    described = {**json.loads(config), "sha256": hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest()}
+    (tmp_path / "config.json").write_text(json.dumps(described))
+    with pytest.raises(ValueError, match=rf"{WEIGHTS} holds NaN, infinity or whole numbers in \['{name}'\]"):
+        load_folder(tmp_path, {"line": build})

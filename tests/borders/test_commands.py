@@ -1,0 +1,80 @@
+"""What commands refuse of words and files: the message names the option or the file."""
+
+import pytest
+
+from torch_denkf.cli.main import main
+from torch_denkf.odometry.paths import PATH_COLUMNS
+
+EMPTY = [
+    ("odometry", "--checkpoint"),
+    ("odometry", "--calibration"),
+    ("evaluate", "--checkpoint"),
+    ("evaluate", "--root"),
+    ("render-kitti", "--poses"),
+    ("train", "--out"),
+    ("collect-ur5", "--out"),
+    ("plot", "--out"),
+]
+
+
+@pytest.mark.parametrize(("command", "option"), EMPTY)
+def test_an_empty_name_is_not_the_working_folder(command, option, capsys):
+    assert main([command, option, ""]) == 2
+    assert f"error: argument {option}: must not be empty; see denkf {command} --help" in capsys.readouterr().err
+
+
+def test_numbers_that_another_option_hides(capsys):
+    assert main(["collect-ur5", "--out", "x", "--no-pixels", "--frames", "-1"]) == 2
+    assert "argument --frames: must be at least 0, got -1" in capsys.readouterr().err
+
+
+def test_drives_without_a_root(tmp_path, capsys):
+    assert main(["train", "--out", str(tmp_path), "--rendered", "3", "--test", "09"]) == 2
+    err = capsys.readouterr().err
+    assert "['09']" in err
+    assert "--root" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_images_without_poses(tmp_path, capsys):
+    (tmp_path / "sequences" / "town" / "image_2").mkdir(parents=True)
+    assert main(["evaluate", "--root", str(tmp_path)]) == 2
+    assert f"no drive below --root {tmp_path} has both images and poses; " in (err := capsys.readouterr().err)
+    assert "poses/town.txt" in err
+
+
+def row(**changed):
+    return ",".join(str(changed.get(name, 1)) for name in PATH_COLUMNS)
+
+
+@pytest.mark.parametrize("byte", [b"\xff", b"\xcf"])
+def test_a_path_that_is_no_text(tmp_path, byte, capsys):
+    file = tmp_path / "path.csv"
+    file.write_bytes(",".join(PATH_COLUMNS).encode() + b"\n" + row().encode() + byte + b"\n")
+    assert main(["plot", str(file)]) == 2
+    assert f"error: {file}:2 is no text in UTF-8 (byte 0x{byte[0]:02x})" in capsys.readouterr().err
+
+
+def test_pictures_into_a_file(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / "path.csv"
+    file.write_text("\n".join([",".join(PATH_COLUMNS), *(row(frame=k, time_s=k, x_m=k) for k in range(3))]) + "\n")
+    for out in (file, file / "below"):
+        assert main(["plot", str(file), "--out", str(out)]) == 2
+        assert f"error: [Errno {20 if out.name == 'below' else 17}] cannot write {out}/path.png" in (
+            capsys.readouterr().err
+        )
+
+
+def test_demos_that_are_not_listed(tmp_path, capsys):
+    folder = tmp_path / "demos"
+    words = ["collect-ur5", "--out", str(folder)]
+    assert main([*words, "--demos", "2", "--no-pixels", "--max-steps", "4", "--processes", "1"]) == 0
+    assert main([*words, "--verify"]) == 0
+    lines = (folder / "demos.jsonl").read_bytes()
+    half = lines.index(b"\n") + 1
+    for kept in (lines[:half], lines[: half + 30], lines[:half] + bytes(half)):
+        (folder / "demos.jsonl").write_bytes(kept)
+        capsys.readouterr()
+        assert main([*words, "--verify"]) == 1
+        assert "demo-000001.npz is not listed in demos.jsonl; the collecting command" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""What smoothers do at borders: of episodes, of masks, of the batch, of what they can be made of."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
+from tests.filters.gaussian_for_tests import directional_check
+from tests.smoothers.joint import drive, joint_beliefs
+from torch_denkf.filters import LSTMFilter
+from torch_denkf.functional import enrts_step
+from torch_denkf.modules import GaussianPrior
+from torch_denkf.odometry import car_filter
+from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
+
+KINDS = {"EnKS": EnKS, "EnKS 2": partial(EnKS, lag=2), "EnRTS": EnRTS, "EnRTS 2": partial(EnRTS, lag=2)}
+ONLINE = {**KINDS, "FixedLag": partial(FixedLag, lag=2)}
+
+
+def means(smoother, frames):
+    return smoother.sequence(frames.copy())["smoothed", "mean"]
+
+
+def noisy(smoother, frames):
+    return getattr(smoother, "filter", smoother).draw_noise(frames)
+
+
+@pytest.mark.parametrize("kind", ONLINE)
+def test_rows_of_a_batch_do_not_know_each_other(float64, kind):
+    smoother = ONLINE[kind](toy_denkf())
+    frames = noisy(smoother, toy_frames([3, 8]))
+    alone = torch.stack([means(smoother, row) for row in frames])
+    assert_close(means(smoother, frames), alone, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("at_reset", [False, True])
+@pytest.mark.parametrize("kind", ONLINE)
+def test_an_episode_that_begins_within_the_lag_begins_anew(float64, kind, at_reset):
+    smoother = ONLINE[kind](toy_denkf(update_at_reset=at_reset))
+    frames = toy_frames([2, 9], resets=False)
+    frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
+    frames["is_init"][:, [0, 4, 5]] = True  # the second episode is a single frame
+    frames = noisy(smoother, frames)
+    apart = [means(smoother, frames[:, begin:end]) for begin, end in ((0, 4), (4, 5), (5, 9))]
+    assert_close(means(smoother, frames), torch.cat(apart, 1), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+def test_nothing_is_read_for_longer_than_the_lag(float64, lag):
+    frames = drive(3, 14, missing=0.0, resets=False)
+    frames["observed"][:, 4:11] = False
+    frames["observation"][:, 4:11] = torch.nan
+    mean, cov = joint_beliefs(frames, lag)
+    out = RTSSmoother(linear_kalman(), lag)(frames.copy())
+    assert_close(out["smoothed", "mean"], mean, rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "cov"], cov, rtol=0, atol=1e-10)
+    if lag:
+        online = FixedLag(linear_kalman(), lag).sequence(frames.copy())
+        assert_close(online["smoothed", "mean"][:, lag:], mean[:, :-lag], rtol=0, atol=1e-10)
+        for smoother in (EnKS, EnRTS):  # times 3 to 8 have nothing to learn from
+            out = smoother(linear_denkf(), lag)(frames.copy())
+            blind = slice(3, 11 - lag)
+            assert_close(out["smoothed", "mean"][:, blind], out["belief", "mean"][:, blind], rtol=0, atol=1e-12)
+            assert (out["smoothed", "mean"] - out["belief", "mean"])[:, 11 - lag].abs().max() > 0.01
+
+
+@pytest.mark.parametrize("smoother", [EnKS, EnRTS, RTSSmoother])
+def test_a_lag_beyond_the_end_is_all_of_it(float64, smoother):
+    frames = drive(2, 6)
+    filter = linear_kalman() if smoother is RTSSmoother else linear_denkf()
+    assert_close(means(smoother(filter, 50), frames), means(smoother(filter), frames), rtol=0, atol=1e-12)
+    first = smoother(filter, 3)(frames[:, :1].copy())
+    assert_close(first["smoothed", "mean"], first["belief", "mean"], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("size", [2, 3, 7, 8])
+def test_members_that_are_all_alike_stay_what_they_are(float64, size):
+    """Nothing can be learned without a spread; fewer members than dimensions take another path than more."""
+    members = torch.randn(5).expand(size, 5).clone().requires_grad_()
+    smoothed = enrts_step(members, 2 * members, 2 * members + 1)
+    assert_close(smoothed, members, rtol=0, atol=0)
+    (gradient,) = torch.autograd.grad(smoothed.sum(), members)
+    assert gradient.isfinite().all()
+    still = GaussianPrior(torch.zeros(3), torch.zeros(3), ensemble_size=size)
+    filter = toy_denkf("etkf", layer="none", sensor_layer="none", ensemble_size=size, initial=still)
+    for smoother in (EnKS(filter), EnRTS(filter)):
+        out = smoother(toy_frames([2, 5]))
+        assert_close(out["smoothed", "mean"], out["belief", "mean"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_with_gaps_and_new_episodes(float64, kind):
+    """Readings that are missing are NaN; none of that reaches the gradient."""
+    filter = toy_denkf(layer="none", ensemble_size=6)
+    with torch.no_grad():  # the noise network starts at zero, where much of its gradient is zero, too
+        for parameter in filter["noise"].parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    frames = toy_frames([2, 6])
+    frames["measurement"] = torch.where(frames["observed"], frames["measurement"], torch.nan)
+    smoother = KINDS[kind](filter)
+    frames = noisy(smoother, frames)
+    weights = torch.linspace(-1, 1, 36).reshape(2, 6, 3)
+    directional_check(lambda: (means(smoother, frames) * weights).sum(), list(filter.parameters()), rtol=1e-4)
+
+
+def test_the_path_of_a_car_online_is_that_of_the_recording():
+    """The analysis sees more than the state: the velocities of past steps; its taper is then cut for the past."""
+    car = car_filter(ensemble_size=8).eval()
+    frames = {
+        "flow": torch.randn(2, 8, 3, 25, 79),
+        "road": torch.randn(2, 8, 13, 69),
+        "start": torch.randn(2, 8, 5),
+        "observed": torch.rand(2, 8, 1) < 0.7,
+    }
+    frames = car.draw_noise(TensorDict(frames, [2, 8]))
+    whole, online = means(EnKS(car, 3), frames), means(FixedLag(car, 3), frames)
+    assert_close(whole[:, :-3], online[:, 3:], rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_no_lag_and_what_no_filter():
+    for lag in (1.5, True, "2"):
+        with pytest.raises(TypeError, match="lag must be a whole number"):
+            EnRTS(linear_denkf(), lag)
+        with pytest.raises(TypeError, match="lag must be a whole number"):
+            FixedLag(linear_denkf(), lag)
+    with pytest.raises(ValueError, match=r"damping must be .*at most 1; got 1.2"):
+        EnRTS(linear_denkf(), damping=1.2)
+    with pytest.raises(TypeError, match="damping must be a number"):
+        EnRTS(linear_denkf(), damping="0.9")
+    recurrent = LSTMFilter(None, state_dim=2, observation_dim=2)
+    for smoother in (partial(FixedLag, lag=2), RTSSmoother):
+        with pytest.raises(TypeError, match="before and after a step"):
+            smoother(recurrent)
+    for smoother in (EnKS, EnRTS):
+        with pytest.raises(TypeError, match="LSTMFilter carries"):
+            smoother(recurrent)

@@ -1,0 +1,76 @@
+"""The measurement update of an ensemble whose columns lie in several processes, as a TensorDict module."""
+
+from __future__ import annotations
+
+from typing import Literal, Unpack
+
+import torch.distributed as dist
+
+from torch_denkf.functional import Analysis, analyse_sharded
+from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
+from torch_denkf.modules.analysis import EnsembleAnalysis
+
+__all__ = ["ShardedEnsembleAnalysis"]
+
+
+class ShardedEnsembleAnalysis(EnsembleAnalysis):
+    """:class:`EnsembleAnalysis` of a state that is spread over processes.
+
+    The mathematics is :func:`~torch_denkf.functional.analyse_sharded`.
+
+    Each process, as ``torchrun`` starts them, runs the same filter on its own components of the state and of the
+    observation, with the same number of members. ``nis`` and ``log_likelihood`` are those of all components; everything
+    else is the process's own. All processes must step together. No gradients: use it for running, not for learning.
+
+    Args:
+        scheme: ``"sensor"``, ``"etkf"`` or ``"sakov"``, as in :class:`EnsembleAnalysis`.
+        inflation: factor on the analysis anomalies, where anything is observed, by whichever process; 1 for none.
+        relaxation: relaxation to prior spread in [0, 1]; 0 for none.
+        group: the processes; ``None`` for all.
+        **keys: see :class:`EnsembleAnalysisKeys`.
+
+    Raises:
+        ValueError: for the scheme ``"perturbed"``, whose draws would be the same in processes of one seed.
+        RuntimeError: from a step where ``torchrun`` started several processes that do not know of each other yet
+            (``torch.distributed.init_process_group``), or where a gradient is required.
+
+    Source:
+        Hunt, Kostelich & Szunyogh 2007, Physica D 230, for the analysis in ensemble space.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": torch.randn(32, 3), "observation": torch.randn(32, 2)},
+        ...     "sensor": {"ensemble": torch.randn(2), "noise": torch.ones(2)},
+        ... })
+        >>> ShardedEnsembleAnalysis("etkf")(td)["belief", "mean"].shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        scheme: Literal["sensor", "etkf", "sakov"] = "etkf",
+        *,
+        inflation: float = 1.0,
+        relaxation: float = 0.0,
+        group: dist.ProcessGroup | None = None,
+        **keys: Unpack[EnsembleAnalysisKeys],
+    ):
+        if scheme not in ("sensor", "etkf", "sakov"):
+            raise ValueError(f'scheme is "sensor", "etkf" or "sakov" in a sharded analysis; got {scheme!r}')
+        super().__init__(scheme, inflation=inflation, relaxation=relaxation, **keys)
+        self.group = group
+
+    def _any(self, observed):
+        """Where any process observes anything, ``[*B]``."""
+        seen = observed.any(-1).byte()
+        if dist.is_initialized():
+            dist.all_reduce(seen, dist.ReduceOp.MAX, group=self.group)
+        return seen.bool()
+
+    def _analyse(self, ensemble, predicted, observation, variance, observed, noise, taper) -> Analysis:
+        """The analysis of this process's components; there is neither noise nor taper."""
+        return analyse_sharded(
+            ensemble, predicted, observation, variance, scheme=self.scheme, observed=observed, group=self.group
+        )
