@@ -25,8 +25,8 @@ class WithJointMoments(WithPast):
         initial: writes ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]``.
         lag: L.
         age: see :class:`WithEnsemblePast`.
-        belief_key: prefix of what ``initial`` writes, and of ``joint_mean`` ``[*B, (L + 1) S]`` and ``joint_cov`` of the
-            present and the past states, the latest first.
+        belief_key: prefix of what ``initial`` writes, and of ``joint_mean`` ``[*B, (L + 1) S]`` and ``joint_cov`` of
+            the present and the past states, the latest first.
         smoothed_key: prefix of ``mean``, ``cov``, ``var`` and ``age`` of the oldest, see :class:`LaggedMoments`.
 
     Raises:
