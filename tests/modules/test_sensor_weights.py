@@ -187,3 +187,15 @@ def test_learned_weights_fall_where_a_sensor_is_bad():
         return (run["belief", "mean"] - unseen["state"])[:, 1:][bad].square().mean().sqrt()
 
     assert error(out) < 0.3 * error(plain)
+
+
+def test_a_long_lag_in_single_precision():
+    """The last sixteen states of a stiff filter are as good as one: their covariance together is singular."""
+    move, push = torch.tensor([[1.0, 0.02], [0.0, 1.0]]), torch.diag(torch.tensor([0.0, 0.02]))
+    sensors = {"wheel": FusedSensor(Select([1]), [0.3]), "gps": FusedSensor(Select([0]), [0.5], delay=15)}
+    initial, weights = MomentPrior(torch.zeros(2), 0.1 * torch.eye(2)), SensorAttention({"wheel": 1, "gps": 1})
+    filter = FusedFilter(LinearTransition(move, push), sensors, initial=initial, weights=weights)
+    out = filter.sequence(TensorDict({"wheel": torch.randn(3, 40, 1), "gps": torch.randn(3, 40, 1)}, [3, 40]))
+    assert out["belief", "mean"].isfinite().all()
+    out["belief", "mean"].square().sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in weights.parameters() if parameter.grad is not None)

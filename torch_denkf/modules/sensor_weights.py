@@ -167,9 +167,9 @@ class SensorWeights(SubModel):
     def on_entries(self, entries, call):
         """The weights."""
         if self.moments is not None:
-            points = _points(
-                self.required(entries, (self.moments, "mean")), self.required(entries, (self.moments, "cov"))
-            )
+            mean, cov = (self.required(entries, (self.moments, name)) for name in ("mean", "cov"))
+            size = next((model.state_dim for model in self.module["models"].values()), None)
+            points = _points(mean, cov, mean.shape[-1] if size is None else size)
             entries = {**entries, self.state_key: points}
         size, innovations, seen = len(call.batch_size), {}, []
         for name, model in self.module["models"].items():
@@ -219,7 +219,12 @@ class WeightedNoise(SubModel):
         return variance / (weight if variance.ndim == weight.ndim else weight.unsqueeze(-1))
 
 
-def _points(mean: Tensor, cov: Tensor) -> Tensor:
-    """Members ``[*B, 2 S, S]`` of that mean and that sample covariance."""
-    root = semidefinite_root(cov).mT * math.sqrt(mean.shape[-1] - 0.5)
-    return mean.unsqueeze(-2) + torch.cat([root, -root], -2)
+def _points(mean: Tensor, cov: Tensor, size: int) -> Tensor:
+    """Members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
+
+    How the states belong together is left out: each sensor observes one of them, and the covariance of all may be as
+    good as singular.
+    """
+    blocks = cov.unflatten(-1, (-1, size)).unflatten(-3, (-1, size)).diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+    roots = semidefinite_root(blocks).mT.movedim(-3, -2).flatten(-2) * math.sqrt(size - 0.5)
+    return mean.unsqueeze(-2) + torch.cat([roots, -roots], -2)
