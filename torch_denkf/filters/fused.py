@@ -371,10 +371,8 @@ def _wire(name: str, sensor: FusedSensor) -> _Wired:
         reading = names[unravel_key(sensor.sensor.out_keys[0])]
         modules[f"{name}_sensor"] = Renamed(sensor.sensor, names)
     own = ("sensor", name, "noise")
-    noise = sensor.noise
-    if not isinstance(noise, torch.nn.Module):
-        noise = ConstantNoise(noise)
-    names[unravel_key(noise.out_keys[0])] = own
+    noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
+    names[writes(noise)[0]] = own
     modules[f"{name}_noise"] = Renamed(noise, names)
     features = None if sensor.features is None else unravel_key(sensor.features)
     return _Wired(modules, reading, own, observed, names.get(features, features))
@@ -396,6 +394,6 @@ def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
 
 def _observation_dim(sensor: FusedSensor) -> int | None:
     noise = sensor.noise
-    if isinstance(noise, torch.nn.Module):
+    if isinstance(noise, TensorDictModuleBase):
         return getattr(noise, "observation_dim", getattr(noise, "dim", None))
     return len(noise)

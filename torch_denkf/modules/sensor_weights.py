@@ -84,9 +84,10 @@ class SensorAttention(nn.Module):
             }
         )
         self.query, self.key, self.value = (nn.Linear(size, size, bias=False) for _ in range(3))
-        self.score = nn.Sequential(nn.Linear(2 * size, size), nn.ELU(), nn.Linear(size, 1))
-        nn.init.zeros_(self.score[-1].weight)
-        nn.init.zeros_(self.score[-1].bias)
+        first, last = nn.Linear(2 * size, size), nn.Linear(size, 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.score = nn.Sequential(first, nn.ELU(), last)
 
     def forward(self, innovations: Mapping[str, Tensor], observed: Tensor, features: Mapping[str, Tensor]) -> Tensor:
         """The weights.
