@@ -1,6 +1,6 @@
-# `make demo` (watch it work), `make test` (everything CI runs), `make docs` (the site, in docs/_build/html),
-# `make bench` (speed, beside its peers), `make fuzz` and `make soak` (reliability), `make test-nightly` (the tests beside
-# the nightlies of torchrl and tensordict).
+# `make demo` (watch it work), `make test` (everything CI runs), `make test-all` (and the slow tests), `make docs`
+# (the site, in docs/_build/html), `make bench` (speed, beside its peers), `make fuzz` and `make soak` (reliability),
+# `make test-nightly` (all tests beside the nightlies of torchrl and tensordict).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -15,12 +15,17 @@ endif
 NIGHTLY_VENV := .venv-nightly
 NIGHTLY_STAMP := $(NIGHTLY_VENV)/.installed
 
-.PHONY: demo test test-nightly lint layers unit smoke bench fuzz soak docs clean
+.PHONY: demo test test-all test-nightly lint layers unit unit-all smoke bench fuzz soak docs clean
 
 demo: $(STAMP)
 	$(BIN)/denkf demo --out runs/demo
 
-test: lint layers unit smoke docs
+# Side by side, in this order: cores that one leaves idle, the next takes.
+test: $(VENV)/.docs
+	$(MAKE) --jobs=2 --output-sync=target lint layers docs unit smoke
+
+test-all: $(VENV)/.docs
+	$(MAKE) --jobs=2 --output-sync=target lint layers docs unit-all smoke
 
 # Exact versions come from constraints.txt. On a machine without a GPU,
 # `make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"` saves the CUDA download.
@@ -43,6 +48,9 @@ OMP_NUM_THREADS=1 $(1)/bin/python -m pytest -n 2 tests/filters/test_kalman.py --
 endef
 
 unit: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -rs -m "not slow"
+
+unit-all: $(STAMP)
 	$(call suite,$(VENV))
 
 # The tests beside the newest nightlies of torchrl and tensordict, or the ones asked for:
@@ -63,10 +71,8 @@ $(NIGHTLY_STAMP): setup.py constraints.txt
 	$(NIGHTLY_VENV)/bin/python -m pip uninstall --quiet --yes torchrl tensordict
 	touch $@
 
-# A tiny run of every study and example, two at a time; the long ones first.
 smoke: $(STAMP)
-	{ printf -- '-m benchmarks.%s\n' kitti ur5 g1 lorenz96 smoothing fusion arms odometry reliability; ls examples/*.py; } | OMP_NUM_THREADS=1 xargs -P 2 -I{} \
-		sh -c 'echo "== {} --smoke" && $(BIN)/python {} --smoke || exit 255'
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.common.smoke
 
 # Damaged inputs at every border: about ten minutes. The tests run a sample.
 fuzz: $(STAMP)

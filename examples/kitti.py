@@ -70,11 +70,11 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(2)
     if args.smoke:
-        args.out, args.train, args.test, args.updates = args.out.with_name("kitti-smoke"), ["00"], ["08"], (2, 2)
+        args.out, args.train, args.test, args.updates = args.out.with_name("kitti-tiny"), ["00"], ["08"], (2, 2)
     size, cache = (100, 300), args.out / "cache"
     if args.root is None:
         args.root = args.out / "drives"
-        write_drives(args.root, [*args.train, *args.test], frames=40 if args.smoke else 150, size=size)
+        write_drives(args.root, [*args.train, *args.test], frames=20 if args.smoke else 150, size=size)
 
     # The data set: optical flow and the road's correlation of all frames, made once and kept in the cache.
     flow = partial(with_motion, keep_images=False, cache=cache)

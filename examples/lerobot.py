@@ -36,6 +36,7 @@ from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay, lag_errors
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (
+    BlackIsMissing,
     ConstantNoise,
     DiagonalNoise,
     EnsembleAnalysis,
@@ -112,6 +113,11 @@ def dead(rows: TensorDict) -> torch.Tensor:
 def fail(rows: TensorDict) -> TensorDict:
     """Rows whose pictures do not arrive while the camera is dead."""
     return rows.set("observed", rows["observed"] & ~dead(rows))
+
+
+def go_black(rows: TensorDict) -> TensorDict:
+    """Rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
+    return BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
 
 
 def make_filter(data: LeRobotReplay) -> DEnKF:
@@ -242,7 +248,7 @@ def main() -> None:
     train(denkf, data, held_out, args.out / f"training-{digest}", args.updates)
 
     # The replay environment, with the filter in it: any torchrl code can step it. Commands are replayed, too.
-    unseen, blind = folder(split="test", transform=fail), folder(split="test", transform=no_picture)
+    unseen, blind = folder(split="test", transform=go_black), folder(split="test", transform=no_picture)
     mean, seen, readings, alone = data.statistics["state", "mean"], [], [], []
     for episode in unseen.episodes[:5]:
         seen.append(believe(denkf, unseen, episode))
@@ -291,9 +297,8 @@ def draw(seen: TensorDict, reading: torch.Tensor, data: LeRobotReplay, names: Se
     axes = plot_bands(seen, readings=dots, **bands, **shared)
     axes[0].figure.savefig(stem.with_suffix(".png"), dpi=110)
     print(f"  {stem.with_suffix('.png')}")
-    pictures = seen["pixels"] * ~dead(seen)[..., None, None]
     every = max(round(data.fps / 15), 1)
-    print(f"  {belief_video(stem.with_suffix('.mp4'), seen, pictures, bands=bands, every=every, **shared)}")
+    print(f"  {belief_video(stem.with_suffix('.mp4'), seen, seen['pixels'], bands=bands, every=every, **shared)}")
 
 
 if __name__ == "__main__":

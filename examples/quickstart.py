@@ -262,8 +262,8 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
     args = parser.parse_args()
     if args.smoke:
-        args.sensor_updates, args.updates, args.drives, args.frames, args.window = 5, 5, 3, 60, 20
-        args.out = args.out / "smoke"
+        args.sensor_updates, args.updates, args.drives, args.frames, args.window = 5, 5, 3, 40, 20
+        args.out = args.out / "small"
     if args.root is not None and (not args.train or len(args.train) < 2 or not args.test):
         parser.error("--root needs --train with two drives or more, and --test")
     torch.manual_seed(args.seed)

@@ -15,8 +15,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
-from torch._subclasses.fake_tensor import FakeTensor
 
 __all__ = [
     "check_count",
@@ -28,6 +26,7 @@ __all__ = [
     "check_shape",
     "check_square",
     "check_values",
+    "flag_value",
     "has_values",
     "read_lines",
 ]
@@ -297,13 +296,22 @@ def has_values(tensor: Tensor) -> bool:
         >>> has_values(torch.ones(2)), has_values(torch.ones(2, device="meta"))
         (True, False)
     """
-    if torch.compiler.is_compiling() or tensor.is_meta or isinstance(tensor, FakeTensor):
-        return False
-    while is_functorch_wrapped_tensor(tensor):
-        if is_batchedtensor(tensor):
-            return False
-        tensor = get_unwrapped(tensor)
-    return True
+    return not torch.compiler.is_compiling() and flag_value(tensor.detach().flatten()[:0].isnan().any()) is not None
+
+
+def flag_value(flag: Tensor) -> bool | None:
+    """The value of a boolean tensor without dimensions; ``None`` where nothing has a value, see :func:`has_values`.
+
+    Example:
+        >>> flag_value(torch.tensor(True)), flag_value(torch.tensor(True, device="meta"))
+        (True, None)
+    """
+    if torch.compiler.is_compiling() or flag.is_meta:
+        return None
+    try:
+        return bool(flag)
+    except RuntimeError:  # what vmap and fake tensors say to it; the flag itself was made outside of this
+        return None
 
 
 def _has_values(tensor: Tensor) -> bool:

@@ -48,8 +48,10 @@ class Recipe:
         dims: the dimensions of the state that count, in scores and losses.
         unit: what counts as an error of one in each of them, ``[len(dims)]``.
         encoding: how many features the noise of a reading is learned from.
+        reading_key: what is compared with the predicted reading.
     """
 
+    reading_key: NestedKey = ("sensor", "ensemble")
     needs_training = False  # True where the state follows from the readings only by learned weights
     scaled: ClassVar[tuple[type[nn.Module], ...]] = (ScaledNoise,)  # modules that set_inflation sets
     dims: Sequence[int]
@@ -59,6 +61,10 @@ class Recipe:
     def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
         """Everything behind the sensor, by name, in order."""
         raise NotImplementedError
+
+    def readings(self) -> OrderedDict[str, TensorDictModuleBase]:
+        """Modules between forecast and reading; none by default."""
+        return OrderedDict()
 
     def noise(self) -> SubModel:
         """R, from what the sensor saw."""
@@ -98,16 +104,11 @@ class Particles(Recipe):
 
     particles = 100  # as Jonschkowski et al. and Kloss et al. train with
     resampling, learned = "soft", None
-    reading_key: NestedKey = ("sensor", "ensemble")
     likelihood_keys: ClassVar[dict[str, NestedKey]] = {}
 
     def noisy_motion(self) -> SubModel:
         """The motion with its noise."""
         raise NotImplementedError
-
-    def readings(self) -> OrderedDict[str, TensorDictModuleBase]:
-        """Modules between forecast and likelihood; none by default."""
-        return OrderedDict()
 
     def modules(self):
         motion, modules = self.noisy_motion(), OrderedDict()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,11 +20,12 @@ CHECKED = 1200  # frames that a sensor is validated on
 
 @dataclass(frozen=True)
 class SensorBudget:
-    """Updates of a sensor, and frames in each."""
+    """Updates of a sensor, and frames in each; networks that read together, trained from different random numbers."""
 
-    glimpse: int = 2600
+    glimpse: int = 2400
     paper: int = 1000
     frames: int = 32
+    networks: int = 2  # of `glimpse`; `paper` is one
 
 
 class TrainedSensor:
@@ -65,26 +67,33 @@ class TrainedSensor:
     def pool(self, rows: Tensor) -> FramePool:
         """Frames of some rows."""
         target = self.target[rows]
-        return FramePool(bytes_of(self.recordings.data, rows), target, self.hand(target[:, : len(ARM)]))
+        episode = self.recordings.data.storage[:]["episode"].flatten()[rows]
+        return FramePool(bytes_of(self.recordings.data, rows), target, self.hand(target[:, : len(ARM)]), episode)
 
     @cached_property
-    def trained(self) -> tuple[ImageSensor, Statistics]:
-        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
-        facts_file, build = self.out / "facts.pt", SENSORS[self.kind]
-        if (self.out / "sensor.pt").exists() and facts_file.exists():
+    def trained(self) -> tuple[list[ImageSensor], Statistics]:
+        """The trained networks. Their statistics lie beside them: a resumed study does not read the pictures."""
+        count = self.budget.networks if self.kind == "glimpse" else 1
+        folders, facts_file = [self.out / str(k) for k in range(count)], self.out / "facts.pt"
+        if facts_file.exists() and all((folder / "sensor.pt").exists() for folder in folders):
             facts = Statistics(**read_checkpoint(facts_file))
-            sensor = build(facts)
-            sensor.load_state_dict(read_checkpoint(self.out / "sensor.pt")["sensor"])
-            return sensor.eval(), facts
+            return [self._read(folder, facts) for folder in folders], facts
         data = self.recordings.data
         train = self.pool(self.seen(self.roles.sensor))
         checked = self.seen([*self.roles.tune, *self.roles.validation])
         held_out = self.pool(checked[:: max(len(checked) // CHECKED, 1)])
-        sequences = [self.target[rows_of(data, [number])] for number in self.roles.sensor]
-        facts = Statistics.of(sequences, train.pixels)
-        torch.manual_seed(self.seed)
-        sensor = build(facts)
-        updates = getattr(self.budget, self.kind)
-        train_sensor(sensor, train, held_out, out=self.out, seed=self.seed, updates=updates, batch=self.budget.frames)
+        facts = Statistics.of([self.target[rows_of(data, [number])] for number in self.roles.sensor], train.pixels)
+        sensors = []
+        for k, folder in enumerate(folders):
+            seed = self.seed + 1000 * k
+            torch.manual_seed(seed)
+            sensor, updates = SENSORS[self.kind](facts), getattr(self.budget, self.kind)
+            train_sensor(sensor, train, held_out, out=folder, seed=seed, updates=updates, batch=self.budget.frames)
+            sensors.append(sensor.eval())
         write_checkpoint(facts_file, vars(facts))
-        return sensor.eval(), facts
+        return sensors, facts
+
+    def _read(self, folder: Path, facts: Statistics) -> ImageSensor:
+        sensor = SENSORS[self.kind](facts)
+        sensor.load_state_dict(read_checkpoint(folder / "sensor.pt")["sensor"])
+        return sensor.eval()

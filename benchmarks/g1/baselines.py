@@ -17,6 +17,7 @@ from torch_denkf.modules import DiagonalNoise
 from torch_denkf.training import hold_last
 
 BINS = 100  # of an episode's phase
+SPREAD_CELLS = (16,)  # hidden layers of the sensor's spread
 WEIGHTS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of a new reading in an exponential filter
 
 
@@ -68,16 +69,16 @@ class SensorSpread:
         target: Target,
         tune: dict[str, TensorDict],
         validation: dict[str, TensorDict],
-        updates: int = 400,
+        updates: int = 600,
     ):
         features, error = _pairs([tune[name] for name in PICTURES])
         checked, wrong = _pairs([validation[name] for name in PICTURES])
         root = error.square().mean(0).sqrt().clamp_min(1e-4)
-        options = {"num_cells": (16,), "in_features": features.shape[-1], "in_key": "encoding"}
+        options = {"num_cells": SPREAD_CELLS, "in_features": features.shape[-1], "in_key": "encoding"}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             self.noise = DiagonalNoise(target.size, r=root, **options)
-            optimiser = torch.optim.AdamW(self.noise.parameters(), lr=2e-3, weight_decay=0.1)
+            optimiser = torch.optim.AdamW(self.noise.parameters(), lr=5e-4, weight_decay=0.1)
             best, kept = self._score(checked, wrong), deepcopy(self.noise.state_dict())
             for update in range(updates):
                 index = torch.randint(len(error), (1024,))

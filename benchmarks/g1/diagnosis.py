@@ -20,21 +20,21 @@ LAGS = range(-6, 7)
 @torch.no_grad()
 def diagnose(sensor: TrainedSensor) -> list[str]:
     """Lines of Markdown on one trained sensor."""
-    data, (model, _) = sensor.recordings.data, sensor.trained
+    data, (models, _) = sensor.recordings.data, sensor.trained
     generator = torch.Generator().manual_seed(0)
     rows = sensor.seen(sensor.roles.sensor)
     rows = rows[:: max(len(rows) // FRAMES, 1)]
-    codes = torch.cat([code_of(model, data[part]["pixels"]) for part in rows.split(64)])
-    known = (read_code(model, codes, SAMPLES, generator)[0].mean(-2) - sensor.target[rows])[:, : len(ARM)].abs()
+    codes = torch.cat([code_of(models, data[part]["pixels"]) for part in rows.split(64)])
+    known = (read_code(models, codes, SAMPLES, generator)[0].mean(-2) - sensor.target[rows])[:, : len(ARM)].abs()
     errors, truths, seen = [], [], []
     for role in ("tune", "validation"):
         file = sensor.recordings.out / "codes" / f"{sensor.name}-{role}-clean.pt"
         numbers = getattr(sensor.roles, role)
         hand = None if file.exists() else sensor.hand
-        unseen = read_codes(model, data, hand, numbers, condition="clean", exact=False, file=file)
+        unseen = read_codes(models, data, hand, numbers, condition="clean", exact=False, file=file)
         for one in unseen:
             at = one["valid"].squeeze(-1)
-            read = read_code(model, one["code"][at], SAMPLES, generator)[0].mean(-2)[:, : len(ARM)]
+            read = read_code(models, one["code"][at], SAMPLES, generator)[0].mean(-2)[:, : len(ARM)]
             truth = one["truth"][at][:, : len(ARM)]
             errors.append(read - truth)
             truths.append(truth)

@@ -11,6 +11,7 @@ from torch_denkf.transforms import SaltAndPepper
 BOX = 0.3  # side of a box over the hand, in widths of the picture
 SHIFT = 10 / 320  # of a camera that was pushed, in widths of the picture
 DARK = 0.45  # share of the light that is left
+MARGIN = (0.16, 0.3)  # between the hand's middle and another episode's table, in widths of the picture
 
 
 def shifted(pixels: Tensor, right: int, down: int) -> Tensor:
@@ -29,6 +30,25 @@ def boxed(pixels: Tensor, place: Tensor, side: float = BOX) -> Tensor:
     inside = ((torch.arange(width) + 0.5 - column.unsqueeze(-1)).abs() < half).unsqueeze(-2)
     inside = inside & ((torch.arange(height) + 0.5 - row.unsqueeze(-1)).abs() < half).unsqueeze(-1)
     return pixels * ~inside.unsqueeze(1)
+
+
+def before_another(pixels: Tensor, place: Tensor, other: Tensor, margin: float) -> Tensor:
+    """The arm of one picture before the table of another, uint8 ``[3, H, W]``.
+
+    The arm reaches in from the right and from below. What is left of the hand or above it comes from the other picture.
+
+    Args:
+        pixels: with the arm.
+        place: of the hand, ``[2]`` from -1 (left, top) to 1.
+        other: with the table.
+        margin: kept around the hand's middle, in widths of the picture.
+    """
+    height, width = pixels.shape[-2:]
+    column, row = (float(place[0]) + 1) / 2 * width, (float(place[1]) + 1) / 2 * height
+    left, top = (max(int(middle - margin * width), 0) for middle in (column, row))
+    out = other.clone()
+    out[:, top:, left:] = pixels[:, top:, left:]
+    return out
 
 
 def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from benchmarks.g1.sensors import Statistics
 from benchmarks.g1.targets import Target
-from torch_denkf.modules import LearnedTransition, SubModel, run_module
 from torch_denkf.training import Stage, train_part
 
 FADING = 0.98  # of a bias in a row, before training
@@ -47,10 +45,13 @@ class Motion(nn.Module):
         actions: whether the commands are read: the last features of the input.
     """
 
+    fading = FADING
+
     def __init__(self, facts: Statistics, target: Target, actions: bool = False):
         super().__init__()
         self.target, self.actions = target, actions
         size, dims = target.size, list(target.dims)
+        self.size, self.read = 2 * size, size
         for name in ("loc", "scale", "rate", "acceleration"):
             self.register_buffer(name, getattr(facts, name)[dims].clone())
         self.damping = nn.Parameter(torch.full((size,), 3.0))  # of it the sigmoid
@@ -76,27 +77,6 @@ class Motion(nn.Module):
         return torch.cat([place + rates, rates], -1)
 
 
-class WithBias(nn.Module):
-    r"""The motion of a state that also holds the sensor's slow errors, which fade: :math:`b_t = \rho \circ b_{t-1}`.
-
-    A sensor that reads a pose wrongly reads it wrongly in the next frame, too: see benchmarks/ur5/README.md.
-
-    Args:
-        motion: of the first 2D numbers.
-    """
-
-    def __init__(self, motion: Motion):
-        super().__init__()
-        self.motion, self.size = motion, motion.target.size
-        self.fading = nn.Parameter(torch.full((self.size,), FADING).logit())
-
-    def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 3D]`` of states ``[*, 3D]``, or of states and commands ``[*, 5D]``."""
-        bias = features[..., 2 * self.size : 3 * self.size]
-        moved = self.motion(torch.cat([features[..., : 2 * self.size], features[..., 3 * self.size :]], -1))
-        return torch.cat([moved, self.fading.sigmoid() * bias], -1)
-
-
 class BiasedReading(nn.Module):
     """h: the numbers, with the sensor's errors of them where the state holds those; then those that have an encoder.
 
@@ -114,39 +94,6 @@ class BiasedReading(nn.Module):
         place = state[..., : self.size]
         read = place if state.shape[-1] == 2 * self.size else place + state[..., 2 * self.size :]
         return torch.cat([read, place[..., self.encoders]], -1)
-
-
-def transition(motion: Motion, bias: bool) -> LearnedTransition:
-    """The motion as a transition of ensembles."""
-    network = WithBias(motion) if bias else motion
-    return LearnedTransition(network, residual=False, action_key="action" if motion.actions else None)
-
-
-class AtRest(SubModel):
-    """An initial belief around D numbers, of something that does not move.
-
-    Args:
-        initial: a belief around the filters' state.
-        size: of the filters' state; further numbers are zero.
-        state_key: ``[*B, D]``.
-    """
-
-    def __init__(self, initial: TensorDictModuleBase, size: int, state_key: str = "start"):
-        super().__init__(initial, [state_key], initial.out_keys)
-        self.size = self.state_dim = size
-        if hasattr(initial, "ensemble_size"):
-            self.ensemble_size = initial.ensemble_size
-
-    def parts(self):
-        """The belief around the filters' state."""
-        return {"initial": self.module}
-
-    def on_entries(self, entries, call):
-        """The belief."""
-        (key,) = self.in_keys
-        state = self.required(entries, key)
-        state = nn.functional.pad(state, (0, self.size - state.shape[-1]))
-        return run_module(self.module, {**entries, key: state}, call.part("initial"))
 
 
 class MotionLoss(nn.Module):

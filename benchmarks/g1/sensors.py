@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.g1.disturbances import disturb
+from benchmarks.g1.disturbances import MARGIN, before_another, disturb
 from benchmarks.g1.recordings import FINGERS, JOINTS, READ
 from benchmarks.g1.trunk import SecondLookTrunk, Shrink
 from torch_denkf.functional import crps_ensemble
@@ -18,6 +18,7 @@ from torch_denkf.modules import ImageSensor, convolutional_trunk
 from torch_denkf.training import Stage, train_part
 
 SAMPLES = 16  # of a sensor while it is trained
+ELSEWHERE = 0.4  # of the training frames are put before the table of another episode
 # What a good sensor leaves: units of all losses. 1.15 degrees; a twentieth of the way of a finger.
 JOINT_UNIT, FINGER_UNIT = 0.02, 0.05
 UNIT = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((FINGERS,), FINGER_UNIT)])
@@ -77,20 +78,34 @@ def _sensor(facts: Statistics, trunk: nn.Module, **options) -> ImageSensor:
     )
 
 
-def code_of(sensor: ImageSensor, pixels: Tensor) -> Tensor:
-    """Features of the sensor's trunk ``[N, F]``, of pictures ``[N, 3, H, W]``."""
-    return sensor._features(pixels, None)
+def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
+    """Features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
+    return torch.cat([one._features(pixels, None) for one in sensors], -1)
 
 
 def read_code(
-    sensor: ImageSensor, code: Tensor, size: int, generator: torch.Generator | None = None
+    sensors: Sequence[ImageSensor], code: Tensor, size: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``[*B, size, 13]`` and encoding ``[*B, F]`` of the sensor's head, of features ``[*B, F]``."""
-    head = sensor.module["head"]
-    noise = head.draw_noise(code.shape[:-1], size, dtype=code.dtype, generator=generator)
-    samples, hidden = head.forward_with_hidden(code.unsqueeze(-2), noise)
-    samples = (sensor.loc + sensor.scale * samples).expand(*code.shape[:-1], size, -1)
-    return samples, hidden.mean(-2)
+    """Samples ``[*B, size, 13]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
+
+    The samples are split among the sensors, which were trained from different random numbers: their spread is also that
+    of what training leaves open. The encoding holds its logarithm, behind those of the heads.
+    """
+    parts, hidden = [], []
+    for k, (one, own) in enumerate(zip(sensors, code.chunk(len(sensors), -1), strict=True)):
+        head, count = one.module["head"], size // len(sensors) + (k < size % len(sensors))
+        noise = head.draw_noise(own.shape[:-1], count, dtype=own.dtype, generator=generator)
+        samples, seen = head.forward_with_hidden(own.unsqueeze(-2), noise)
+        parts.append(samples.expand(*own.shape[:-1], count, -1))
+        hidden.append(seen.mean(-2))
+    samples = torch.cat(parts, -2)
+    spread = samples.detach().std(-2).clamp_min(1e-4).log()
+    return sensors[0].loc + sensors[0].scale * samples, torch.cat([*hidden, spread], -1)
+
+
+def encoding_size(sensors: Sequence[ImageSensor]) -> int:
+    """F of :func:`read_code`'s encoding."""
+    return sum(one.module["head"].layers[-1].in_features for one in sensors) + READ
 
 
 class FrameLoss(nn.Module):
@@ -103,8 +118,8 @@ class FrameLoss(nn.Module):
 
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
         """Scores frames ``[N]``."""
-        code = code_of(self.sensor, frames["pixels"])
-        score = (crps_ensemble(read_code(self.sensor, code, SAMPLES)[0], frames["target"]) / UNIT).mean(0)
+        code = code_of([self.sensor], frames["pixels"])
+        score = (crps_ensemble(read_code([self.sensor], code, SAMPLES)[0], frames["target"]) / UNIT).mean(0)
         terms = {"loss_joints": score[:JOINTS].mean(), "loss_hand": 0.3 * score[JOINTS:].mean()}
         if self.looks:
             terms["loss_place"] = 3 * (code[:, -2:] - frames["place"]).abs().mean()
@@ -118,21 +133,35 @@ class FramePool:
         pixels: uint8 ``[N, 3, H, W]``.
         target: what is to be read, ``[N, 13]``.
         place: where the hand is in the picture, ``[N, 2]``.
+        episode: ``[N]``.
     """
 
-    def __init__(self, pixels: Tensor, target: Tensor, place: Tensor):
-        self.pixels, self.target, self.place = pixels, target, place
+    def __init__(self, pixels: Tensor, target: Tensor, place: Tensor, episode: Tensor):
+        self.pixels, self.target, self.place, self.episode = pixels, target, place, episode
 
     def __len__(self) -> int:
         return len(self.target)
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random disturbed frames ``[batch]``."""
+        """Random disturbed frames ``[batch]``, some before the table of another episode."""
         index = torch.randint(len(self), (batch,), generator=generator)
         rows = {"target": self.target[index], "place": self.place[index]}
-        pixels, moved = disturb(self.pixels[index], self.place[index], generator)
+        pixels, moved = disturb(self._elsewhere(index, generator), self.place[index], generator)
         rows["place"] = rows["place"] + moved
         return TensorDict({**rows, "pixels": pixels}, batch_size=[batch])
+
+    def _elsewhere(self, index: Tensor, generator: torch.Generator) -> Tensor:
+        # A sensor knows its few episodes by their tables. Most of the others' hands are at about the same place.
+        pixels = self.pixels[index]
+        for k in (torch.rand(len(index), generator=generator) < ELSEWHERE).nonzero().flatten().tolist():
+            others = torch.randint(len(self), (400,), generator=generator)
+            near, least = torch.rand(2, generator=generator).tolist()
+            away = (self.place[others] - self.place[index[k]]).norm(dim=-1)
+            away = away + 10 * (self.episode[others] == self.episode[index[k]])
+            other = others[away.argmin()] if near < 0.7 else others[0]
+            margin = MARGIN[0] + (MARGIN[1] - MARGIN[0]) * least
+            pixels[k] = before_another(pixels[k], self.place[index[k]], self.pixels[other], margin)
+        return pixels
 
 
 @torch.no_grad()
@@ -142,7 +171,7 @@ def sensor_error(sensor: ImageSensor, pool: FramePool) -> dict[str, float]:
     scores, errors = [], []
     generator = torch.Generator().manual_seed(0)
     for index in torch.arange(len(pool)).split(128):
-        samples, _ = read_code(sensor, code_of(sensor, pool.pixels[index].float() / 255), SAMPLES, generator)
+        samples, _ = read_code([sensor], code_of([sensor], pool.pixels[index].float() / 255), SAMPLES, generator)
         scores.append(crps_ensemble(samples, pool.target[index]) / UNIT)
         errors.append((samples.mean(-2) - pool.target[index]).abs())
     sensor.train()

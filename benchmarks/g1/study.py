@@ -26,12 +26,13 @@ from benchmarks.g1.readings import (
     black_readings,
     fail,
     read_codes,
+    standardised,
     with_readings,
 )
 from benchmarks.g1.recipes import FILTERS, G1Recipe
 from benchmarks.g1.recipes._base import MEMBERS
 from benchmarks.g1.recordings import Recordings, rows_of
-from benchmarks.g1.sensors import SENSORS
+from benchmarks.g1.sensors import SENSORS, encoding_size
 from benchmarks.g1.targets import TARGETS, Target
 from benchmarks.g1.training import FilterBudget, filter_error, train_filter
 from torch_denkf.filters import Filter
@@ -84,17 +85,38 @@ class Base:
         """Where the training episodes begin, ``[N, D]``."""
         return torch.stack([state[0] for state, _ in self.sequences])
 
-    def _readings(self, role: str) -> dict[str, TensorDict]:
-        """What the sensor reads of the episodes of a role, in all conditions."""
+    def _pictures(self, role: str) -> dict[str, TensorDict]:
+        """What the sensor reads of the episodes of a role in all pictures; encodings as they are."""
         trained, study = self.trained, self.study
-        sensor, _ = trained.trained
+        sensors, _ = trained.trained
         numbers, out = getattr(trained.roles, role), {}
         for condition in PICTURES:
             file = study.out / "codes" / f"{trained.name}-{role}-{condition}.pt"
             exact = role == "test"
             hand = None if file.exists() else trained.hand
-            codes = read_codes(sensor, study.data, hand, numbers, condition=condition, exact=exact, file=file)
-            out[condition] = with_readings(sensor, codes, self.target, MEMBERS, self.start.mean(0))
+            codes = read_codes(sensors, study.data, hand, numbers, condition=condition, exact=exact, file=file)
+            out[condition] = with_readings(sensors, codes, self.target, MEMBERS, self.start.mean(0))
+        return out
+
+    @cached_property
+    def _tune(self) -> dict[str, TensorDict]:
+        return self._pictures("tune")
+
+    @cached_property
+    def _encoding(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the encodings of the tuning episodes, in all pictures."""
+        seen = torch.cat([one["sensor", "encoding"][one["observed"].squeeze(-1)] for one in self._tune.values()])
+        return seen.mean(0), seen.std(0).clamp_min(1e-3)
+
+    def _standardised(self, readings: TensorDict) -> TensorDict:
+        sensor = readings["sensor"].copy()
+        sensor["encoding"] = standardised(sensor["encoding"], *self._encoding)
+        return readings.copy().set("sensor", sensor)
+
+    def _readings(self, role: str) -> dict[str, TensorDict]:
+        """What the sensor reads of the episodes of a role, in all conditions."""
+        pictures = self._tune if role == "tune" else self._pictures(role)
+        out = {condition: self._standardised(one) for condition, one in pictures.items()}
         for condition in set(CONDITIONS) - set(PICTURES):
             out[condition] = fail(out["clean"], condition, self.black)
         return {condition: out[condition] for condition in CONDITIONS}
@@ -102,7 +124,8 @@ class Base:
     @cached_property
     def black(self) -> TensorDict:
         """The reading of a black frame."""
-        return black_readings(self.trained.trained[0], self.target, MEMBERS)
+        black = black_readings(self.trained.trained[0], self.target, MEMBERS)
+        return black.set("encoding", standardised(black["encoding"], *self._encoding))
 
     @cached_property
     def tune(self) -> dict[str, TensorDict]:
@@ -146,10 +169,16 @@ class Base:
     def train(self, name: str) -> tuple[G1Recipe, Filter]:
         """Trains a filter, or reads it."""
         kind = FILTERS[name]
-        sensor, facts = self.trained.trained
-        encoding = sensor.module["head"].layers[-1].in_features
+        sensors, facts = self.trained.trained
+        encoding = encoding_size(sensors)
         recipe = kind(
-            self.target, facts, self.motion(kind.actions), self.error, self.start.std(0).clamp_min(1e-3), encoding
+            self.target,
+            facts,
+            self.motion(kind.actions),
+            self.error,
+            self.start.std(0).clamp_min(1e-3),
+            encoding,
+            self.baselines.spread.noise,
         )
         windows = Windows(self.tune, self.black, self.study.budget.length)
         out = self.study.out / "filters" / f"{name}-{self.name}"

@@ -98,15 +98,14 @@ def _cell(value: Any) -> str:
 #: The columns of each part's table; all others stay in the JSON file.
 COLUMNS = {
     "steps": (
-        "package",
         "steps",
         "unobserved",
         "not finite",
         "mean squared error, first chunk",
         "mean squared error, last chunk",
+        "largest difference from the filter",
         "largest difference from a fresh run",
         "memory grown, MB",
-        "us a step",
     ),
     "kills": ("kills", "equal to an unbroken run", "left behind", "workers that stayed"),
     "disks": ("said", "with room again", "left behind then", "refused", "result"),
@@ -123,7 +122,11 @@ TITLES = {
     "steps": "Packaged steps, compiled ahead of time. Stretches of 10,000 steps in a row bring no reading.",
     "kills": "Work that `kill -9` ended at random moments, and that was started again.",
     "disks": "Disks that are full (tmpfs) or read-only, and two processes that write to one place.",
-    "layouts": "A filter inside environments, workers and collectors; each step compared with the same step by hand.",
+    "layouts": (
+        "A filter inside environments, workers and collectors; each step compared with the same step by hand. Steps "
+        f"are counted of all rows: each of the {layouts.ENVIRONMENTS} processes of a ParallelEnv has {layouts.ROWS} "
+        f"rows, so that {layouts.ENVIRONMENTS * layouts.ROWS} steps are one exchange between processes."
+    ),
 }
 
 

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
-from torch_denkf.modules import LearnedTransition, SubModel, run_module
 from torch_denkf.training import Stage, train_part
 
 SIZE = STATE + JOINTS  # of the filters' state
@@ -47,6 +45,8 @@ class ArmMotion(nn.Module):
         facts: statistics of the training demos.
         actions: whether the joints' targets of the last step are read: features 17 to 23 of the input.
     """
+
+    size, read, fading = SIZE, STATE, FADING
 
     def __init__(self, facts: Statistics, actions: bool = False):
         super().__init__()
@@ -92,29 +92,6 @@ class ArmMotion(nn.Module):
         return torch.cat([moved, place, rates], -1)
 
 
-class WithBias(nn.Module):
-    r"""The motion of a state that also holds the sensor's slow errors, which fade: :math:`b_t = \rho \circ b_{t-1}`.
-
-    A sensor that reads a pose wrongly reads it wrongly in the next frame, too. A filter that takes its errors for white
-    noise believes them more with each frame; here they are part of the state, and the reading is state plus bias
-    ("coloured measurement noise": Bryson & Henrikson 1968).
-
-    Args:
-        motion: of the first 17 numbers.
-    """
-
-    def __init__(self, motion: ArmMotion):
-        super().__init__()
-        self.motion = motion
-        self.fading = nn.Parameter(torch.full((STATE,), FADING).logit())
-
-    def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 27]`` of states ``[*, 27]``, or of states and actions ``[*, 34]``."""
-        bias = features[..., SIZE : SIZE + STATE]
-        moved = self.motion(torch.cat([features[..., :SIZE], features[..., SIZE + STATE :]], -1))
-        return torch.cat([moved, self.fading.sigmoid() * bias], -1)
-
-
 class BiasedReading(nn.Module):
     """h: the table's ten numbers, and the sensor's errors of them where the state holds those."""
 
@@ -122,40 +99,6 @@ class BiasedReading(nn.Module):
         """Readings ``[*, 10]`` of states ``[*, 17]`` or ``[*, 27]``."""
         read = state[..., :STATE]
         return read if state.shape[-1] == SIZE else read + state[..., SIZE:]
-
-
-def transition(motion: ArmMotion, bias: bool) -> LearnedTransition:
-    """The motion as a transition of ensembles."""
-    network = WithBias(motion) if bias else motion
-    return LearnedTransition(network, residual=False, action_key="action" if motion.actions else None)
-
-
-class AtRest(SubModel):
-    """An initial belief around the table's ten numbers, of an arm that does not move.
-
-    Args:
-        initial: a belief around the filters' state.
-        state_key: the table's state ``[*B, 10]``, or the filters' ``[*B, S]``.
-        size: S; further numbers of the state are zero, and those beyond it are left out.
-    """
-
-    def __init__(self, initial: TensorDictModuleBase, state_key: str = "state", size: int = SIZE):
-        super().__init__(initial, [state_key], initial.out_keys)
-        self.size = size
-        self.input_dim, self.state_dim = STATE, size
-        if hasattr(initial, "ensemble_size"):
-            self.ensemble_size = initial.ensemble_size
-
-    def parts(self):
-        """The belief around the filters' state."""
-        return {"initial": self.module}
-
-    def on_entries(self, entries, call):
-        """The belief."""
-        (key,) = self.in_keys
-        state = self.required(entries, key)
-        state = nn.functional.pad(state, (0, self.size - state.shape[-1]))
-        return run_module(self.module, {**entries, key: state}, call.part("initial"))
 
 
 class MotionLoss(nn.Module):

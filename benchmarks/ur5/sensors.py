@@ -184,26 +184,6 @@ class NearForecast(SubModel):
         return states
 
 
-class BlackIsMissing(SubModel):
-    """Marks a frame that is black all over as not observed: no scene is, so that the camera says itself that it fails.
-
-    Put it in front of the sensor.
-
-    Args:
-        threshold: a frame none of whose pixels is brighter, as a share of white, is black.
-    """
-
-    def __init__(self, threshold: float = 0.02):
-        super().__init__(nn.Identity(), ["pixels"], ["observed"], optional_keys=["observed"])
-        self.threshold = threshold
-
-    def compute(self, pixels, before=None):
-        """The mask ``[*B, 1]``; what was not observed before stays so."""
-        white = 1.0 if pixels.is_floating_point() else 255
-        seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
-        return seen if before is None else seen & before
-
-
 def disturb(frames: TensorDict, generator: torch.Generator) -> TensorDict:
     """What a camera does to training frames: a third get salt and pepper, a third another exposure."""
     seed = int(torch.randint(2**31, (), generator=generator))

@@ -8,13 +8,13 @@ from tensordict import TensorDict
 
 from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.baselines import Baselines, at_phase, clock, smoothed
-from benchmarks.g1.disturbances import boxed, disturb, shifted
+from benchmarks.g1.disturbances import before_another, boxed, disturb, shifted
 from benchmarks.g1.motion import DELAYS, BiasedReading, Motion, delayed, with_rates
-from benchmarks.g1.readings import BLACK, CONDITIONS, PICTURES, Windows, blackouts, fail
+from benchmarks.g1.readings import BLACK, CONDITIONS, PICTURES, Windows, black_readings, blackouts, fail
 from benchmarks.g1.recipes.denkf import TAPER, WithEncoders, localisation
-from benchmarks.g1.recordings import Recordings, Roles, drawn_recording
+from benchmarks.g1.recordings import READ, Recordings, Roles, drawn_recording
 from benchmarks.g1.scores import blackout, scores
-from benchmarks.g1.sensors import Statistics
+from benchmarks.g1.sensors import Statistics, code_of, encoding_size, paper_sensor, read_code
 from benchmarks.g1.tables import COLUMNS, markdown, named
 from benchmarks.g1.targets import ARM, HAND
 from torch_denkf.data import LeRobotReplay
@@ -47,8 +47,9 @@ def readings(error=0.0, target=ARM, spread=0.01):
     return out
 
 
-def black(target=ARM):
+def black(target=ARM, seen=True):
     entries = {"ensemble": torch.full((1, 1, MEMBERS, target.size), 9.0), "encoding": torch.full((1, 1, FEATURES), 7.0)}
+    entries["observed"] = torch.full((1, 1, 1), seen)
     return TensorDict(entries, [1, 1])
 
 
@@ -88,6 +89,14 @@ def test_a_shifted_picture_and_a_box():
     assert (hidden[1] == 0).sum().item() == 3 * 10 * 10  # a quarter of it is in the picture
 
 
+def test_an_arm_before_another_table():
+    arm, table = torch.full((3, 60, 80), 9, dtype=torch.uint8), torch.zeros(3, 60, 80, dtype=torch.uint8)
+    out = before_another(arm, torch.tensor([0.5, 0.0]), table, 0.25)  # the hand is in column 60 and row 30
+    assert (out[:, 10:, 40:] == 9).all()
+    assert int((out == 9).sum()) == 3 * 50 * 40
+    assert (before_another(arm, torch.tensor([-1.0, -1.0]), table, 0.1) == 9).all()
+
+
 def test_disturbed_frames_are_repeatable_and_keep_the_place():
     pixels = torch.randint(0, 256, (40, 3, 24, 32), dtype=torch.uint8)
     place = torch.zeros(40, 2)
@@ -110,6 +119,9 @@ def test_conditions_hide_what_they_say():
     assert torch.equal(dark, ~lost)
     assert unannounced["observed"].all()
     assert (unannounced["sensor", "ensemble"][dark] == 9.0).all()
+    recognised = fail(clean, "black20_unannounced", black(seen=False))
+    announced = fail(clean, "black20", black())
+    assert all(torch.equal(recognised[key], announced[key]) for key in ("observed", "arrived", ("sensor", "ensemble")))
     missing = fail(clean, "missing", black())["observed"].float().mean()
     assert abs(float(missing) - 0.7) < 0.1
     assert clean["observed"].all()
@@ -124,6 +136,23 @@ def test_the_hand_is_where_the_picture_changes():
     for column, (near, far) in enumerate(((8, 13), (7, 10))):
         middle = 0.6 * state[:, near] + 0.4 * state[:, far]
         assert float((place[:, column] - middle).abs().mean()) < 0.12
+
+
+def test_networks_read_together():
+    facts = Statistics.of([torch.randn(30, READ)], torch.randint(0, 256, (3, 3, 36, 48), dtype=torch.uint8))
+    first, second = paper_sensor(facts), paper_sensor(facts)
+    with torch.no_grad():
+        pixels = torch.rand(2, 3, 36, 48)
+        code = code_of([first, second], pixels)
+        samples, encoding = read_code([first, second], code, 7, torch.Generator().manual_seed(0))
+        alone, _ = read_code([first], code_of([first], pixels), 4, torch.Generator().manual_seed(0))
+        dark = black_readings([first, second], ARM, 7)
+    assert torch.equal(samples[:, :4], alone)  # four of the first network, three of the second
+    spread = ((samples - facts.loc) / facts.scale).std(1).log()
+    torch.testing.assert_close(encoding[:, -READ:], spread, atol=1e-3, rtol=0)
+    assert encoding.shape[-1] == encoding_size([first, second])
+    assert dark["ensemble"].shape == (1, 1, 7, 7)
+    assert not dark["observed"].any()  # for it is black
 
 
 # Motion and filters ---------------------------------------------------------------------------------------------------

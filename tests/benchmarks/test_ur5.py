@@ -11,7 +11,7 @@ from benchmarks.ur5.evaluation import blackout, errors, sensor_rows
 from benchmarks.ur5.gallery import draw_all
 from benchmarks.ur5.motion import SIZE, with_rates
 from benchmarks.ur5.readings import BLACK, Windows, blackouts, fail
-from benchmarks.ur5.sensors import SENSORS, BlackIsMissing, TurnedWrist
+from benchmarks.ur5.sensors import SENSORS, TurnedWrist
 from benchmarks.ur5.tables import COLUMNS, markdown
 from tests.benchmarks.ur5_for_tests import states
 
@@ -29,16 +29,6 @@ def test_pictures_need_beliefs(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------ failing cameras
-
-
-def test_black_frames_are_missing_and_dark_ones_are_not():
-    pixels = torch.zeros(3, 3, 4, 4)
-    pixels[1, 0, 2, 2] = 0.3
-    pixels[2] = 0.5
-    td = BlackIsMissing()(TensorDict({"pixels": pixels, "observed": torch.tensor([[True], [True], [False]])}, [3]))
-    assert td["observed"].squeeze(-1).tolist() == [False, True, False]
-    td = BlackIsMissing()(TensorDict({"pixels": (pixels * 255).to(torch.uint8)}, [3]))
-    assert td["observed"].squeeze(-1).tolist() == [False, True, True]
 
 
 def test_conditions_hide_what_they_say():

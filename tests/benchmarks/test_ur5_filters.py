@@ -7,9 +7,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.arms import AtRest, WithBias
 from benchmarks.ur5.evaluation import errors
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
-from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, AtRest, BiasedReading, WithBias, with_rates
+from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, with_rates
 from benchmarks.ur5.readings import read_head
 from benchmarks.ur5.recipes import FILTERS
 from benchmarks.ur5.recipes.denkf import localisation
@@ -210,7 +211,7 @@ def test_a_head_on_features_is_the_sensor_on_pictures():
 def test_a_belief_at_rest_is_padded():
     from torch_denkf.modules import AroundState
 
-    initial = AtRest(AroundState(torch.zeros(27), ensemble_size=3), size=27)
+    initial = AtRest(AroundState(torch.zeros(27), ensemble_size=3), 27, 10)
     state = states(2)
     belief = initial(TensorDict({"state": state}, [2]))["belief", "mean"]
     torch.testing.assert_close(belief, torch.cat([state, torch.zeros(2, 17)], -1))

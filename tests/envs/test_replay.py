@@ -152,7 +152,7 @@ def test_random_stretches_are_uniform_and_follow_the_seed():
     [
         *((name, SerialEnv) for name in SETS),
         ("own", ParallelEnv),
-        ("kitti", ParallelEnv),
+        pytest.param("kitti", ParallelEnv, marks=pytest.mark.slow),
     ],  # processes take 10 s to start
     indirect=["data"],
 )

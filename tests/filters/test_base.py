@@ -194,9 +194,17 @@ def test_float32_agrees_with_float64(float64):
 # ------------------------------------------------------------------------------------------------ compilation
 
 
-@pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
-@pytest.mark.parametrize("layer", ["dropout", "flipout"])
-def test_compiled_step_equals_eager(float64, layer):
+@pytest.mark.parametrize(
+    ("layer", "backend"),
+    [
+        ("dropout", "aot_eager"),  # both graphs; test_compiled.py has one in C++
+        pytest.param("dropout", "inductor", marks=pytest.mark.slow),
+        pytest.param("flipout", "inductor", marks=pytest.mark.slow),
+    ],
+)
+def test_compiled_step_equals_eager(float64, layer, backend):
+    if backend == "inductor" and not has_compiler():
+        pytest.skip("torch.compile needs a C++ compiler")
     filter = toy_denkf("sensor", layer)
     td = filter.initialise(toy_frames((3,), resets=False))
     filter.draw_noise(td)
@@ -209,7 +217,7 @@ def test_compiled_step_equals_eager(float64, layer):
 
     torch._dynamo.reset()
     eager, grads = loss(filter.step, td)
-    compiled, compiled_grads = loss(torch.compile(filter.step, fullgraph=True), td)
+    compiled, compiled_grads = loss(torch.compile(filter.step, fullgraph=True, backend=backend), td)
     # Inductor fuses sums and uses fused multiply-adds: rounding, 1e-16, amplified by the solve.
     assert_equal(compiled, eager, filter.out_keys, atol=1e-11)
     assert len(grads) == len(compiled_grads) > 10

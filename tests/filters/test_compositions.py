@@ -25,6 +25,19 @@ from torch_denkf.transforms import DEnKFTransform
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
 PAIRS = [pair for pair in combinations(FEATURES, 2) if set(pair) != {"flipout", "dropout"}]
 every_pair = pytest.mark.parametrize("features", PAIRS, ids=" + ".join)
+#: Each feature once. To trace a composition takes dynamo ten seconds; `make test-all` traces all pairs.
+TRACED = [
+    ("two sensors", "two analyses"),
+    ("mask on one", "dropout"),
+    ("flipout", "actions"),
+    ("extra outputs", "foreign module"),
+    ("stored carry", "resets"),
+]
+some_pairs = pytest.mark.parametrize(
+    "features",
+    [pair if pair in TRACED else pytest.param(pair, marks=pytest.mark.slow) for pair in PAIRS],
+    ids=" + ".join,
+)
 
 
 def close(first, second, keys, atol=1e-10):  # float64: rounding of a few steps
@@ -72,7 +85,7 @@ def with_carry(frames, beliefs):
     return frames.copy().set(BELIEF[0], beliefs[BELIEF[0]])
 
 
-@every_pair
+@some_pairs
 def test_compiled_is_eager(float64, features):
     filter, frames, carry = prepared(features)
     data = frames if carry is None else with_carry(frames, stepped(filter, frames, carry))
@@ -201,6 +214,11 @@ def two_readings(scheme, size=20_000):
         },
         initial=GaussianPrior([0.0], [1.0], ensemble_size=size),
     )
+
+
+def test_the_pairs_that_are_traced_hold_each_feature():
+    assert sorted(feature for pair in TRACED for feature in pair) == sorted(FEATURES)
+    assert set(TRACED) <= set(PAIRS)
 
 
 @pytest.mark.parametrize("scheme", ["perturbed", "etkf"])

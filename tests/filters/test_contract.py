@@ -92,6 +92,11 @@ FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "L
 FILTERS_WITHOUT_NOISE |= {"fused Kalman, late", "fused Kalman, late, joint"}
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)
+#: One of each belief. To trace a step takes dynamo up to half a minute; `make test-all` traces all.
+TRACED = {"DEnKF etkf, lag", "Backprop KF", "particles, soft"}
+some_filters = pytest.mark.parametrize(
+    "name", [name if name in TRACED else pytest.param(name, marks=pytest.mark.slow) for name in FILTERS]
+)
 
 
 def readings(*batch, width=1):
@@ -147,7 +152,7 @@ def test_steps_are_the_sequence(float64, name, width):
         assert_equal(filter(frames.copy()), expected, filter.belief_keys)
 
 
-@every_filter
+@some_filters
 def test_compiled_is_eager(float64, name):
     """Forward and backward. What inductor makes of a graph is tested in test_compiled.py."""
     filter, frames = with_noise(name, 3, 5, width=2)

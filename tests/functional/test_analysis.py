@@ -241,16 +241,25 @@ def test_an_indefinite_system_is_nan_and_only_there(scheme, space):
     assert result.log_likelihood[1].isnan()
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler, g++")
-@pytest.mark.parametrize("sizes", [(6, 4, 3), (3, 4, 5)])  # observation space, ensemble space
-def test_compiled_equals_eager_forward_and_backward(sizes):
+@pytest.mark.parametrize(
+    ("sizes", "backend"),
+    [
+        ((6, 4, 3), "aot_eager"),  # observation space
+        ((3, 4, 5), "aot_eager"),  # ensemble space
+        pytest.param((6, 4, 3), "inductor", marks=pytest.mark.slow),
+        pytest.param((3, 4, 5), "inductor", marks=pytest.mark.slow),
+    ],
+)
+def test_compiled_equals_eager_forward_and_backward(sizes, backend):
+    if backend == "inductor" and shutil.which("g++") is None:
+        pytest.skip("inductor needs a C++ compiler, g++")
     problem = Problem(*sizes, (2,), mask="partial")
     inputs = [tensor.requires_grad_() for tensor in problem.tensors]
 
     def call(*tensors):  # all four in one graph: compiling is what takes the time
         return [value for scheme in SCHEMES for value in analyse(*tensors, **problem.options(scheme))]
 
-    eager, compiled = call(*inputs), torch.compile(call, fullgraph=True)(*inputs)
+    eager, compiled = call(*inputs), torch.compile(call, fullgraph=True, backend=backend)(*inputs)
     for ours, theirs in zip(compiled, eager, strict=True):
         torch.testing.assert_close(ours, theirs, **EXACT)
     gradients = [torch.autograd.grad(sum(v.square().sum() for v in out), inputs) for out in (compiled, eager)]

@@ -53,7 +53,10 @@ class Killed(Exception):
     """As if the process had ended."""
 
 
-@pytest.mark.parametrize("stage", ["sensor", "filter", "end_to_end"])
+@pytest.mark.parametrize(
+    "stage",
+    [pytest.param("sensor", marks=pytest.mark.slow), "filter", pytest.param("end_to_end", marks=pytest.mark.slow)],
+)
 def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp_path, monkeypatch):
     shutil.copytree(trained[0] / "cache", tmp_path / "cache")  # the optical flow
     plain = FilterTrainer._update

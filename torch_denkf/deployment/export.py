@@ -15,7 +15,7 @@ from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters._rejection import REJECTED
-from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler
+from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.modules._base import flat_noise
 
 
@@ -66,7 +66,7 @@ def export_step(
     Raises:
         KeyError: if an entry that the step reads is missing.
         ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
-        RuntimeError: if there is no C++ compiler.
+        RuntimeError: if there is no C++ compiler, or this torch cannot trace the step.
         OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
@@ -114,7 +114,7 @@ def export_step(
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
     try:
         with torch.no_grad():
-            program = torch.export.export(step, values)
+            program = trace_below_autograd(step, values)
     finally:
         filter.train(was_training)
     package = io.BytesIO()  # torch's own writer ends the process where the disk is full

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from torch_denkf._checks import has_values
+from torch_denkf._checks import flag_value
 from torch_denkf.filters._said import say_once
 from torch_denkf.modules._base import Entries
 
@@ -90,6 +90,6 @@ def _variances(belief: Iterable[NestedKey]) -> list[NestedKey]:
 
 def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
     """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
-    if variance.is_cuda or not has_values(variance):
+    if torch.compiler.is_compiling() or variance.is_cuda:
         return None
-    return bool((variance > ceiling).any())
+    return flag_value((variance > ceiling).any())

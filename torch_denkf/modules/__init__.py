@@ -8,6 +8,7 @@ from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.black import BlackIsMissing
 from torch_denkf.modules.check import check_analysis
 from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
@@ -62,6 +63,7 @@ __all__ = [
     "ConstantNoise",
     "ScaledNoise",
     "ImageSensor",
+    "BlackIsMissing",
     "VectorSensor",
     "FlowSensor",
     "MemberGain",

@@ -6,11 +6,14 @@ from collections import OrderedDict
 from copy import deepcopy
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from benchmarks.common.recipes import Recipe, Registry
-from benchmarks.g1.motion import FADING, AtRest, BiasedReading, Motion, transition
+from benchmarks.common.arms import ArmRecipe, AtRest
+from benchmarks.common.recipes import Registry
+from benchmarks.g1.baselines import SPREAD_CELLS
+from benchmarks.g1.motion import FADING, BiasedReading, Motion
 from benchmarks.g1.sensors import Statistics
 from benchmarks.g1.targets import Target
 from torch_denkf.filters import Filter
@@ -45,7 +48,7 @@ class RatesAndBias(SubModel):
         return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 
 
-class G1Recipe(Recipe):
+class G1Recipe(ArmRecipe):
     """A filter of D numbers of a robot, behind a trained sensor. All carry them in the first D entries of their mean.
 
     Args:
@@ -55,18 +58,26 @@ class G1Recipe(Recipe):
         error: root mean square error of the sensor, ``[D]``, on episodes that it has not seen.
         start: standard deviation of where episodes begin, ``[D]``.
         encoding: features of the sensor's encoding.
-        ensemble_size: members of an ensemble.
+        spread: the variance of the sensor's errors as a function of the encoding, fitted before.
     """
 
-    actions = False  # whether the motion reads the commands
     encoders = False  # whether some joints have noisy encoders
-    bias = True  # whether the state holds the sensor's slow errors
+    fitted = True  # whether R and the noise of the bias begin as the fitted variance of the sensor's errors
     members = MEMBERS
     longer = 1  # times as many updates as others
 
-    def __init__(self, target: Target, facts: Statistics, motion: Motion, error: Tensor, start: Tensor, encoding: int):
+    def __init__(
+        self,
+        target: Target,
+        facts: Statistics,
+        motion: Motion,
+        error: Tensor,
+        start: Tensor,
+        encoding: int,
+        spread: DiagonalNoise,
+    ):
         self.target, self.facts, self.motion = target, facts, deepcopy(motion)
-        self.error, self.start, self.encoding = error, start, encoding
+        self.error, self.start, self.encoding, self.spread = error, start, encoding, spread
         self.dims, self.unit = range(target.size), torch.full((target.size,), target.unit)
 
     def belief(self, std: Tensor) -> TensorDictModuleBase:
@@ -74,8 +85,16 @@ class G1Recipe(Recipe):
         raise NotImplementedError
 
     def noise(self):
-        keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding")}
-        return ScaledNoise(DiagonalNoise(self.target.size, r=self.white * self.error, num_cells=(16,), **keys))
+        return ScaledNoise(self._of_sensor(self.white, ("sensor", "noise")))
+
+    def _of_sensor(self, share: float, out_key: NestedKey) -> DiagonalNoise:
+        """A share of the sensor's errors, from what it sees; before training as it was fitted."""
+        root = (self.spread.variance + self.spread.floor).sqrt() if self.fitted else self.error
+        keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding"), "out_key": out_key}
+        noise = DiagonalNoise(self.target.size, r=share * root, num_cells=SPREAD_CELLS, **keys)
+        if self.fitted:
+            noise.module.load_state_dict(self.spread.module.state_dict())
+        return noise
 
     @property
     def white(self) -> float:
@@ -83,18 +102,14 @@ class G1Recipe(Recipe):
         return WHITE if self.bias else 1.0
 
     @property
-    def size(self) -> int:
-        """S, of the state."""
-        return self.target.size * (3 if self.bias else 2)
-
-    @property
     def noisy(self) -> list[int]:
         """Dimensions of the state that the process noise acts on: the numbers follow from their rates."""
         return list(range(self.target.size, self.size))
 
-    def transition(self) -> SubModel:
-        """The learned motion, with a copy of its pre-trained parameters."""
-        return transition(self.motion, self.bias)
+    @property
+    def rates(self) -> list[int]:
+        """Dimensions of the state that are rates."""
+        return list(range(self.target.size, 2 * self.target.size))
 
     def observation(self) -> SubModel:
         """H."""
@@ -105,10 +120,6 @@ class G1Recipe(Recipe):
         """What motion and bias do not know before training: accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * SLOW * self.error
         return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
-
-    def process_noise(self) -> SubModel:
-        """Q of rates and bias, from the belief's mean."""
-        return ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> SubModel:
         motion, size = self.motion, self.target.size
@@ -124,24 +135,12 @@ class G1Recipe(Recipe):
         )
         if not self.bias:
             return rates
-        slow = DiagonalNoise(
-            size,
-            r=self.process_std[size:],
-            num_cells=(16,),
-            in_features=self.encoding,
-            in_key=("sensor", "encoding"),
-            out_key=("forecast", "noise"),
-        )
+        slow = self._of_sensor((1 - FADING**2) ** 0.5 * SLOW, ("forecast", "noise"))
         return RatesAndBias(rates, slow)
-
-    @property
-    def state_scale(self) -> Tensor:
-        """Units of the loss; rates and biases do not count."""
-        return torch.cat([self.unit, torch.full((self.size - self.target.size,), torch.inf)])
 
     def _initial(self, std: Tensor, rates: float) -> TensorDictModuleBase:
         whole = torch.cat([std, rates * self.motion.rate, SLOW * self.error])[: self.size]
-        return AtRest(self.belief(whole), self.size)
+        return AtRest(self.belief(whole), self.size, self.target.size, "start")
 
     def build(self) -> Filter:
         """The filter, on readings; episodes begin somewhere where those of the training do."""

@@ -98,5 +98,7 @@ class DEnKFEncoders(DEnKF):
 class ADEnKF(DEnKF):
     """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
 
+    fitted = False  # to the truth
+
     def loss(self, model):
         return self.likelihood_loss(model)

@@ -2,49 +2,19 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-
-import torch
-
+from benchmarks.common.gaussian import Backprop, Extended, Unscented
 from benchmarks.g1.recipes._base import G1Recipe, register
-from torch_denkf.modules import (
-    CholeskyNoise,
-    EKFAnalysis,
-    EKFTransition,
-    GaussianAround,
-    MappedNoise,
-    SubModel,
-    UKFAnalysis,
-    UKFTransition,
-)
+from torch_denkf.modules import GaussianAround
 
 
-class _Gaussian(G1Recipe):
-    """Noise of the rates moves the joints in the same step, as it does the members of an ensemble."""
-
-    Analysis = EKFAnalysis
-
-    def forecast(self, noise: SubModel) -> SubModel:
-        """Mean and covariance a step on; its Jacobian is a constant to the gradient, as in Kloss et al."""
-        return EKFTransition(self.transition(), noise, stop_jacobian_gradient=True)
-
-    def modules(self):
-        size = self.target.size
-        matrix = torch.eye(self.size)[:, self.noisy]
-        matrix[range(size), range(size)] = 1.0
-        return OrderedDict(
-            noise=self.noise(),
-            transition=self.forecast(MappedNoise(self.process_noise(), matrix)),
-            analysis=self.Analysis(self.observation()),
-        )
-
+class _Start(G1Recipe):
     def belief(self, std):
         return GaussianAround(std, state_key="start")
 
 
 @register
-class DEKF(_Gaussian):
-    """Differentiable extended Kalman filter (Kloss et al. 2021), Jacobians through the learned motion."""
+class DEKF(Extended, _Start):
+    """See :class:`benchmarks.common.gaussian.Extended`."""
 
 
 @register
@@ -55,20 +25,10 @@ class DEKFActions(DEKF):
 
 
 @register
-class DUKF(_Gaussian):
-    """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
-
-    Analysis = UKFAnalysis
-
-    def forecast(self, noise: SubModel) -> SubModel:
-        """Mean and covariance a step on."""
-        return UKFTransition(self.transition(), noise)
+class DUKF(Unscented, _Start):
+    """See :class:`benchmarks.common.gaussian.Unscented`."""
 
 
 @register
-class BKF(_Gaussian):
-    """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant with all covariances."""
-
-    def _process_noise(self) -> SubModel:
-        keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
-        return CholeskyNoise(len(self.noisy), r=self.process_std, in_features=self.size, **keys)
+class BKF(Backprop, _Start):
+    """See :class:`benchmarks.common.gaussian.Backprop`."""

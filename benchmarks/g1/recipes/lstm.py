@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from benchmarks.g1.motion import AtRest
+from benchmarks.common.arms import AtRest
 from benchmarks.g1.recipes._base import G1Recipe, register
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import GaussianAround, WithMemory
@@ -37,7 +37,8 @@ class LSTM(G1Recipe):
         return OrderedDict((name, whole[name]) for name in ("transition", "lstm"))
 
     def _initial(self, std, rates):
-        return WithMemory(AtRest(GaussianAround(std, state_key="start"), self.target.size), HIDDEN)
+        size = self.target.size
+        return WithMemory(AtRest(GaussianAround(std, state_key="start"), size, size, "start"), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

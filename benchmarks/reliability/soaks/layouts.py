@@ -3,6 +3,9 @@
 The filter draws nothing at random, so that what an environment returns follows from what it was given: the belief of
 t+1 from that of t, the action and the frame; the belief after a reset is known; and what is handed on from step to
 step, and from batch to batch, must be what came out before.
+
+Each process's environment has several rows, so that one exchange between processes moves steps of all of them. Steps
+are counted of each row: 64 rows that step once are 64 steps, and one exchange.
 """
 
 from __future__ import annotations
@@ -24,30 +27,29 @@ from torch_denkf.transforms import DEnKFTransform
 
 __all__ = ["LAYOUTS", "rows"]
 
-ROWS, FRAMES = 4, 2000  # environments, and steps of all of them in a batch
-WORKERS = 2
-LENGTHS = [3, 5, 17, 23]  # of the episodes in each row: resets are partial
+ENVIRONMENTS, ROWS = 4, 16  # processes of a ParallelEnv, and rows of each
+FRAMES = 6400  # steps of all rows in a batch
+WORKERS = 2  # processes of a collector
+LENGTHS = [3, 5, 17, 23] * (ROWS // 4)  # of the episodes in each row: resets are partial
 BELIEF = (("belief", "ensemble"), ("belief", "mean"), ("belief", "var"))
 CLOSE = 1e-4  # float32, another order of sums
 
 
-def filtered(base: EnvBase | None = None, *, seed: int = 0, rows: int | None = ROWS) -> EnvBase:
-    """An environment with the filter in it; half of its readings are missing."""
-    if base is None:
-        lengths = LENGTHS[:rows] if rows else LENGTHS[seed % len(LENGTHS)]
-        base = base_env(seed=seed, missing=0.5, max_steps=lengths, batch_size=[rows] if rows else [])
+def plain(seed: int = 0) -> EnvBase:
+    """Rows without a filter; half of their readings are missing."""
+    return base_env(seed=seed, missing=0.5, max_steps=LENGTHS, batch_size=[ROWS])
+
+
+def filtered(base: EnvBase | None = None, *, seed: int = 0) -> EnvBase:
+    """An environment with the filter in it."""
+    base = plain(seed) if base is None else base
     return TransformedEnv(TransformedEnv(base, DEnKFTransform(linear_denkf("etkf"))), InitTracker())
 
 
-def plain(seed: int) -> EnvBase:
-    """One row without a filter."""
-    return base_env(seed=seed, missing=0.5, max_steps=LENGTHS[seed % len(LENGTHS)])
-
-
-def _many(kind: type, inside: bool) -> EnvBase:
-    if inside:
-        return kind(ROWS, [partial(filtered, seed=k, rows=None) for k in range(ROWS)], serial_for_single=False)
-    return filtered(kind(ROWS, [partial(plain, seed=k) for k in range(ROWS)], serial_for_single=False))
+def _many(kind: type, inside: bool, first: int = 0) -> EnvBase:
+    make = (lambda k: partial(filtered, seed=k)) if inside else (lambda k: partial(plain, k))
+    env = kind(ENVIRONMENTS, [make(first + k) for k in range(ENVIRONMENTS)], serial_for_single=False)
+    return env if inside else filtered(env)
 
 
 def _collected(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBase]:
@@ -58,8 +60,9 @@ def _collected(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBa
         collector.shutdown()
 
 
-def _collected_by_workers(makes: list[Callable[[], EnvBase]], total: int) -> Iterator[TensorDictBase]:
-    collector = MultiCollector(makes, None, frames_per_batch=FRAMES, total_frames=total, sync=True, cat_results=0)
+def _collected_by_workers(makes: list[Callable[[], EnvBase]], total: int, sync: bool) -> Iterator[TensorDictBase]:
+    frames = {"frames_per_batch": FRAMES, "total_frames": total}
+    collector = MultiCollector(makes, None, **frames, sync=sync, **({"cat_results": 0} if sync else {}))
     try:
         yield from collector
     finally:
@@ -69,8 +72,8 @@ def _collected_by_workers(makes: list[Callable[[], EnvBase]], total: int) -> Ite
 def _rollouts(make: Callable[[], EnvBase], total: int) -> Iterator[TensorDictBase]:
     env = make()
     try:
-        carry, steps = env.reset(), FRAMES // ROWS
-        for _ in range(total // FRAMES):
+        carry, steps = env.reset(), FRAMES // (ENVIRONMENTS * ROWS)
+        for _ in range(-(-total // FRAMES)):
             out = env.rollout(
                 steps, auto_reset=False, tensordict=carry, break_when_any_done=False, return_contiguous=True
             )
@@ -87,13 +90,13 @@ LAYOUTS: dict[str, Callable[[int], Iterator[TensorDictBase]]] = {
     "Collector over ParallelEnv, filter inside": lambda total: _collected(partial(_many, ParallelEnv, True), total),
     "Collector over ParallelEnv, filter outside": lambda total: _collected(partial(_many, ParallelEnv, False), total),
     "ParallelEnv by hand, filter inside": lambda total: _rollouts(partial(_many, ParallelEnv, True), total),
-    "MultiCollector, 2 workers": lambda total: _collected_by_workers(
-        [partial(filtered, seed=k) for k in range(WORKERS)], total
-    ),
-    "MultiCollector, 2 workers, each over ParallelEnv, filter inside": lambda total: _collected_by_workers(
-        [partial(_many, ParallelEnv, True)] * WORKERS, total
-    ),
 }
+for sync in (True, False):
+    kind = f"MultiCollector, 2 workers, {'in turn' if sync else 'as they come'}"
+    alone = [partial(filtered, seed=k) for k in range(WORKERS)]
+    nested = [partial(_many, ParallelEnv, True, k * ENVIRONMENTS) for k in range(WORKERS)]
+    LAYOUTS[kind] = partial(_collected_by_workers, alone, sync=sync)
+    LAYOUTS[f"{kind}, each over ParallelEnv, filter inside"] = partial(_collected_by_workers, nested, sync=sync)
 
 
 class Reference:
@@ -102,7 +105,7 @@ class Reference:
     def __init__(self):
         self.filter = linear_denkf("etkf")
         self.start = self.filter.initial.members
-        self.last: TensorDictBase | None = None
+        self.ends: list[TensorDictBase] = []  # of the last batch; of each worker's, where they come in any order
         self.worst = {"step": 0.0, "reset": 0.0, "handed on": 0.0}
         self.frames = self.resets = self.missing = 0
 
@@ -118,9 +121,10 @@ class Reference:
         for key in BELIEF:
             self._at("step", by_hand[key], following[key].flatten(0, 1))
         self._hands_on(batch[:, :-1]["next"], batch[:, 1:])
-        if self.last is not None and self.last.shape[0] == batch.shape[0]:
-            self._hands_on(self.last, batch[:, :1])
-        self.last = batch[:, -1:]["next"].clone()
+        before = [k for k, end in enumerate(self.ends) if _goes_on(end, batch[:, :1])]
+        if before:
+            self._hands_on(self.ends.pop(before[0])["next"], batch[:, :1])
+        self.ends.append(batch[:, -1:].clone())
 
     def _hands_on(self, before: TensorDictBase, after: TensorDictBase) -> None:
         done = before["done"].squeeze(-1)
@@ -136,6 +140,15 @@ class Reference:
         off = (one - other).abs()
         largest = float(off.max()) if off.numel() else 0.0
         self.worst[what] = float("nan") if largest != largest else max(self.worst[what], largest)
+
+
+def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
+    """Whether a batch goes on where another ended: in the same episodes, which collectors number."""
+    episodes = [each.get(("collector", "traj_ids"), None) for each in (end, start)]
+    if any(episode is None for episode in episodes):
+        return True
+    same = (episodes[0] == episodes[1]) | end["next", "done"].squeeze(-1)
+    return bool(same.all())
 
 
 def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
@@ -159,6 +172,8 @@ def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
             "resets": reference.resets,
             "missing readings": reference.missing,
             **worst,
-            "right": reference.frames >= steps and all(value < CLOSE for value in worst.values()),
+            "right": reference.frames >= steps
+            and all(value < CLOSE for value in worst.values())
+            and len(reference.ends) == (WORKERS if "as they come" in name else 1),
             "seconds": round(time.time() - began, 1),
         }

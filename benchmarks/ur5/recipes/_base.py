@@ -9,12 +9,13 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from benchmarks.common.recipes import Recipe, Registry
+from benchmarks.common.arms import ArmRecipe, AtRest
+from benchmarks.common.recipes import Registry
 from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.motion import ERRORS, FADING, NOISY, SIZE, ArmMotion, AtRest, BiasedReading, transition
-from benchmarks.ur5.sensors import MEMBERS, BlackIsMissing, NearForecast, Preset, Statistics
+from benchmarks.ur5.motion import ERRORS, FADING, NOISY, RATES, SIZE, ArmMotion, BiasedReading
+from benchmarks.ur5.sensors import MEMBERS, NearForecast, Preset, Statistics
 from torch_denkf.filters import Filter
-from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
+from torch_denkf.modules import BlackIsMissing, DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
 
 WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
 INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states
@@ -24,7 +25,7 @@ FILTERS = Registry()
 register = FILTERS.register
 
 
-class UR5Recipe(Recipe):
+class UR5Recipe(ArmRecipe):
     """A filter of an arm: all read the same sensor and begin with the same motion, and all carry the table's ten
     numbers in the first ten entries of their mean.
 
@@ -43,8 +44,7 @@ class UR5Recipe(Recipe):
     """
 
     dims, unit, scaled = range(STATE), ERRORS, (ScaledNoise, NearForecast)
-    actions = False  # whether the motion reads the joints' targets
-    bias = True  # whether the state holds the sensor's slow errors
+    rates = RATES
 
     def __init__(
         self,
@@ -68,18 +68,9 @@ class UR5Recipe(Recipe):
         return ScaledNoise(DiagonalNoise(STATE, r=WHITE * self.error, **keys))
 
     @property
-    def size(self) -> int:
-        """S, of the state."""
-        return SIZE + STATE * self.bias
-
-    @property
     def noisy(self) -> list[int]:
         """Dimensions of the state that the process noise acts on."""
         return [*NOISY, *range(SIZE, self.size)]
-
-    def transition(self) -> SubModel:
-        """The learned motion, with a copy of its pre-trained parameters."""
-        return transition(self.motion, self.bias)
 
     def observation(self) -> SubModel:
         """H of the near reading."""
@@ -90,10 +81,6 @@ class UR5Recipe(Recipe):
         """What motion and bias do not know before training: 0.5 mm, usual accelerations; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
         return torch.cat([torch.full((3,), 0.0005), self.facts.acceleration, slow])[: len(self.noisy)]
-
-    def process_noise(self) -> SubModel:
-        """Q of place, rates and bias, from the belief's mean."""
-        return ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> SubModel:
         facts, blind = self.facts, self.size - SIZE
@@ -108,11 +95,6 @@ class UR5Recipe(Recipe):
         )
 
     @property
-    def state_scale(self) -> Tensor:
-        """Units of the loss; rates and biases do not count."""
-        return torch.cat([self.unit, torch.full((self.size - STATE,), torch.inf)])
-
-    @property
     def start_std(self) -> Tensor:
         """How wrong training windows begin, ``[17]``."""
         # As far as a filter is off in the long run, or it learns to hold on to where it began.
@@ -125,7 +107,7 @@ class UR5Recipe(Recipe):
     def initial(self) -> TensorDictModuleBase:
         """The belief at the start of an episode: near the true state, at rest."""
         std = torch.cat([INITIAL * self.facts.scale, torch.zeros(JOINTS)])
-        return AtRest(self.belief(self._with_bias(std), "state"), "state", self.size)
+        return AtRest(self.belief(self._with_bias(std), "state"), self.size, STATE)
 
     def build(self) -> Filter:
         """The whole filter, from pictures on."""
@@ -138,4 +120,4 @@ class UR5Recipe(Recipe):
         if not training:
             return Filter(parts, initial=model.initial)
         belief = self.belief(self._with_bias(self.start_std), "start")
-        return Filter(parts, initial=AtRest(belief, "start", self.size))
+        return Filter(parts, initial=AtRest(belief, self.size, STATE, "start"))

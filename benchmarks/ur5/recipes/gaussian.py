@@ -4,67 +4,32 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-import torch
-
-from benchmarks.ur5.demos import JOINTS
-from benchmarks.ur5.motion import RATES
+from benchmarks.common.gaussian import Backprop, Extended, Unscented
 from benchmarks.ur5.recipes._base import UR5Recipe, register
 from benchmarks.ur5.sensors import NEAR, NearForecast
-from torch_denkf.modules import (
-    CholeskyNoise,
-    EKFAnalysis,
-    EKFTransition,
-    GaussianAround,
-    MappedNoise,
-    SubModel,
-    UKFAnalysis,
-    UKFTransition,
-)
+from torch_denkf.modules import GaussianAround
 
 
-class _Gaussian(UR5Recipe):
-    """Noise of the rates moves the joints in the same step, as it does the members of an ensemble."""
+class _Near(UR5Recipe):
+    reading_key = NEAR
 
-    Analysis = EKFAnalysis
-
-    def forecast(self, noise: SubModel) -> SubModel:
-        """Mean and covariance a step on; its Jacobian is a constant to the gradient, as in Kloss et al."""
-        return EKFTransition(self.transition(), noise, stop_jacobian_gradient=True)
-
-    def modules(self):
-        matrix = torch.eye(self.size)[:, self.noisy]
-        matrix[range(JOINTS), [self.noisy.index(rate) for rate in RATES]] = 1.0
-        return OrderedDict(
-            noise=self.noise(),
-            transition=self.forecast(MappedNoise(self.process_noise(), matrix)),
-            near=NearForecast(self.preset, ("forecast", "mean")),
-            analysis=self.Analysis(self.observation(), observation_key=NEAR),
-        )
+    def readings(self):
+        return OrderedDict(near=NearForecast(self.preset, ("forecast", "mean")))
 
     def belief(self, std, state_key):
         return GaussianAround(std, state_key=state_key)
 
 
 @register
-class DEKF(_Gaussian):
-    """Differentiable extended Kalman filter (Kloss et al. 2021), Jacobians through the learned motion."""
+class DEKF(Extended, _Near):
+    """See :class:`benchmarks.common.gaussian.Extended`."""
 
 
 @register
-class DUKF(_Gaussian):
-    """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
-
-    Analysis = UKFAnalysis
-
-    def forecast(self, noise: SubModel) -> SubModel:
-        """Mean and covariance a step on."""
-        return UKFTransition(self.transition(), noise)
+class DUKF(Unscented, _Near):
+    """See :class:`benchmarks.common.gaussian.Unscented`."""
 
 
 @register
-class BKF(_Gaussian):
-    """Backprop-KF (Haarnoja et al. 2016): R from the frame, Q a learned constant with all covariances."""
-
-    def _process_noise(self) -> SubModel:
-        keys = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}
-        return CholeskyNoise(len(self.noisy), r=self.process_std, in_features=self.size, **keys)
+class BKF(Backprop, _Near):
+    """See :class:`benchmarks.common.gaussian.Backprop`."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
+from benchmarks.common.arms import AtRest
 from benchmarks.ur5.demos import STATE
-from benchmarks.ur5.motion import AtRest
 from benchmarks.ur5.recipes._base import INITIAL, UR5Recipe, register
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import GaussianAround, WithMemory
@@ -40,7 +40,7 @@ class LSTM(UR5Recipe):
 
     def belief(self, std, state_key):
         # Of ten numbers: it has no use for rates.
-        return WithMemory(AtRest(GaussianAround(std[:STATE], state_key=state_key), state_key, STATE), HIDDEN)
+        return WithMemory(AtRest(GaussianAround(std[:STATE], state_key=state_key), STATE, STATE, state_key), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

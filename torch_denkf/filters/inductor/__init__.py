@@ -1,4 +1,4 @@
-"""Passes for inductor, torch.compile's backend: the only room that uses what torch keeps to itself.
+"""Passes for inductor, torch.compile's backend, and the tracing of packages: the only room for torch's private names.
 
 A step is thirty kernels of a microsecond or two; so calling them, and what they save for the backward pass, must cost
 little. The passes make no result right that is wrong without them. They are used with the versions of torch that they
@@ -15,8 +15,16 @@ from typing import Any
 import torch
 
 from torch_denkf.filters.inductor.libraries import clear_damaged_libraries, clear_full_cache
+from torch_denkf.filters.inductor.tracing import trace_below_autograd
 
-__all__ = ["TESTED_VERSIONS", "clear_damaged_libraries", "clear_full_cache", "need_compiler", "options_for_processors"]
+__all__ = [
+    "TESTED_VERSIONS",
+    "clear_damaged_libraries",
+    "clear_full_cache",
+    "need_compiler",
+    "options_for_processors",
+    "trace_below_autograd",
+]
 
 #: Versions of torch, by their first two numbers, that the passes were tested with.
 TESTED_VERSIONS = ("2.13",)

@@ -1,0 +1,85 @@
+"""A tiny run of every study and example, two side by side: ``python -m benchmarks.common.smoke``.
+
+Torch and torchrl are imported once, and each run is a fork of this process: otherwise to import them takes longer than
+most of the runs.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import IO
+
+import torchrl.collectors
+import torchrl.envs
+import torchrl.objectives  # noqa: F401  # what nearly all programs import
+
+import torch_denkf.filters  # noqa: F401
+
+ROOT = Path(__file__).parents[2]
+LONG = ("kitti", "ur5", "g1", "lorenz96")  # studies that come first
+ELSEWHERE = ("speed",)  # needs the libraries that it compares with, see tests/benchmarks/test_speed.py
+SIDE_BY_SIDE = 2
+
+
+def programs() -> list[str]:
+    """Modules and files."""
+    found = {file.parent.name for file in ROOT.glob("benchmarks/*/__main__.py")} - set(ELSEWHERE)
+    studies = [*LONG, *sorted(found - set(LONG))]
+    return [f"benchmarks.{name}" for name in studies] + sorted(
+        f"examples/{file.name}" for file in ROOT.glob("examples/*.py")
+    )
+
+
+def run(program: str) -> None:
+    """Runs a program, as if it had been started by itself."""
+    sys.argv = [program, "--smoke"]
+    if program.endswith(".py"):
+        sys.path.insert(0, str(ROOT / "examples"))
+        runpy.run_path(str(ROOT / program), run_name="__main__")
+    else:
+        runpy.run_module(program, run_name="__main__", alter_sys=True)
+
+
+def start(program: str, log: IO[bytes]) -> int:
+    """A process of its own, whose output goes to a file; its number."""
+    sys.stdout.flush()
+    process = os.fork()
+    if process:
+        return process
+    os.dup2(log.fileno(), 1)
+    os.dup2(log.fileno(), 2)
+    try:
+        run(program)
+    except Exception:
+        traceback.print_exc()
+        sys.exit(1)
+    sys.exit(0)
+
+
+def main() -> None:
+    """Runs all; prints what each said, and ends with an error if one failed."""
+    waiting, running, failed = programs(), {}, []
+    while waiting or running:
+        while waiting and len(running) < SIDE_BY_SIDE:
+            program, log = waiting.pop(0), tempfile.TemporaryFile()  # noqa: SIM115  # read when the process has ended
+            running[start(program, log)] = program, log, time.monotonic()
+        process, status = os.wait()
+        program, log, began = running.pop(process)
+        log.seek(0)
+        text = log.read().decode(errors="replace")
+        log.close()
+        code = os.waitstatus_to_exitcode(status)
+        failed += [program] * (code != 0)
+        print(f"== {program} --smoke: {code}, {time.monotonic() - began:.0f} s\n{text}", flush=True)
+    if failed:
+        raise SystemExit(f"{failed} failed")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""A module as a graph of plain arithmetic, for torch.export's packages."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["trace_below_autograd"]
+
+
+def trace_below_autograd(module: nn.Module, values: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
+    """Records what a module does once automatic differentiation is done.
+
+    ``torch.export.export`` records above it. There a Jacobian that is taken inside the module becomes a constant, the
+    example's, and inductor compiles an LSTM cell to other numbers (torch 2.13): packages that run, and are wrong.
+
+    Args:
+        module: from tensors to a tuple of tensors.
+        values: examples of its inputs; their shapes are the graph's.
+
+    Raises:
+        RuntimeError: if this torch cannot trace so.
+    """
+    try:
+        from torch.export._trace import _export
+    except ImportError as error:
+        raise RuntimeError(
+            f"torch {torch.__version__} does not trace a step below automatic differentiation ({error}); install "
+            "torch 2.13 to export a step."
+        ) from error
+    return _export(module, values, strict=False, pre_dispatch=False)

@@ -1,0 +1,47 @@
+"""A camera that shows nothing says itself that it fails."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_number
+from torch_denkf.modules._base import SubModel
+
+__all__ = ["BlackIsMissing"]
+
+
+class BlackIsMissing(SubModel):
+    """Marks pictures that are black all over as not observed: no scene is.
+
+    A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor:
+    the filter then goes by its motion until the camera is back, and its spread grows.
+
+    Args:
+        threshold: a picture none of whose pixels is brighter, as a share of white, is black.
+        image_key: pictures ``[*B, C, H, W]``, in [0, 1] or of whole numbers up to 255.
+        observed_key: the mask ``[*B, 1]``; pictures that were not observed before stay so.
+
+    Raises:
+        ValueError: if the threshold is not between 0 and 1.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> pictures = torch.stack([torch.zeros(3, 4, 4), torch.full((3, 4, 4), 0.3)])
+        >>> BlackIsMissing()(TensorDict({"pixels": pictures}, [2]))["observed"].tolist()
+        [[False], [True]]
+    """
+
+    def __init__(
+        self, threshold: float = 0.02, *, image_key: NestedKey = "pixels", observed_key: NestedKey = "observed"
+    ):
+        check_number("threshold", threshold, least=0, most=1)
+        super().__init__(nn.Identity(), [image_key], [observed_key], optional_keys=[observed_key])
+        self.threshold = threshold
+
+    def compute(self, pixels: Tensor, before: Tensor | None = None) -> Tensor:
+        """The mask ``[*B, 1]``."""
+        white = 1.0 if pixels.is_floating_point() else 255
+        seen = (pixels.flatten(-3).amax(-1, keepdim=True) / white) > self.threshold
+        return seen if before is None else seen & before
