@@ -18,14 +18,17 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import Gated, LSTMFilter, Monitored, ParticleFilter
+from torch_denkf.filters import FusedFilter, FusedSensor, Gated, LSTMFilter, Monitored, ParticleFilter
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianLikelihood,
     GaussianPrior,
     InnovationMonitor,
     LinearObservation,
+    LinearTransition,
+    MomentPrior,
     MonitoredSensor,
+    Select,
 )
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms import DEnKFTransform
@@ -50,6 +53,22 @@ def lstm():
     return LSTMFilter(None, state_dim=2, hidden_size=8, observation_dim=2, observation_key="observation")
 
 
+def fused(kind, *, late=False, **kwargs):
+    """Two sensors that read the same entry, the second one perhaps two steps late."""
+    F, Q, H, R = linear_system()
+    if kind == "Kalman":
+        motion, initial = LinearTransition(F, Q), MomentPrior(torch.zeros(2), torch.eye(2))
+    else:
+        motion = NoisyLinear(F, torch.linalg.cholesky(Q))
+        initial = GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=8)
+    shared = {"reading": "observation", "observed": "observed"}
+    sensors = {
+        "first": FusedSensor(LinearObservation(H), R.sqrt(), **shared),
+        "second": FusedSensor(Select([0, 1]), 2 * R.sqrt(), delay=2 * late, **shared),
+    }
+    return FusedFilter(motion, sensors, initial=initial, **kwargs)
+
+
 FILTERS = {
     "DEnKF etkf": linear_denkf,
     "DEnKF perturbed": lambda: linear_denkf("perturbed", noisy=True),
@@ -66,10 +85,16 @@ FILTERS = {
     "monitored": lambda: Monitored(linear_kalman(), InnovationMonitor({"gps": MonitoredSensor("info", 2)}).double()),
     "gated DEnKF": lambda: Gated(linear_denkf("perturbed", noisy=True), 2, response="reject", rate=0.2, patience=2),
     "gated UKF": lambda: Gated(linear_filter("UKF"), 2, rate=0.2, adapt_noise=0.1),
+    "fused": lambda: fused("ensemble"),
+    "fused, late": lambda: fused("ensemble", late=True),
+    "fused, late, joint": lambda: fused("ensemble", late=True, joint=True),
+    "fused Kalman, late": lambda: fused("Kalman", late=True),
+    "fused Kalman, late, joint": lambda: fused("Kalman", late=True, joint=True),
 }
 LAGGED = ("DEnKF etkf", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
 FILTERS |= {f"{name}, lag": partial(lambda inner: FixedLag(inner(), 3), FILTERS[name]) for name in LAGGED}
 FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}  # of their own
+FILTERS_WITHOUT_NOISE |= {"fused Kalman, late", "fused Kalman, late, joint"}
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)
 #: One of each belief. To trace a step takes dynamo up to half a minute; `make test-all` traces all.

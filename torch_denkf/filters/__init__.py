@@ -5,6 +5,7 @@ from torch_denkf.filters.base import Filter
 from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
+from torch_denkf.filters.fused import FusedFilter, FusedSensor
 from torch_denkf.filters.kalman import KalmanFilter
 from torch_denkf.filters.monitored import Gated, Monitored
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
@@ -23,6 +24,8 @@ __all__ = [
     "MixtureParticleFilter",
     "PFM",
     "LSTMFilter",
+    "FusedFilter",
+    "FusedSensor",
     "GaussianOptions",
     "Gated",
     "Monitored",

@@ -52,7 +52,7 @@ def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[Ne
     for mask, sharing in readers.items():
         whole: dict[NestedKey, None] = {}
         components: dict[NestedKey, None] = {}
-        same = len({tuple(map(unravel_key, _readings(part))) for part in sharing}) == 1
+        same = len({_direct(part, sources) for part in sharing}) == 1
         by_component = same and all(getattr(part, "reads_components", False) for part in sharing)
         for key in (unravel_key(key) for part in sharing for key in _readings(part)):
             for source in sources.get(key, ()):
@@ -64,6 +64,12 @@ def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[Ne
 
 def _readings(part: SubModel) -> Sequence[NestedKey]:
     return getattr(part, "reading_keys", None) or ()
+
+
+def _direct(part: SubModel, sources: Mapping[NestedKey, Sequence[NestedKey]]) -> frozenset[NestedKey]:
+    """The readings that come from outside as they are; all readings, where a module makes them."""
+    keys = [unravel_key(key) for key in _readings(part)]
+    return frozenset([key for key in keys if key in sources.get(key, ())] or keys)
 
 
 def usable(guards: Sequence[Guard], entries: Entries, batch_size: Sequence[int]) -> Entries:

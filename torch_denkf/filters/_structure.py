@@ -240,9 +240,22 @@ def _guards(
         found = {key: None}
         for _, module in reversed([*frames, *update]):
             if not found.keys().isdisjoint(writes(module)):
-                found.update(dict.fromkeys(reads(module)[0]))
+                found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
-    return guards_of(parts, sources)
+    return guards_of(_in_front(parts, sources), sources)
+
+
+def _in_front(parts: Sequence[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[SubModel]:
+    """The parts but for those whose mask another part makes, if others hide the same entries where they come in."""
+    made = {key for part in parts for key in writes(part) if key != getattr(part, "observed_key", None)}
+    first = [part for part in parts if getattr(part, "observed_key", None) not in made]
+
+    def hidden(some: Sequence[SubModel]) -> set[NestedKey]:
+        keys = (unravel_key(key) for part in some for key in getattr(part, "reading_keys", ()))
+        return {source for key in keys for source in sources[key]}
+
+    covered = hidden(first)
+    return [part for part in parts if part in first or not covered.issuperset(hidden([part]))]
 
 
 def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[Placed]:

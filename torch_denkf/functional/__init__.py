@@ -9,6 +9,7 @@ from torch_denkf.functional.chi_square import (
     detectable_bias,
     noncentral_p_value,
 )
+from torch_denkf.functional.continuous import discretise
 from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.gating import Response, adapt, disbelief, spread_about_mean
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
@@ -83,6 +84,7 @@ __all__ = [
     "unscented_moments",
     "unscented_cross",
     "unscented_update",
+    "discretise",
     "wrap_angles",
     "align_angles",
     "mean_observation",

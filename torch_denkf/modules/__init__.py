@@ -11,10 +11,13 @@ from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.black import BlackIsMissing
 from torch_denkf.modules.carried import WithState
 from torch_denkf.modules.check import check_analysis
+from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.flow_sensor import FlowSensor
+from torch_denkf.modules.fused import JoinedObservation, JoinedReading, Renamed, StateObservation
 from torch_denkf.modules.gate import GatedAnalysis, GateOptions
 from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
+from torch_denkf.modules.joint_moments import JointForecast, PresentOfJoint, WithJointMoments
 from torch_denkf.modules.kalman import GaussianAround, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules.keypoints import KeypointTrunk, SpatialSoftArgmax
 from torch_denkf.modules.likelihood import GaussianLikelihood, LearnedLikelihood
@@ -30,6 +33,7 @@ from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, Mom
 from torch_denkf.modules.process_noise import CholeskyNoise, MappedNoise, UnicycleNoise, as_process_noise
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
+from torch_denkf.modules.sensor_weights import SensorAttention, SensorWeights, WeightedNoise
 from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
@@ -48,6 +52,9 @@ __all__ = [
     "LearnedTransition",
     "UnicycleTransition",
     "UnicycleMotion",
+    "ContinuousMotion",
+    "ContinuousNoise",
+    "NoisePerSecond",
     "PairObservation",
     "WithHistory",
     "ClonedPrior",
@@ -100,6 +107,16 @@ __all__ = [
     "CrossTransition",
     "MomentsPast",
     "LaggedMoments",
+    "WithJointMoments",
+    "JointForecast",
+    "PresentOfJoint",
+    "Renamed",
+    "StateObservation",
+    "JoinedObservation",
+    "JoinedReading",
+    "SensorAttention",
+    "SensorWeights",
+    "WeightedNoise",
     "WithMemory",
     "LSTMTransition",
     "LSTMUpdate",

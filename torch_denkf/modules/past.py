@@ -14,12 +14,12 @@ from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel, check_module, named_modules_of, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 
@@ -40,6 +40,8 @@ class InPlaceOf(SubModel):
 
     def parts(self):
         """Those of the module inside."""
+        if type(self.module) is TensorDictSequential:
+            return dict(named_modules_of(self.module))
         return self.module.parts() if isinstance(self.module, SubModel) else {}
 
 

@@ -55,11 +55,14 @@ class LearnedTransition(MemberNetwork):
             the previous step; ``None`` for none.
         action_loc: mean of each command ``[A]``, in its units; zero by default.
         action_scale: standard deviation of each command ``[A]``; one by default.
+        dt_key: entry ``[*B, 1]`` with the seconds since the last step, where steps differ in length: the network then
+            writes the rate of change per second, which is multiplied by it (Euler's step); only if ``residual``.
         in_key: the belief's ensemble ``[*B, E, S]``.
         out_key: the forecast ensemble ``[*B, E, S]``.
 
     Raises:
         KeyError: if an entry is missing.
+        ValueError: if it is not ``residual``, and has a ``dt_key``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -80,20 +83,24 @@ class LearnedTransition(MemberNetwork):
         action_key: NestedKey | None = None,
         action_loc: torch.Tensor | Sequence[float] | None = None,
         action_scale: torch.Tensor | Sequence[float] | None = None,
+        dt_key: NestedKey | None = None,
         in_key: NestedKey = ("belief", "ensemble"),
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
         check_network("network", network)
-        in_keys = [in_key] if action_key is None else [in_key, action_key]
-        super().__init__(network, in_keys, [out_key])
-        self.residual, self.action_key = residual, action_key
+        if dt_key is not None and not residual:
+            raise ValueError(f"dt_key={dt_key!r} scales a change: it needs residual=True.")
+        super().__init__(network, [in_key, *(key for key in (action_key, dt_key) if key is not None)], [out_key])
+        self.residual, self.action_key, self.dt_key = residual, action_key, dt_key
         register_location(self, "loc", loc)
         register_scale(self, "scale", scale)
         register_location(self, "action_loc", action_loc)
         register_scale(self, "action_scale", action_scale)
 
-    def compute(self, state, action=None, *, noise):
+    def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble."""
+        if self.action_key is None:  # then what is read second is the length of the step
+            action, dt = None, action
         features = state if self.loc is None else state - self.loc
         if self.scale is not None:
             features = features / self.scale
@@ -105,6 +112,8 @@ class LearnedTransition(MemberNetwork):
         change = self._run(features, noise)
         if self.scale is not None:
             change = change * self.scale
+        if dt is not None:
+            change = change * dt.to(change.dtype).unsqueeze(-2)
         if self.residual:
             return state + change
         return change if self.loc is None else change + self.loc

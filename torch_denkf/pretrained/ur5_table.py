@@ -131,7 +131,7 @@ class _ArmTransition(LearnedTransition):
         )
         self.register_buffer("change", torch.tensor(scale))
 
-    def compute(self, state, action=None, *, noise):
+    def compute(self, state, action=None, dt=None, *, noise):
         """The forecast ensemble: each joint on its way to its target, and what the network adds to that."""
         way = action.to(state.dtype).unsqueeze(-2) - state[..., :JOINTS]
         features = torch.cat([(state - self.loc) / self.scale, (way / _STEP).clamp(-4, 4)], -1)

@@ -121,7 +121,7 @@ def kind_of(filter: Filter) -> tuple[str, str]:
     transition = filter.transition_module
     for prefix in dict.fromkeys(key[0] for key in carry):
         names = {key[1] for key in carry if key[0] == prefix}
-        if "past" in names or "past_mean" in names:
+        if names & {"past", "past_mean", "joint_mean"}:
             raise TypeError("This filter carries a past already; give the filter that was made for.")
         if {"ensemble", "log_weight"} <= names and isinstance(transition, ResampledTransition):
             return "particles", prefix

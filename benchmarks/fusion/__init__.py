@@ -1,0 +1,1 @@
+"""Several sensors in one filter: each dropped, disturbed or delayed in turn."""

@@ -1,0 +1,171 @@
+"""The study: its options, its conditions, its table."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+
+from benchmarks.common.arguments import command, parse, processor
+from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.fusion.arm import arm_task
+from benchmarks.fusion.car import car_task
+from benchmarks.fusion.task import FAULTS, Task, delayed, faulty, without
+from benchmarks.fusion.training import make_weights, train
+from torch_denkf.training import read_checkpoint, write_checkpoint
+
+COLUMNS = Columns(
+    names=("task", "method", "sensors", "condition", "error", "error_without", "error_ratio"),
+    text=("task", "method", "sensors", "condition"),
+    whole=(),
+    order=lambda row: (row["task"], row["condition"], row["sensors"], row["method"]),
+)
+METHODS = ("plain", "weights")
+SECONDS = 3.0  # that a sensor fails
+WINDOW, BATCH = 50, 32  # steps of a training window, and windows in an update
+
+
+@dataclass(frozen=True)
+class Study:
+    """Several sensors in one filter, on a UR5 and on KITTI: every subset, and each sensor disturbed and delayed."""
+
+    kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
+    out: Path = Path("runs/fusion")
+    demos: int = 3  # of the UR5, for training and for the test each
+    updates: tuple[int, int] = (10, 60)  # of the noise and of the weights
+    processes: int = 1
+    smoke: bool = False  # tiny tasks: does it run?
+
+
+def subsets(task: Task) -> list[tuple[str, ...]]:
+    """Every set of sensors, the smallest first."""
+    names = task.sensors
+    return [some for count in range(1, len(names) + 1) for some in combinations(names, count)]
+
+
+@torch.no_grad()
+def conditions(task: Task) -> tuple[dict[tuple[str, str], TensorDict], slice]:
+    """Recordings by sensors and condition, and the steps of the faults."""
+    every, count = task.sensors, task.test.shape[1]
+    length = min(round(SECONDS * task.rate), count // 2)
+    begin = (count - length) // 2
+    spans = (torch.full((len(task.test),), begin), torch.full((len(task.test),), begin + length))
+    found = {}
+    for some in subsets(task):
+        lacking = [name for name in every if name not in some]
+        found[" + ".join(some), "as it is"] = without(task.test, *lacking)
+    for name in every:
+        for fault in FAULTS:
+            generator = torch.Generator().manual_seed(3)
+            found[" + ".join(every), f"{name}: {fault}"] = faulty(task, task.test, name, fault, *spans, generator)
+    return found, slice(begin, begin + length)
+
+
+@torch.no_grad()
+def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
+    """Errors under all conditions, all recordings of all conditions as one batch."""
+    cases, span = conditions(task)
+    whole, out = torch.cat(list(cases.values())), []
+    for method, network in zip(METHODS, (None, weights), strict=True):
+        errors = task.error(run(task.build(network, task.heeds), whole)).split(len(task.test))
+        by_case = dict(zip(cases, errors, strict=True))
+        for (sensors, condition), error in by_case.items():
+            row = {"task": task.name, "method": method, "sensors": sensors, "condition": condition}
+            if condition == "as it is":
+                out.append({**row, "error": rms(error)})
+                continue
+            failed = condition.partition(":")[0]
+            others = " + ".join(name for name in task.sensors if name != failed)
+            never = rms(by_case[others, "as it is"][:, span])
+            out.append({**row, "error": rms(error[:, span]), "error_without": never})
+            out[-1]["error_ratio"] = out[-1]["error"] / never
+    late = [delayed(task.test, name, task.late[name]) for name in task.sensors]
+    for heed in (False, True):
+        errors = task.error(run(task.build(None, heed), torch.cat(late))).split(len(task.test))
+        for name, data, error in zip(task.sensors, late, errors, strict=True):
+            milliseconds = 1e3 * int(data[f"{name}_late"].max()) / task.rate
+            text = f"{name}: {milliseconds:.0f} ms late, {'heeded' if heed else 'ignored'}"
+            row = {"task": task.name, "method": "plain", "sensors": " + ".join(task.sensors), "condition": text}
+            out.append({**row, "error": rms(error)})
+    return out
+
+
+def run(model, data: TensorDict) -> TensorDict:
+    """The filter's means beside the truth."""
+    return model.sequence(data.copy(), keep=[("belief", "mean")])
+
+
+def rms(error: torch.Tensor) -> float:
+    """Root of the mean square of errors of some components, as a length where they are coordinates."""
+    return float(error.square().mean().sqrt())
+
+
+def job(name: str, study: Study) -> list[dict]:
+    """All of one task."""
+    torch.set_num_threads(1)
+    if name == "UR5":
+        task = arm_task(demos=2, steps=3) if study.smoke else arm_task(demos=study.demos)
+    else:
+        task = car_task(study.kitti, frames=6) if study.smoke else car_task(study.kitti)
+    weights, file = make_weights(task), study.out / f"{name}.pt"
+    if file.exists():
+        saved = read_checkpoint(file)
+        task.parts.load_state_dict(saved["parts"])
+        weights.load_state_dict(saved["weights"])
+    else:
+        train(task, weights, updates=study.updates, window=16 if study.smoke else WINDOW, batch=BATCH)
+        write_checkpoint(file, {"parts": task.parts.state_dict(), "weights": weights.state_dict()})
+    return rows(task, weights)
+
+
+def one_file(file: Path, name: str, study: Study) -> None:
+    """A job of its own process: rows into a file."""
+    once(file, partial(job, name, study))
+
+
+def page(found: Sequence[dict], study: Study) -> str:
+    """Tables of both tasks."""
+    lines = ["# Several sensors in one filter", ""]
+    for task, unit in (("UR5", "degrees, six joints"), ("KITTI", "m, each coordinate")):
+        own = pick(found, task=task)
+        if not own:
+            continue
+        lines += [f"## {task}: root mean square error, {unit}", "", *head("sensors", *METHODS)]
+        subset = pick(own, condition="as it is")
+        for sensors in dict.fromkeys(row["sensors"] for row in subset):
+            errors = [pick(subset, sensors=sensors, method=method)[0]["error"] for method in METHODS]
+            lines.append(line(sensors, *(f"{error:.3g}" for error in errors)))
+        lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, beside the error of the"]
+        lines += ["filter that never had the sensor, in the same time.", ""]
+        lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times")
+        failing = [row for row in own if "error_ratio" in row]
+        for condition in dict.fromkeys(row["condition"] for row in failing):
+            plain, weighed = (pick(failing, condition=condition, method=method)[0] for method in METHODS)
+            cells = [plain["error"], weighed["error"], weighed["error_without"]]
+            cells += [plain["error_ratio"], weighed["error_ratio"]]
+            lines.append(line(condition, *(f"{cell:.3g}" for cell in cells)))
+        lines += ["", "A sensor comes late:", "", *head("delay", "error")]
+        lines += [line(row["condition"], f"{row['error']:.3g}") for row in own if "late" in row["condition"]]
+        lines.append("")
+    lines += [f"* Command: `{command('fusion')}`.", f"* Hardware: {processor()}; torch {torch.__version__}."]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Runs the study; one that was broken off goes on."""
+    study = parse(Study)
+    if study.smoke:
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), updates=(1, 1))
+    tasks = ["UR5"] + ["KITTI"] * (study.kitti is not None or study.smoke)
+    files = {study.out / "parts" / f"{name}.json": name for name in tasks}
+    side_by_side([partial(one_file, file, name, study) for file, name in files.items()], study.processes, "fusion")
+    found = read_rows(files)
+    COLUMNS.write(found, study.out / "fusion.csv")
+    write_page(page(found, study), study.out / "fusion.md")

@@ -1,0 +1,116 @@
+"""What both tasks say about themselves, and what can happen to a sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from torch_denkf.filters import FusedFilter
+
+__all__ = ["FAULTS", "FEATURE_STEPS", "Task", "add_features", "delayed", "faulty", "without"]
+
+#: What a sensor does for a while, without a word.
+FAULTS = ("frozen", "offset", "noise")
+FEATURE_STEPS = 5  # readings of which the spread is a feature
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task.
+
+    Attributes:
+        name: of the task.
+        rate: of the filter's steps, in Hz.
+        offsets: by sensor, what a fault adds, in the reading's units.
+        noises: by sensor, standard deviations of the readings.
+        late: by sensor, by how many more steps its readings come late where it is delayed.
+        train: windows ``[N, T]`` on which noise and weights are trained.
+        test: recordings ``[N, T]``.
+        parts: what is trained: the modules of the noise.
+        build: makes a filter of these, from the network of its weights and whether it heeds delays.
+        heeds: whether the usual filter does.
+        loss: of a filter's output, to be trained on.
+        error: of a belief against the truth, ``[N, T, D]``, in ``unit``.
+        unit: of the errors.
+    """
+
+    name: str
+    rate: float
+    offsets: dict[str, Tensor]
+    noises: dict[str, Tensor]
+    late: dict[str, int]
+    train: TensorDict
+    test: TensorDict
+    parts: nn.ModuleDict
+    build: Callable[[nn.Module | None, bool], FusedFilter]
+    heeds: bool
+    loss: Callable[[TensorDict], Tensor]
+    error: Callable[[TensorDict], Tensor]
+    unit: str
+
+    @property
+    def sensors(self) -> list[str]:
+        """Names of all sensors."""
+        return list(self.offsets)
+
+
+def without(data: TensorDict, *sensors: str) -> TensorDict:
+    """The recordings without some sensors' readings."""
+    out = data.copy()
+    for name in sensors:
+        out[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
+    return out
+
+
+def faulty(
+    task: Task, data: TensorDict, sensor: str, fault: str, begin: Tensor, end: Tensor, generator: torch.Generator
+) -> TensorDict:
+    """The recordings with one sensor out of order from ``begin`` to ``end`` ``[N]``, which its mask does not tell."""
+    time = torch.arange(data.shape[1]).unsqueeze(0)
+    bad = ((time >= begin.unsqueeze(-1)) & (time < end.unsqueeze(-1))).unsqueeze(-1)
+    reading = data[sensor]
+    if fault == "frozen":
+        held = reading.gather(1, (begin - 1).clamp(min=0).reshape(-1, 1, 1).expand(-1, 1, reading.shape[-1]))
+        wrong = held.expand_as(reading)
+    elif fault == "offset":
+        wrong = reading + task.offsets[sensor]
+    else:
+        wrong = reading + 10 * task.noises[sensor] * torch.randn(reading.shape, generator=generator)
+    out = data.copy()
+    out[sensor] = torch.where(bad, wrong, reading)
+    return add_features(out, sensor)
+
+
+def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
+    """The recordings with one sensor's readings so many steps late."""
+    out = data.copy()
+    for key in (sensor, f"{sensor}_observed", f"{sensor}_features"):
+        out[key] = data[key].roll(steps, 1)
+    out[f"{sensor}_observed"][:, :steps] = False
+    out[f"{sensor}_late"] = data[f"{sensor}_late"] + steps
+    return out
+
+
+def add_features(data: TensorDict, *sensors: str) -> TensorDict:
+    """Adds what tells of a frozen or a noisy sensor: how much its last readings differ, as a logarithm.
+
+    The sensor's readings are held between the steps at which they are taken.
+    """
+    out = data.copy()
+    for name in sensors:
+        reading, seen = data[name], data[f"{name}_observed"]
+        time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
+        spread, index = torch.zeros_like(reading), torch.where(seen, time, 0).cummax(1).values
+        present = reading.gather(1, index.expand_as(reading))
+        before = present
+        for _ in range(FEATURE_STEPS):
+            index = torch.where(seen, time, 0).cummax(1).values.gather(1, (index - 1).clamp(min=0))
+            earlier = reading.gather(1, index.expand_as(reading))
+            spread = spread + (before - earlier).abs() / FEATURE_STEPS
+            before = earlier
+        out[f"{name}_features"] = (spread + 1e-3 * reading.abs().mean() + 1e-6).log()
+    return out

@@ -1,0 +1,419 @@
+"""Several sensors in one filter: one Kalman filter of all readings in their order is the oracle."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torch.testing import assert_close
+
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import directional_check
+from torch_denkf.filters import EKF, DEnKF, Filter, FusedFilter, FusedSensor
+from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.modules import (
+    CholeskyNoise,
+    ConstantNoise,
+    DiagonalNoise,
+    EKFTransition,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MappedNoise,
+    MomentPrior,
+    Select,
+    StochasticMLP,
+    UKFTransition,
+    VectorSensor,
+)
+from torch_denkf.smoothers import FixedLag
+
+B, T, DELAY = 3, 11, 3
+BELIEF = [("belief", "mean"), ("belief", "cov")]
+KINDS = ("Kalman", "EKF", "UKF")
+
+
+def known_noise():
+    unit = ConstantNoise([1.0, 1.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    return MappedNoise(unit, torch.linalg.cholesky(linear_system()[1]))
+
+
+def sensors(**second):
+    """The two components of the linear system's reading, as two sensors."""
+    _, _, H, R = linear_system()
+    return {
+        "first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
+        "second": FusedSensor(LinearObservation(H[1:]), R[1:].sqrt(), **second),
+    }
+
+
+def fused(kind, *, joint=False, lag=None, members=None, noisy=True, **second):
+    F, Q, _, _ = linear_system()
+    if kind == "ensemble":
+        motion = NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None)
+        return FusedFilter(motion, sensors(**second), initial=FixedEnsemble(members), joint=joint, lag=lag)
+    motion = LinearTransition(F, Q)
+    if kind != "Kalman":
+        motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), known_noise())
+    initial = MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.tensor([1.0, 2.0])))
+    return FusedFilter(motion, sensors(**second), initial=initial, joint=joint, lag=lag)
+
+
+def readings():
+    """Readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
+    torch.manual_seed(0)
+    y = torch.randn(B, T, 2)
+    frames = TensorDict({"first": y[..., :1], "second": y[..., 1:]}, [B, T])
+    for name in ("first", "second"):
+        frames[f"{name}_observed"] = torch.rand(B, T, 1) < 0.7
+        frames[f"{name}_observed"][:, 0] = False
+    frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = True
+    return frames
+
+
+def as_kalman(frames):
+    """The frames for one Kalman filter of both sensors."""
+    out = frames.select("is_init")
+    out["observation"] = torch.cat([frames["first"], frames["second"]], -1)
+    out["observed"] = torch.cat([frames["first_observed"], frames["second_observed"]], -1)
+    return out
+
+
+def arriving(frames, late):
+    """The second sensor's readings when they arrive: at t comes that of t - late[t]."""
+    index = torch.arange(T) - late
+    out = frames.copy()
+    for key in ("second", "second_observed"):
+        out[key] = frames[key][:, index.clamp(min=0)]
+    out["second_observed"] = out["second_observed"] & (index >= 0).unsqueeze(-1)
+    out["late"] = late.reshape(1, T, 1).expand(B, T, 1)
+    return out
+
+
+def arrived(frames, late, now):
+    """The readings in their order, as far as they have arrived at ``now``."""
+    out = frames[:, : now + 1].copy()
+    times = torch.arange(T) - late
+    known = torch.isin(torch.arange(now + 1), times[: now + 1])
+    out["second_observed"] = out["second_observed"] & known.unsqueeze(-1)
+    return out
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_in_turn_and_joint_are_one_kalman_filter(float64, kind, joint):
+    frames = readings()
+    expected = linear_kalman().sequence(as_kalman(frames))
+    out = fused(kind, joint=joint).sequence(frames.copy())
+    for key in (*BELIEF, ("info", "log_likelihood"), ("info", "nis")):
+        assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+
+
+def test_in_turn_and_joint_are_the_same_ensemble_in_mean_and_covariance(float64):
+    frames, (F, _, H, R) = readings(), linear_system()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    outs = [fused("ensemble", joint=joint, members=members, noisy=False).sequence(frames.copy()) for joint in (0, 1)]
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
+    assert_close(outs[0]["belief", "var"], outs[1]["belief", "var"], rtol=0, atol=1e-10)
+    whole = DEnKF(
+        transition=NoisyLinear(F),
+        sensor=None,
+        observation=LinearObservation(H),
+        noise=ConstantNoise(R.sqrt(), in_key="observation"),
+        analysis=EnsembleAnalysis("etkf", sensor_key="observation"),
+        initial=FixedEnsemble(members),
+    ).sequence(as_kalman(frames))
+    assert_close(outs[1]["belief", "ensemble"], whole["belief", "ensemble"], rtol=0, atol=1e-12)
+
+
+PATTERNS = {
+    "three steps late": torch.full((T,), DELAY),
+    "out of order": torch.tensor([0, 2] * T)[:T],  # that of t=2 before that of t=1, and so on
+}
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_late_readings_give_what_they_give_in_order(float64, kind, joint, pattern):
+    frames, late = readings(), PATTERNS[pattern]
+    key = {} if pattern == "three steps late" else {"late": "late"}
+    out = fused(kind, joint=joint, delay=DELAY, **key).sequence(arriving(frames, late))
+    for now in range(T):
+        expected = linear_kalman().sequence(as_kalman(arrived(frames, late, now)))
+        for name in BELIEF:
+            assert_close(out[name][:, now], expected[name][:, -1], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, pattern):
+    frames, late = readings(), PATTERNS[pattern]
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False}
+    key = {} if pattern == "three steps late" else {"late": "late"}
+    out = fused("ensemble", joint=joint, delay=DELAY, **key, **given).sequence(arriving(frames, late))
+    for now in range(T):
+        expected = fused("ensemble", **given).sequence(arrived(frames, late, now))
+        for name in ("mean", "var"):
+            assert_close(out["belief", name][:, now], expected["belief", name][:, -1], rtol=0, atol=1e-10)
+
+
+def test_late_readings_of_a_noisy_ensemble_within_the_error_of_its_members(float64):
+    """With process noise, members are only a sample of its covariance with the past: 1 / sqrt(E)."""
+    frames, late = readings(), PATTERNS["three steps late"]
+    errors = []
+    for count in (500, 8000):
+        torch.manual_seed(2)
+        members = torch.tensor([1.0, -1.0]) + torch.tensor([1.0, 2.0]).sqrt() * torch.randn(count, 2)
+        out = fused("ensemble", delay=DELAY, members=members).sequence(arriving(frames, late))
+        expected = fused("Kalman", delay=DELAY).sequence(arriving(frames, late))
+        errors.append((out["belief", "mean"] - expected["belief", "mean"]).square().mean().sqrt())
+    assert errors[1] < 0.02
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    frames["is_init"][:, 6] = True
+    frames["second_observed"][:] = True
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    out = fused(kind, delay=DELAY, **given).sequence(frames.copy())
+    alone = fused(kind, delay=DELAY, **given).sequence(frames[:, 6:].copy())
+    assert_close(out["belief", "mean"][:, 6:], alone["belief", "mean"], rtol=0, atol=0)
+    assert (alone["info", "second", "nis"][:, :DELAY] == 0).all()
+    assert (alone["info", "second", "nis"][:, DELAY:] > 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_state_a_lag_ago_is_that_of_the_smoother(float64, kind):
+    frames = readings()
+    expected = FixedLag(linear_kalman(), 4).sequence(as_kalman(frames))
+    out = fused(kind, lag=4, joint=True).sequence(frames.copy())
+    for name in ("mean", "cov", "var", "age"):
+        assert_close(out["smoothed", name], expected["smoothed", name], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
+    frames = readings()
+    for name in ("first", "second"):
+        frames[f"{name}_observed"][:] = True
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    plain = fused(kind, **given)
+    late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
+    order["second_observed"] = order["second_observed"].clone()
+    order["second_observed"][:, -DELAY:] = False
+    plain.update_at_reset = True
+    expected = plain.sequence(order)
+    F, Q, _, _ = linear_system()
+    motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)
+    filter = FusedFilter(motion, sensors(delay=DELAY), initial=plain.initial, update_at_reset=True)
+    out = filter.sequence(late)
+    assert_close(out["belief", "mean"][:, -1], expected["belief", "mean"][:, -1], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+@pytest.mark.parametrize("delay", [0, DELAY])
+def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kind, joint, delay):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    filter = fused(kind, joint=joint, delay=delay, **given)
+    filter.reject = True
+    broken = frames.copy()
+    broken["second"] = frames["second"].clone()
+    broken["second_observed"][:, 4:6] = True
+    broken["second"][:, 4:6] = torch.nan
+    hidden = frames.copy()
+    hidden["second_observed"] = frames["second_observed"].clone()
+    hidden["second_observed"][:, 4:6] = False
+    outs = [filter.sequence(value.copy()) for value in (broken, hidden)]
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=0)
+    assert (outs[0][REJECTED][:, 4:6] == 1).all()
+    assert outs[0][REJECTED].sum() == 2 * B
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_readings_can_be_left_out(float64, joint):
+    frames = readings()[:, 1]
+    frames.exclude("is_init", inplace=True)
+    filter = fused("Kalman", joint=joint, delay=DELAY)
+    row = filter.initialise(frames)
+    for key in ("first_observed", "second_observed"):
+        row[key][:] = True
+    hidden = row.copy()
+    hidden["second_observed"] = torch.zeros(B, 1, dtype=torch.bool)
+    expected = filter.step(hidden.copy())
+    without = row.clone().exclude("second")
+    if joint:
+        with pytest.raises(ValueError, match="hide them with their masks"):
+            filter.step(without, without=["second"])
+    else:
+        assert_close(filter.step(without, without=["second"])["belief", "mean"], expected["belief", "mean"])
+    predicted = filter.predict(row.clone().exclude("first", "second"))
+    for key in ("first_observed", "second_observed"):
+        hidden[key] = torch.zeros(B, 1, dtype=torch.bool)
+    assert_close(predicted["belief", "mean"], filter.step(hidden)["belief", "mean"])
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian, joint):
+    torch.manual_seed(0)
+    mlp = {"layer": "none", "activation": nn.Tanh}
+    camera = VectorSensor(4, 2, ensemble_size=6, num_cells=(8,), layer="none", in_key="lamps")
+    parts = {
+        "camera": FusedSensor(
+            LearnedObservation(StochasticMLP(2, 2, (6,), **mlp)),
+            DiagonalNoise(2, r=0.5, num_cells=(4,)),
+            sensor=camera,
+            delay=2,
+        ),
+        "wheel": FusedSensor(Select([1]), ConstantNoise([0.3], trainable=True)),
+    }
+    motion = LearnedTransition(StochasticMLP(2, 2, (6,), output_gain=0.5, **mlp))
+    if gaussian:
+        initial, q = MomentPrior(torch.zeros(2), torch.eye(2)), CholeskyNoise(2, r=0.4)
+        filter = FusedFilter(motion, parts, initial=initial, process_noise=q, joint=joint)
+    else:
+        filter = FusedFilter(motion, parts, initial=FixedEnsemble(torch.randn(6, 2)), joint=joint)
+    with torch.no_grad():
+        for parameter in filter.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    frames = TensorDict({"lamps": torch.randn(2, 6, 4), "wheel": torch.randn(2, 6, 1)}, [2, 6])
+    directional_check(
+        lambda: sum(filter.sequence(frames.copy())["belief", key].square().sum() for key in ("mean", "var")),
+        filter.parameters(),
+    )
+
+
+@pytest.mark.parametrize("kind", ["ensemble", "Kalman"])
+def test_rows_of_a_batch_do_not_know_each_other(float64, kind):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    filter = fused(kind, delay=DELAY, **given)
+    whole = filter.sequence(frames.copy())
+    for row in range(B):
+        alone = filter.sequence(frames[row].copy())
+        assert_close(alone["belief", "mean"], whole["belief", "mean"][row], rtol=0, atol=1e-12)
+
+
+def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):
+    torch.manual_seed(0)
+    F, _, _, _ = linear_system()
+
+    def lamps(**keys):
+        torch.manual_seed(3)
+        return VectorSensor(4, 2, ensemble_size=8, num_cells=(8,), in_key="lamps", **keys)
+
+    start = FixedEnsemble(torch.randn(8, 2))
+    by_hand = Filter(
+        {
+            "camera_sensor": lamps(),
+            "camera_noise": ConstantNoise([0.3, 0.4]),
+            "wheel_noise": ConstantNoise([0.2], in_key="wheel", out_key="wheel_noise"),
+            "transition": NoisyLinear(F),
+            "camera_observation": Select([0, 1]),
+            "camera": EnsembleAnalysis("sensor", belief_key="middle", observed_key="camera_observed"),
+            "wheel_observation": Select([1], in_key=("middle", "ensemble"), out_key="wheel_predicted"),
+            "wheel": EnsembleAnalysis(
+                "etkf",
+                forecast_key=("middle", "ensemble"),
+                predicted_key="wheel_predicted",
+                sensor_key="wheel",
+                noise_variance_key="wheel_noise",
+                observed_key="wheel_observed",
+            ),
+        },
+        initial=start,
+    )
+    built = FusedFilter(
+        NoisyLinear(F),
+        {
+            "camera": FusedSensor(
+                Select([0, 1]),
+                [0.3, 0.4],
+                sensor=lamps(),
+                analysis=lambda **keys: EnsembleAnalysis("sensor", **keys),
+            ),
+            "wheel": FusedSensor(Select([1]), [0.2]),
+        },
+        initial=start,
+    )
+    frames = TensorDict({"lamps": torch.randn(B, T, 4), "wheel": torch.randn(B, T, 1)}, [B, T])
+    frames["camera_observed"] = torch.rand(B, T, 1) < 0.5
+    frames = by_hand.draw_noise(frames)
+    expected = by_hand.sequence(frames.copy())
+    out = built.sequence(frames.copy())
+    assert out["belief", "ensemble"].equal(expected["belief", "ensemble"])
+    assert out["info", "wheel", "nis"].equal(expected["info", "wheel", "nis"])
+
+
+def test_angles_side_by_side(float64):
+    """A heading near pi, read a full turn away: both ways to update take the shorter way round."""
+    turns = {
+        "compass": FusedSensor(Select([0]), [0.3], angles=[0]),
+        "pair": FusedSensor(Select([1, 0]), [0.5, 0.4], angles=[1]),
+    }
+    F = torch.eye(2)
+    frames = TensorDict({"compass": torch.full((3, 1), -3.1), "pair": torch.tensor([[0.2, -3.0]] * 3)}, [3])
+    means = []
+    for joint in (False, True):
+        initial = MomentPrior(torch.tensor([3.1, 0.0]), torch.eye(2))
+        kf = FusedFilter(LinearTransition(F, 0.1 * F), turns, initial=initial, joint=joint)
+        means.append(kf.sequence(frames.copy())["belief", "mean"])
+    assert_close(means[0], means[1], rtol=0, atol=1e-10)
+    assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
+
+
+def test_covariances_of_readings_side_by_side(float64):
+    F, Q, H, _ = linear_system()
+    cov = torch.tensor([[0.5, 0.2], [0.2, 0.3]])
+
+    class Constant(ConstantNoise):
+        def compute(self, like, *, batch_size):
+            return cov.expand(*batch_size, 2, 2)
+
+    both = {
+        "pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])),
+        "one": FusedSensor(Select([1]), [0.7]),
+    }
+    frames = TensorDict({"pair": torch.randn(4, 2), "one": torch.randn(4, 1)}, [4])
+    outs = []
+    for joint in (False, True):
+        initial = MomentPrior(torch.zeros(2), torch.eye(2))
+        outs.append(FusedFilter(LinearTransition(F, Q), both, initial=initial, joint=joint).sequence(frames.copy()))
+    assert_close(outs[0]["belief", "cov"], outs[1]["belief", "cov"], rtol=0, atol=1e-10)
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
+
+
+def test_what_is_refused():
+    F, Q, H, R = linear_system(torch.float32)
+    moments, members = MomentPrior(torch.zeros(2), torch.eye(2)), GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)
+    one = {"a": FusedSensor(LinearObservation(H), R.sqrt())}
+    with pytest.raises(ValueError, match="at least one sensor"):
+        FusedFilter(LinearTransition(F, Q), {}, initial=moments)
+    with pytest.raises(ValueError, match="writes an ensemble"):
+        FusedFilter(LinearTransition(F, Q), one, initial=members)
+    with pytest.raises(ValueError, match="process noise already"):
+        FusedFilter(LinearTransition(F, Q), one, initial=moments, process_noise=0.1)
+    with pytest.raises(ValueError, match="need process_noise"):
+        FusedFilter(NoisyLinear(F), one, initial=moments)
+    with pytest.raises(ValueError, match="beyond lag=2"):
+        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, delay=3)}, initial=members, lag=2)
+    with pytest.raises(ValueError, match="how late"):
+        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late="age")}, initial=members)
+    with pytest.raises(TypeError, match="carries a past already"):
+        FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
+    own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
+    with pytest.raises(ValueError, match="analysis of their own"):
+        FusedFilter(NoisyLinear(F), own, initial=members, joint=True)
