@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 
 from torch_denkf._checks import has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
-from torch_denkf.filters._structure import Structure, previous_key
+from torch_denkf.filters._structure import Structure, previous_key, submodels
 from torch_denkf.modules._base import Entries, random_parts
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ __all__ = [
     "check_inputs",
     "refuse_absurd_readings",
     "refuse_non_finite",
+    "refuse_single_readings",
     "refuse_two_precisions",
     "refuse_unknown_noise",
     "refuse_unknown_readings",
@@ -154,6 +155,16 @@ def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) 
     if unknown:
         raise KeyError(f"without names {unknown}, which no module must find; they read {list(structure.needed)}.")
     return keys
+
+
+def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
+    """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
+    joined = any(getattr(part, "joins_readings", False) for _, module in structure.modules for part in submodels(module))
+    if joined and without and set(without) != set(structure.readings):
+        raise ValueError(
+            f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "
+            "hide them with their masks."
+        )
 
 
 def refuse_two_precisions(filter: Filter) -> None:

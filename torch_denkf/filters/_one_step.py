@@ -14,6 +14,7 @@ from torch_denkf.filters._checks import (
     check_inputs,
     refuse_missing_actions,
     refuse_non_finite,
+    refuse_single_readings,
     refuse_unknown_readings,
 )
 from torch_denkf.filters._entries import write
@@ -35,6 +36,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
     """See :meth:`Filter.step`."""
     structure = filter.structure
     without = refuse_unknown_readings(structure, without)
+    refuse_single_readings(structure, without)
     entries = filter.entries_of(tensordict, one_step=True)
     check_inputs(filter, entries, tensordict, without)
     if without:

@@ -136,6 +136,8 @@ class Structure(NamedTuple):
         _refuse_overwriting([*frames, *steps])
         _refuse_nesting([*needed, *optional], [key for _, module in modules for key in writes(module)])
         own_info, totals = _apart(steps)
+        renamed = {name for names in own_info.values() for name in names.values()}
+        needed, optional = ([key for key in keys if key not in renamed] for keys in (needed, optional))
         written = [own_info.get(place, {}).get(key, key) for place, module in steps for key in writes(module)]
         step_keys = tuple(dict.fromkeys([*written, *totals]))
         still = [key for key in carry if key not in step_keys]

@@ -196,20 +196,7 @@ class FusedFilter(Filter):
         if lag:
             modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief()
         super().__init__(modules, initial=initial, **kwargs)
-        self.sensors, self.lag, self.together = tuple(sensors), lag, joint or weights is not None
-
-    def step(self, tensordict, *, without=()):
-        """A step, see :meth:`Filter.step`.
-
-        Raises:
-            ValueError: if the update is joint, or sensors have weights, and ``without`` names some readings, not all.
-        """
-        if self.together and without and set(map(unravel_key, without)) != set(self.structure.readings):
-            raise ValueError(
-                f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "
-                "hide them with their masks."
-            )
-        return super().step(tensordict, without=without)
+        self.sensors, self.lag = tuple(sensors), lag
 
 
 class _Updates:

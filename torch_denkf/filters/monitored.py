@@ -32,6 +32,7 @@ class Monitored(Filter):
 
     Raises:
         KeyError: if the filter does not write what the monitor reads.
+        ValueError: if the filter writes under the monitor's ``monitor_key`` already, as another monitor does.
 
     Example:
         >>> import torch
@@ -54,13 +55,20 @@ class Monitored(Filter):
             raise KeyError(f"the monitor reads {missing}, which the filter does not write; it writes {filter.out_keys}")
         like = filter.like()
         modules = OrderedDict(named_modules_of(filter))
-        modules["monitor"] = monitor if like is None else monitor.to(like.device, like.dtype)
+        taken = [key for key in monitor.state_keys if key in filter.out_keys]
+        if taken:
+            raise ValueError(
+                f"the filter writes {taken[0]} already; give this monitor another name: monitor_key="
+                f"{monitor.monitor_key + '2'!r}"
+            )
+        self._place = "monitor" if "monitor" not in modules else monitor.monitor_key
+        modules[self._place] = monitor if like is None else monitor.to(like.device, like.dtype)
         super().__init__(modules, initial=WithState(filter.initial, [monitor]), **options_of(filter))
 
     @property
     def monitor(self) -> InnovationMonitor:
         """What watches."""
-        return self["monitor"]
+        return self[self._place]
 
     def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Monitored:
         """Calibrates the monitor on clean data, see :meth:`~torch_denkf.modules.InnovationMonitor.calibrate`.
@@ -87,7 +95,7 @@ class Gated(Filter):
         places: of the analyses that get a gate; all by default. With other options for others, put one ``Gated`` around
             another.
         **options: of all gates, see :class:`~torch_denkf.modules.GateOptions`. Of several the ``gate_key`` is followed
-            by the analysis' place: ``"gate_camera"``.
+            by the analysis' place, ``"gate_camera"``, and by a number where a sequence in one place has several.
 
     Raises:
         TypeError: if the filter has no analysis that can be gated.
@@ -115,7 +123,8 @@ class Gated(Filter):
     ):
         modules = OrderedDict(named_modules_of(filter))
         found = [name for name, module in modules.items() if any(_analyses(module))]
-        several = len(found) + sum(isinstance(module, GatedAnalysis) for module in filter.modules()) > 1
+        count = sum(1 for name in found for _ in _analyses(modules[name]))
+        several = count + sum(isinstance(module, GatedAnalysis) for module in filter.modules()) > 1
         if places is not None:
             if unknown := [place for place in places if place not in found]:
                 raise ValueError(f"places names {unknown}; the filter has analyses at {found}")
@@ -127,10 +136,12 @@ class Gated(Filter):
             )
         key, gates = options.get("gate_key", "gate"), []
         for name in found:
-            for analysis in _analyses(modules[name]):
+            inside = list(_analyses(modules[name]))
+            for number, analysis in enumerate(inside):
                 own = observation_dim[name] if isinstance(observation_dim, Mapping) else observation_dim
                 dim = _dim(filter, analysis) if own is None else own
-                own_options: GateOptions = {**options, "gate_key": f"{key}_{name}" if several else key}
+                own_key = f"{key}_{name}" + (f"_{number}" if len(inside) > 1 else "")
+                own_options: GateOptions = {**options, "gate_key": own_key if several else key}
                 gates.append(GatedAnalysis(analysis, dim, **own_options))
                 like = filter.like()
                 gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)

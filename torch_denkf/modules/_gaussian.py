@@ -202,6 +202,10 @@ class GaussianAnalysis(SubModel):
         zero = torch.zeros_like(predicted[..., 0, :])
         return mean, cov, cov.diagonal(dim1=-2, dim2=-1), zero, zero[..., :1], zero[..., :1]
 
+    def mask(self, entries: Entries, mean: torch.Tensor, call: Call) -> torch.Tensor | None:
+        """What is observed, ``[*B, 1]`` or ``[*B, O]``, as the model says that the analysis runs inside."""
+        return self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[1]
+
     def _update(
         self, entries: Entries, mean, cov, observation, noise, call: Call
     ) -> tuple[GaussianUpdate, torch.Tensor | None]:

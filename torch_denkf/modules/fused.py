@@ -205,6 +205,8 @@ class JoinedReading(SubModel):
         tensor([1., 1., 0.])
     """
 
+    joins_readings = True  # without one of them it has nothing to say
+
     def __init__(
         self,
         reading_keys: Sequence[NestedKey],

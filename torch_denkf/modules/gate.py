@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import adapt, chi_square_quantile, disbelief, interpolate, spread_about_mean
-from torch_denkf.modules._base import Call, Entries, SubModel, flat_noise
+from torch_denkf.modules._base import Call, Entries, SubModel, flat_noise, writes
 from torch_denkf.modules._calibration import IDENTITY, chi_square_table, empirical_quantile
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
@@ -200,7 +200,7 @@ class GatedAnalysis(InPlaceOf):
     def on_entries(self, entries, call):
         """The belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
-        entries = self._with_noise(entries, call)
+        entries = self._with_mask(self._with_noise(entries, call), call)
         if self.adapt_noise:
             entries = self._noisier(entries, log_noise.exp())
         if self.adapt_inflation:
@@ -263,6 +263,13 @@ class GatedAnalysis(InPlaceOf):
             values = [self.required(entries, key) for key in self.module.in_keys]
             entries.update(flat_noise(self.module._noise(entries, values, call), call.place))
         return entries
+
+    def _with_mask(self, entries: Entries, call: Call) -> Entries:
+        """The entries with the mask, where an observation model inside the analysis makes it."""
+        if not isinstance(self.module, GaussianAnalysis) or self.observed_key not in writes(self.module.module):
+            return entries
+        mean = self.required(entries, self.in_keys[0])
+        return {**entries, self.observed_key: self.module.mask(entries, mean, call)}
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""

@@ -208,9 +208,9 @@ class InnovationMonitor(SubModel):
         nis, innovation = (self.required(entries, (*info, entry)) for entry in ("nis", "innovation"))
         noise = None if sensor.noise_key is None else self.required(entries, unravel_key(sensor.noise_key))
         mask = entries.get(unravel_key(sensor.observed_key))
-        count = torch.full_like(nis, innovation.shape[-1])
-        if mask is not None:
-            count = mask.expand(innovation.shape).sum(-1, keepdim=True).to(nis.dtype)
+        # Without a mask to be read, as where an observation model makes it: what is not observed has no innovation.
+        seen = innovation != 0 if mask is None else mask.expand(innovation.shape)
+        count = seen.sum(-1, keepdim=True).to(nis.dtype)
         return nis, innovation, noise, torch.where(nis > 0, count, 0)  # it is 0 where a belief begins
 
     def _sum(self, total: Tensor, score: Tensor, seen: Tensor, limit: Tensor) -> Tensor:

@@ -132,6 +132,8 @@ class SensorWeights(SubModel):
         weight_key: prefix of the weights ``[*B, 1]``, by the sensors' names.
     """
 
+    joins_readings = True  # without one of them it has nothing to say
+
     def __init__(
         self,
         network: nn.Module,
