@@ -326,3 +326,20 @@ def test_an_ekf_with_clones_is_the_kalman_filter_with_clones(float64):
         dims = [3, 5, 7, 0]
         torch.testing.assert_close(out["mean"][t, dims], mean, rtol=0, atol=1e-8)
         torch.testing.assert_close(out["cov"][t][dims][:, dims], cov, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_a_rejected_reading_counts_as_not_observed(float64, masked):
+    frames = frames_of(torch.randn(6, 2) + torch.tensor([4.0, 0.1]), [0, 1, 1, 1, 1, 1])
+    bad, hidden = frames.clone(), frames.clone()
+    bad["y"][3] = torch.nan
+    hidden["observed"][3] = False
+    if not masked:
+        del bad["observed"]
+    filter, outs = pair_filter(16), []
+    filter.reject = True
+    for data in (bad, hidden):
+        torch.manual_seed(3)
+        outs.append(filter.sequence(data))
+    assert outs[0]["info", "rejected"].flatten().tolist() == [0, 0, 0, 2, 0, 0]
+    torch.testing.assert_close(outs[0]["belief", "ensemble"], outs[1]["belief", "ensemble"], rtol=0, atol=0)

@@ -36,18 +36,24 @@ class Guard(NamedTuple):
     components: tuple[NestedKey, ...]
 
 
-def guards_of(parts: Iterable[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> tuple[Guard, ...]:
+def guards_of(
+    parts: Iterable[SubModel],
+    sources: Mapping[NestedKey, Sequence[NestedKey]],
+    made_of: Mapping[NestedKey, NestedKey],
+) -> tuple[Guard, ...]:
     """A guard for each mask.
 
     Args:
         parts: sub-models, of which those with ``reading_keys`` and an ``observed_key`` update a belief.
         sources: the entries from outside that each reading is made of.
+        made_of: the mask from outside, of a mask that a module makes of it.
     """
     readers: dict[NestedKey, list[SubModel]] = {}
     for part in parts:
         mask = getattr(part, "observed_key", None)
         if mask is not None and _readings(part):
-            readers.setdefault(unravel_key(mask), []).append(part)
+            mask = unravel_key(mask)
+            readers.setdefault(made_of.get(mask, mask), []).append(part)
     guards = []
     for mask, sharing in readers.items():
         whole: dict[NestedKey, None] = {}

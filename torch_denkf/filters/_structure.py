@@ -244,7 +244,18 @@ def _guards(
             if not found.keys().isdisjoint(writes(module)):
                 found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
-    return guards_of(_in_front(parts, sources), sources)
+    return guards_of(_in_front(parts, sources), sources, _made_of(parts))
+
+
+def _made_of(parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
+    """The mask that each mask is made of, where a part reads one and writes another: hidden is what the first hides."""
+    masks = {unravel_key(part.observed_key) for part in parts if getattr(part, "observed_key", None) is not None}
+    found = {}
+    for part in parts:
+        own = getattr(part, "observed_key", None)
+        if own is not None:
+            found.update({key: unravel_key(own) for key in writes(part) if key in masks and key != unravel_key(own)})
+    return found
 
 
 def _in_front(parts: Sequence[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[SubModel]:

@@ -133,7 +133,7 @@ class PairObservation(SubModel):
         reach = [torch.inf, torch.inf] if reach is None else reach
         register_constant(self, "reach", reach)
         check_values("reach", self.reach, above=0, infinite=True)
-        self.observation_dim = 2
+        self.observation_dim, self.observed_key = 2, unravel_key(observed_key)
 
     def compute(self, forecast, *rest):
         """The predicted observations, the ensemble that the analysis is to update, and the mask."""
