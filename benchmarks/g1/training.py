@@ -35,7 +35,7 @@ def run_filter(model: Filter, readings: TensorDict) -> tuple[Tensor, Tensor]:
     """Means and variances ``[N, T, S]`` of a filter, from where episodes begin on average."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        out = model.sequence(readings.exclude("motion", "valid", "state", "arrived"))
+        out = model.sequence(readings.exclude("motion", "valid", "state", "arrived").copy())  # nested entries, too
     return out["belief", "mean"], out["belief", "var"]
 
 

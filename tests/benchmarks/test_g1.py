@@ -17,7 +17,10 @@ from benchmarks.g1.scores import blackout, scores
 from benchmarks.g1.sensors import Statistics, code_of, encoding_size, paper_sensor, read_code
 from benchmarks.g1.tables import COLUMNS, markdown, named
 from benchmarks.g1.targets import ARM, HAND
+from benchmarks.g1.training import run_filter
 from torch_denkf.data import LeRobotReplay
+from torch_denkf.filters import FusedFilter, FusedSensor
+from torch_denkf.modules import LinearTransition, MomentPrior, Select
 
 COUNT, STEPS, MEMBERS, FEATURES = 4, 60, 8, 5
 
@@ -278,6 +281,16 @@ def test_scores_leave_out_what_does_not_count():
     assert row["n7"] == pytest.approx(math.degrees(0.08), rel=1e-4)
     assert row["coverage90"] == pytest.approx(6 / 7)  # 0.08 is outside of 1.645 x 0.03
     assert row["cover_n7"] == 0.0
+
+
+def test_a_run_leaves_the_readings_as_they_are():
+    one, size = torch.eye(ARM.size), ARM.size
+    camera = FusedSensor(Select(range(size)), torch.ones(size), reading=("sensor", "ensemble"))
+    model = FusedFilter(LinearTransition(one, one), {"camera": camera}, initial=MomentPrior(torch.zeros(size), one))
+    given = readings()
+    before = set(given.keys(True))
+    run_filter(model, given)
+    assert set(given.keys(True)) == before
 
 
 def test_blackout_looks_at_the_black_frames():
