@@ -217,6 +217,8 @@ def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
     filter = FusedFilter(motion, sensors(delay=DELAY), initial=plain.initial, update_at_reset=True)
     out = filter.sequence(late)
     assert_close(out["belief", "mean"][:, -1], expected["belief", "mean"][:, -1], rtol=0, atol=1e-10)
+    first = filter.initialise(late[:, 0].select(*filter.structure.needed, *filter.structure.optional, strict=False))
+    assert_close(first["belief", "mean"], out["belief", "mean"][:, 0])
 
 
 @pytest.mark.parametrize("joint", [False, True])

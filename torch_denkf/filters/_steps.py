@@ -130,6 +130,8 @@ class Steps(NamedTuple):
         if structure.beside and in_sequence:  # their shapes follow from a step out of the start
             out = self.run([structure.transition], entries, call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
+        elif structure.beside and hasattr(structure.transition[1], "without_step"):
+            forecast |= structure.transition[1].without_step(entries)
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
         return self._update(entries, forecast, call, every, start, missing)
 

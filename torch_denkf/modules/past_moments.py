@@ -60,6 +60,11 @@ class CrossTransition(InPlaceOf):
         written, cross = self.module.with_cross(entries, call, wanted=True)
         return {**written, unravel_key(self.out_keys[-1]): cross}
 
+    def without_step(self, entries):
+        """What stands beside the forecast where an episode begins: there is no state before."""
+        mean = self.required(entries, self.in_keys[0])
+        return {unravel_key(self.out_keys[-1]): mean.new_zeros(*mean.shape, mean.shape[-1])}
+
 
 class WithMomentsPast(WithPast):
     """An initial mean and covariance with a past: L copies of them.
