@@ -243,8 +243,8 @@ class Filter(TensorDictSequential):
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
-            ValueError: with ``check_finite``, if a reading or the new belief is not finite; or if readings are looked at
-                together, and ``without`` names some of them, not all.
+            ValueError: with ``check_finite``, if a reading or the new belief is not finite; or if readings are looked
+                at together, and ``without`` names some of them, not all.
         """
         return _one_step.step(self, of_one_robot(self, tensordict), without)
 

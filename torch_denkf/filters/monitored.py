@@ -61,9 +61,12 @@ class Monitored(Filter):
                 f"the filter writes {taken[0]} already; give this monitor another name: monitor_key="
                 f"{monitor.monitor_key + '2'!r}"
             )
-        self._place = "monitor" if "monitor" not in modules else monitor.monitor_key
-        modules[self._place] = monitor if like is None else monitor.to(like.device, like.dtype)
+        place = "monitor"
+        while place in modules:
+            place += "_"
+        modules[place] = monitor if like is None else monitor.to(like.device, like.dtype)
         super().__init__(modules, initial=WithState(filter.initial, [monitor]), **options_of(filter))
+        self._place = place
 
     @property
     def monitor(self) -> InnovationMonitor:
