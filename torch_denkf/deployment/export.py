@@ -102,7 +102,8 @@ def export_step(
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {written}")
     in_keys = _inputs(filter, example)
-    values = tuple(example.get(key) for key in in_keys)
+    # Not parts of one another, whose strides the graph would hold.
+    values = tuple(example.get(key).clone(memory_format=torch.contiguous_format) for key in in_keys)
     signature = {
         "inputs": [
             (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)

@@ -60,7 +60,7 @@ class PackagedStep:
                     f"{name!r} must be {dtype} {list(shape)}, got {value.dtype} {list(value.shape)}; a package has "
                     "static shapes: export another one"
                 )
-            values.append(value)
+            values.append(value.contiguous())  # native code reads as the example lay in memory
         return dict(zip(self.outputs, self._run(*values), strict=True))
 
 
