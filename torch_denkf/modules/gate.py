@@ -269,7 +269,8 @@ class GatedAnalysis(InPlaceOf):
         if not isinstance(self.module, GaussianAnalysis) or self.observed_key not in writes(self.module.module):
             return entries
         mean = self.required(entries, self.in_keys[0])
-        return {**entries, self.observed_key: self.module.mask(entries, mean, call)}
+        mask = self.module.mask(entries, mean, call)
+        return entries if mask is None else {**entries, self.observed_key: mask}
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
