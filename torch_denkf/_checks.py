@@ -262,7 +262,8 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
     """
     if cov.ndim == 1:
         raise ValueError(
-            f"{name} must be a covariance {layout}, got {list(cov.shape)}; of standard deviations it is torch.diag(std**2)"
+            f"{name} must be a covariance {layout}, got {list(cov.shape)}; "
+            "that of standard deviations is torch.diag(std**2)"
         )
     check_square(name, cov, size, layout)
     check_values(name, cov)
