@@ -139,7 +139,7 @@ def _linearise(
         if images.shape[-1] != size:
             raise ValueError(
                 f"the model of {mean.shape[-1]} states gives {images.shape[-1]} numbers; {size} are due: an "
-                "observation gives one for each component of its reading, a motion one for each component of the state. "
+                "observation gives one for each component of its reading, a motion one for each of the state. "
                 "Earlier states that are kept for late readings count among the states."
             )
         return images, () if mask is None else (mask,)

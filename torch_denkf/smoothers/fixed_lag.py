@@ -124,7 +124,7 @@ def kind_of(filter: Filter) -> tuple[str, str]:
         if names & {"past", "past_mean", "joint_mean"}:
             raise TypeError(
                 "This filter carries a past already, as FixedLag, IEnKS and FusedFilter with a delay do. Give the "
-                "filter inside of it. A FusedFilter with a delay writes ('smoothed', 'mean') itself, lag=... steps back."
+                "filter inside of it. A FusedFilter with a delay writes ('smoothed', 'mean') itself, lag= steps back."
             )
         if {"ensemble", "log_weight"} <= names and isinstance(transition, ResampledTransition):
             return "particles", prefix
