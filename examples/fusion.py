@@ -82,7 +82,7 @@ def run(filter: FusedFilter, data: TensorDict, *lacking: str) -> TensorDict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
+    parser.add_argument("--smoke", action="store_true", help="a tiny run of everything; its errors mean nothing")
     smoke = parser.parse_args().smoke
     carts, steps, updates = (2, 100, 1) if smoke else (30, 400, 60)
     torch.manual_seed(0)

@@ -100,7 +100,7 @@ def error_of(out: TensorDict) -> Tensor:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", default="runs/monitor.png", help="the picture")
-    parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
+    parser.add_argument("--smoke", action="store_true", help="a tiny run of everything; its errors mean nothing")
     options = parser.parse_args()
     runs, steps = (2, 180) if options.smoke else (20, 300)
     torch.manual_seed(0)
@@ -121,7 +121,7 @@ def main() -> None:
     quiet, plain, answered = watched.sequence(sound.clone()), watched.sequence(broken.clone()), gated.sequence(broken)
     alarm = plain["monitor", "alarm"][..., 0]
     delay = alarm[:, OFF:BACK].float().argmax(1)
-    print(f"False alarms: {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps are under one.")
+    print(f"False alarms on sound runs: in {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps.")
     print(f"The GPS goes off: alarm {delay.float().median():.0f} steps after (median of {runs} carts).")
     for name, out in (("without a gate", plain), ("with a gate", answered)):
         during, after = error_of(out)[:, OFF:BACK].mean(), error_of(out)[:, BACK + 10 :].mean()

@@ -260,6 +260,11 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
         ...
         ValueError: cov must be positive semi-definite; its correlations have the eigenvalue -1. Pass A @ A.T ...
     """
+    if cov.ndim == 1:
+        raise ValueError(
+            f"{name} must be a covariance {layout}, got {list(cov.shape)}; "
+            "that of standard deviations is torch.diag(std**2)"
+        )
     check_square(name, cov, size, layout)
     check_values(name, cov)
     if not _has_values(cov):

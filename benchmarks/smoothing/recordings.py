@@ -19,6 +19,7 @@ from torch_denkf.odometry.streams import Drive, all_frames, read_spans
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.pretrained.train.ur5_table import behind_sensor, read_demos, whole_demos
 from torch_denkf.pretrained.ur5_table import JOINTS, UR5TableFilter
+from torch_denkf.training import read_checkpoint, write_checkpoint
 
 Group = dict[str, TensorDict]  # recordings of one length side by side, [N, T], by their names with blanks between
 
@@ -54,9 +55,8 @@ class Task:
             folder.mkdir(parents=True, exist_ok=True)
             read = self.read(self.model(members))
             plain = {name: {key: batch.to_dict() for key, batch in group.items()} for name, group in read.items()}
-            torch.save(plain, file.with_suffix(".part"))
-            file.with_suffix(".part").rename(file)
-        plain = torch.load(file)
+            write_checkpoint(file, plain)
+        plain = read_checkpoint(file)
         return {
             name: {key: TensorDict(batch, batch["state"].shape[:2]) for key, batch in group.items()}
             for name, group in plain.items()

@@ -172,7 +172,7 @@ def test_damaged_folders_are_named(checkpoint, tmp_path):
     with pytest.raises(ValueError, match=r"weights\.safetensors does not fit config\.json"):
         load_car_filter(checkpoint)
     change(colour="red")
-    with pytest.raises(ValueError, match=r"does not make a filter: .*unexpected keyword argument 'colour'"):
+    with pytest.raises(ValueError, match=r"does not make a filter: colour is no setting of a car filter"):
         load_car_filter(checkpoint)
     change(dt="soon")
     with pytest.raises(ValueError, match=r"config\.json does not make a filter"):

@@ -137,7 +137,11 @@ def _linearise(
     def run(states: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         images, mask = model(rows, states, call)
         if images.shape[-1] != size:
-            raise ValueError(f"the model of {mean.shape[-1]} states gives {images.shape[-1]} numbers; {size} are due.")
+            raise ValueError(
+                f"the model of {mean.shape[-1]} states gives {images.shape[-1]} numbers; {size} are due: an "
+                "observation gives one for each component of its reading, a motion one for each of the state. "
+                "Earlier states that are kept for late readings count among the states."
+            )
         return images, () if mask is None else (mask,)
 
     states = mean.unsqueeze(-2).expand(*copies, *mean.shape[:-1], 1, mean.shape[-1])

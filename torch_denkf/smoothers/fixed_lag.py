@@ -122,7 +122,10 @@ def kind_of(filter: Filter) -> tuple[str, str]:
     for prefix in dict.fromkeys(key[0] for key in carry):
         names = {key[1] for key in carry if key[0] == prefix}
         if names & {"past", "past_mean", "joint_mean"}:
-            raise TypeError("This filter carries a past already; give the filter that was made for.")
+            raise TypeError(
+                "This filter carries a past already, as FixedLag, IEnKS and FusedFilter with a delay do. Give the "
+                "filter inside of it. A FusedFilter with a delay writes ('smoothed', 'mean') itself, lag= steps back."
+            )
         if {"ensemble", "log_weight"} <= names and isinstance(transition, ResampledTransition):
             return "particles", prefix
         if {"mean", "cov"} <= names:

@@ -174,7 +174,7 @@ def test_damaged_files_are_found_and_made_again(unbroken, copy, capsys, damage):
         file.write_bytes(data)
     assert main(["--out", str(copy), "--verify"]) == 1
     out, err = capsys.readouterr()
-    assert out == f"6 demos in {copy}: 1 are missing or damaged\n"
+    assert out == f"6 demos in {copy}: 1 are missing, damaged or not listed\n"
     assert err.startswith(str(file))
     assert len(err.splitlines()) == 1
     with pytest.warns(UserWarning, match=f"{file}.*made again"):
