@@ -404,6 +404,13 @@ def test_what_is_refused():
     one = {"a": FusedSensor(LinearObservation(H), R.sqrt())}
     with pytest.raises(ValueError, match="at least one sensor"):
         FusedFilter(LinearTransition(F, Q), {}, initial=moments)
+    with pytest.raises(TypeError, match="sensors is a dict"):
+        FusedFilter(LinearTransition(F, Q), [one["a"]], initial=moments)
+    late = FusedFilter(
+        LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
+    )
+    with pytest.raises(TypeError, match="a_observed.* must be boolean"):
+        late.sequence(TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3]))
     with pytest.raises(ValueError, match="writes an ensemble"):
         FusedFilter(LinearTransition(F, Q), one, initial=members)
     with pytest.raises(ValueError, match="process noise already"):

@@ -133,7 +133,7 @@ class FusedFilter(Filter):
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, or process noise is missing or given
             twice.
-        TypeError: for particles, or an analysis that cannot correct earlier states.
+        TypeError: for particles, sensors that are no dict, or an analysis that cannot correct earlier states.
 
     Example:
         >>> from tensordict import TensorDict
@@ -165,6 +165,8 @@ class FusedFilter(Filter):
     ):
         check_module("transition", transition)
         check_module("initial", initial)
+        if not isinstance(sensors, Mapping) or not all(isinstance(one, FusedSensor) for one in sensors.values()):
+            raise TypeError(f"sensors is a dict, {{name: FusedSensor(...)}}; got {type(sensors).__name__}: {sensors}")
         if not sensors:
             raise ValueError("FusedFilter needs at least one sensor: sensors={name: FusedSensor(...)}.")
         gaussian = _is_gaussian(initial)

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torch_denkf._checks import check_mask
 from torch_denkf.functional import mean_observation
 from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module, writes
 from torch_denkf.modules.past import InPlaceOf
@@ -140,6 +141,7 @@ class StateObservation(InPlaceOf):
     def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
         """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
+        check_mask(str(self.observed_key), observed)
         if age is None:  # asked for a shape alone
             age = torch.full_like(whole[..., 0, 0, :1], whole.shape[-2], dtype=torch.int64)
         late = None if self.late_key is None else entries.get(self.late_key)
