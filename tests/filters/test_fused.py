@@ -409,7 +409,7 @@ def test_what_is_refused():
     late = FusedFilter(
         LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
     )
-    with pytest.raises(TypeError, match="a_observed.* must be boolean"):
+    with pytest.raises(TypeError, match=r"a_observed.* must be boolean"):
         late.sequence(TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3]))
     with pytest.raises(ValueError, match="writes an ensemble"):
         FusedFilter(LinearTransition(F, Q), one, initial=members)
