@@ -307,7 +307,7 @@ def _is_gaussian(initial: TensorDictModuleBase) -> bool:
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """L, the largest delay or what was asked for."""
+    """L: what is given, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late is not None and sensor.delay < 1:
