@@ -14,6 +14,7 @@ from torch_denkf.functional.dropped_relu import dropped_relu
 from torch_denkf.functional.gating import Response, adapt, disbelief, spread_about_mean
 from torch_denkf.functional.gaussian import GaussianUpdate, gaussian_log_prob, kalman_predict, kalman_update
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.joint_moments import joint_forecast
 from torch_denkf.functional.linalg import (
     cholesky,
     inverse_square_root,
@@ -67,6 +68,7 @@ __all__ = [
     "Space",
     "analyse",
     "analyse_sharded",
+    "joint_forecast",
     "ensemble_mean",
     "ensemble_anomalies",
     "ensemble_var",

@@ -142,7 +142,7 @@ class StateObservation(InPlaceOf):
         """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
         check_mask(str(self.observed_key), observed)
-        if age is None:  # asked for a shape alone
+        if age is None:  # a call that learns shapes brings no age
             age = torch.full_like(whole[..., 0, 0, :1], whole.shape[-2], dtype=torch.int64)
         late = None if self.late_key is None else entries.get(self.late_key)
         if late is None:

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.functional import smoothing_gain
+from torch_denkf.functional import joint_forecast
 from torch_denkf.modules._base import SubModel, run_module
 from torch_denkf.modules.past import WithPast
 
@@ -68,18 +68,8 @@ class JointForecast(SubModel):
 
     def compute(self, mean, cov, cross, joint_mean, joint_cov, age):
         """Mean and covariance of the joint state."""
-        size = mean.shape[-1]
-        past_mean, past_cov = joint_mean[..., :-size], joint_cov[..., :-size, :-size]
-        last = past_cov[..., :size, :size]
         # At the start of an episode, before its own frame, no step has been made.
-        start = (age < 0).unsqueeze(-1)
-        identity = torch.eye(size, dtype=mean.dtype, device=mean.device)
-        # The past enters the forecast through the last state alone: x = G^T x_last + what is new.
-        cross = torch.where(start, last, cross).mT
-        gain = torch.where(start, identity, smoothing_gain(cross, last))
-        between = torch.cat([cross, gain @ past_cov[..., :size, size:]], -1)
-        joint = torch.cat([torch.cat([cov, between], -1), torch.cat([between.mT, past_cov], -1)], -2)
-        return torch.cat([mean, past_mean], -1), joint
+        return joint_forecast(mean, cov, cross, joint_mean, joint_cov, unmoved=age < 0)
 
 
 class PresentOfJoint(SubModel):
