@@ -14,15 +14,18 @@ from torch_denkf.modules import SensorAttention
 __all__ = ["make_weights", "train"]
 
 
-def make_weights(task: Task) -> SensorAttention:
+def make_weights(task: Task, seed: int = 0) -> SensorAttention:
     """The network of a task's weights, untrained."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     sizes = {name: len(noise) for name, noise in task.noises.items()}
-    return SensorAttention(sizes, features=sizes)
+    features = {name: task.train[f"{name}_features"].shape[-1] for name in sizes}
+    return SensorAttention(sizes, features=features)
 
 
 def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: int, batch: int, seed: int = 0) -> None:
     """Trains the noise on clean windows, and then the weights on windows in which a sensor fails, both in place.
+
+    The start-up of a window is not scored, and nothing fails in it.
 
     Args:
         task: the task.
@@ -32,7 +35,11 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
         batch: windows in an update.
         seed: of the windows and their faults.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator, settled = torch.Generator().manual_seed(seed), task.settled
+    kinds = [(name, fault) for name in task.sensors for fault in FAULTS]
+
+    def integer(low: int, high: int) -> Tensor:
+        return torch.randint(low, high, (1,), generator=generator)
 
     def clean() -> TensorDict:
         rows = torch.randint(task.train.shape[0], (batch, 1), generator=generator)
@@ -40,20 +47,21 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
         return task.train[rows, starts + torch.arange(window)]
 
     def failing() -> TensorDict:
-        data, parts = clean(), []
+        parts = []
         # A third of the windows stays as it is; in the others one sensor fails, and comes back or does not.
-        kinds = [(name, fault) for name in task.sensors for fault in FAULTS]
-        for part in data.split(1):
-            choice = int(torch.randint(len(kinds) * 3 // 2, (), generator=generator))
+        for part in clean().split(1):
+            choice = int(integer(0, len(kinds) * 3 // 2))
             if choice < len(kinds):
-                begin = torch.randint(window // 8, window // 2, (1,), generator=generator)
-                length = torch.randint(window // 4, window, (1,), generator=generator)
+                begin, length = integer(settled.start, window // 2), integer(window // 4, window)
                 part = faulty(task, part, *kinds[choice], begin, begin + length, generator)
             parts.append(part)
         return torch.cat(parts)
 
-    fit(task.build(None, False), task.loss, clean, task.parts.parameters(), updates[0], 3e-2)
-    fit(task.build(weights, False), task.loss, failing, weights.parameters(), updates[1], 1e-2)
+    def loss(out: TensorDict) -> Tensor:
+        return task.loss(out[:, settled])
+
+    fit(task.build(None, False), loss, clean, task.parts.parameters(), updates[0], 5e-2)
+    fit(task.build(weights, False), loss, failing, weights.parameters(), updates[1], 1e-2)
 
 
 def fit(
