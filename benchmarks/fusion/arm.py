@@ -110,7 +110,8 @@ def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: boo
             for name in names
         }
         motion = LinearTransition(move, MappedNoise(parts["motion"], eye[:, JOINTS:]))
-        return FusedFilter(motion, sensors, initial=MomentPrior(mean, start), weights=weights)
+        # Linear sensors: one update of all is the same as one after the other, and takes less time.
+        return FusedFilter(motion, sensors, initial=MomentPrior(mean, start), joint=True, weights=weights)
 
     def loss(out: TensorDict) -> Tensor:
         mean, var, truth = (

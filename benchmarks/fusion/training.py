@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.fusion.task import FAULTS, Task, faulty
+from benchmarks.fusion.task import FAULTS, Task, faulty, without
 from torch_denkf.modules import SensorAttention
 
 __all__ = ["make_weights", "train"]
@@ -23,9 +24,10 @@ def make_weights(task: Task, seed: int = 0) -> SensorAttention:
 
 
 def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: int, batch: int, seed: int = 0) -> None:
-    """Trains the noise on clean windows, and then the weights on windows in which a sensor fails, both in place.
+    """Trains the noise, and then the weights, on windows in which a sensor fails, both in place.
 
-    The start-up of a window is not scored, and nothing fails in it.
+    In a third of the windows one sensor is absent, so that the others are trained alone. In a half of those for the
+    weights one fails. The start-up of a window is not scored, and nothing fails in it.
 
     Args:
         task: the task.
@@ -36,32 +38,31 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
         seed: of the windows and their faults.
     """
     generator, settled = torch.Generator().manual_seed(seed), task.settled
-    kinds = [(name, fault) for name in task.sensors for fault in FAULTS]
+    names = task.sensors
 
     def integer(low: int, high: int) -> Tensor:
         return torch.randint(low, high, (1,), generator=generator)
 
-    def clean() -> TensorDict:
+    def sample(fail: bool) -> TensorDict:
         rows = torch.randint(task.train.shape[0], (batch, 1), generator=generator)
         starts = torch.randint(task.train.shape[1] - window + 1, (batch, 1), generator=generator)
-        return task.train[rows, starts + torch.arange(window)]
-
-    def failing() -> TensorDict:
         parts = []
-        # A third of the windows stays as it is; in the others one sensor fails, and comes back or does not.
-        for part in clean().split(1):
-            choice = int(integer(0, len(kinds) * 3 // 2))
-            if choice < len(kinds):
+        for number, part in enumerate(task.train[rows, starts + torch.arange(window)].split(1)):
+            name = names[int(integer(0, len(names)))]
+            if number % 6 < 2:
+                part = without(part, name)
+            elif fail and number % 6 < 5:
                 begin, length = integer(settled.start, window // 2), integer(window // 4, window)
-                part = faulty(task, part, *kinds[choice], begin, begin + length, generator)
+                fault = FAULTS[int(integer(0, len(FAULTS)))]
+                part = faulty(task, part, name, fault, begin, begin + length, generator)
             parts.append(part)
         return torch.cat(parts)
 
     def loss(out: TensorDict) -> Tensor:
         return task.loss(out[:, settled])
 
-    fit(task.build(None, False), loss, clean, task.parts.parameters(), updates[0], 5e-2)
-    fit(task.build(weights, False), loss, failing, weights.parameters(), updates[1], 1e-2)
+    fit(task.build(None, False), loss, partial(sample, False), task.parts.parameters(), updates[0], 5e-2)
+    fit(task.build(weights, False), loss, partial(sample, True), weights.parameters(), updates[1], 1e-2)
 
 
 def fit(
@@ -77,7 +78,7 @@ def fit(
     optimiser = torch.optim.Adam(parameters, lr)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, lr, total_steps=max(updates, 2))
     for _ in range(updates):
-        value = loss(model.sequence(sample()))
+        value = loss(model.sequence(sample(), keep=[("belief", "mean"), ("belief", "var")]))
         optimiser.zero_grad()
         value.backward()
         nn.utils.clip_grad_norm_(parameters, 1.0)
