@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_system
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
 from tests.filters.test_fused import BELIEF, DELAY, PATTERNS, B, T, arrived, arriving, fused, readings, sensors
 from torch_denkf.filters import FusedFilter, ParticleFilter, Refiltering
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation, SensorAttention
@@ -105,6 +106,33 @@ def test_readings_from_before_the_episode_or_the_window_are_not_used(float64):
         rows["late"] = late.reshape(1, T, 1).expand(B, T, 1)
         out = Refiltering(filter, LATE, DELAY).sequence(rows)
         assert_close(out["belief", "ensemble"], expected, rtol=0, atol=1e-12)
+
+
+def test_noise_that_is_not_given_is_drawn_once_and_actions_drive_the_next_step(float64):
+    control = torch.tensor([[1.0, 0.0], [0.5, 1.0]])
+    filter = linear_denkf("perturbed", noisy=True, control=control)
+    frames = TensorDict({"observation": torch.randn(2, 6, 2), "action": torch.randn(2, 6, 2)}, [2, 6])
+    frames["observed"] = torch.ones(2, 6, 1, dtype=torch.bool)
+    frames["late"] = torch.zeros(2, 6, 1, dtype=torch.int64)
+    late = Refiltering(filter, {"late": ("observation", "observed")}, 2)
+    given = filter.draw_noise(frames.copy())
+    expected = filter.sequence(given.copy())["belief", "ensemble"]
+    assert_close(late.sequence(given)["belief", "ensemble"], expected, rtol=0, atol=1e-10)
+    frames["late"][:, 4] = 2
+    rows = frames.unbind(1)
+    window = late.start(rows[0])
+    for row in rows[1:4]:
+        window = late.step(window, row)
+    noise = [row["noise"].clone() for row in window.rows]
+    window = late.step(window, rows[4])
+    assert (window.rows[1]["noise"] == noise[2]).all()
+    hidden = rows[4].copy()
+    hidden["observed"] = torch.zeros_like(hidden["observed"])
+    again = window.beliefs[0]
+    for row, reading in zip(window.rows, (rows[4], rows[3], hidden), strict=True):
+        step = reading.copy().update(row.select("noise", "action")).update(again.select(*filter.carry_keys))
+        again = filter.step(step)
+    assert_close(window.belief["belief", "ensemble"], again["belief", "ensemble"], rtol=0, atol=1e-12)
 
 
 def test_what_is_refused(float64):

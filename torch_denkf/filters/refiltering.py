@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
 from torch_denkf._checks import check_count
+from torch_denkf.filters._entries import write
+from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._steps import where_rows
 from torch_denkf.filters.base import Filter
 
@@ -91,8 +94,9 @@ class Refiltering:
 
         Raises:
             KeyError: if an entry is missing.
+            ValueError: if a module can draw its noise only within the step.
         """
-        rows = [*window.rows, self.filter.draw_noise(row.copy())][-self.lag - 1 :]
+        rows = [*window.rows, self._with_noise(row, window.belief)][-self.lag - 1 :]
         beliefs = list(window.beliefs[-len(rows) :])
         first = self._place(rows)
         del beliefs[first + 1 :]
@@ -114,14 +118,25 @@ class Refiltering:
         rows = tensordict.unbind(time)
         window = self.start(rows[0])
         beliefs = [window.belief]
-        for before, row in zip(rows[:-1], rows[1:], strict=True):
-            window = self.step(window, row.copy().update(before.select(*controls)))
+        for before, row in pairwise(rows):
+            window = self.step(window, row.copy().update(before.select(*controls, strict=False)))
             beliefs.append(window.belief)
         for key in self.filter.out_keys:
             like = beliefs[-1].get(key)
             values = [belief.get(key, None) for belief in beliefs]
             tensordict.set(key, torch.stack([torch.zeros_like(like) if v is None else v for v in values], time))
         return tensordict
+
+    def _with_noise(self, row: TensorDictBase, belief: TensorDictBase) -> TensorDictBase:
+        """The row and all noise of its step."""
+        row = row.copy()
+        carry = {key: belief[key] for key in self.filter.carry_keys}
+        entries = {**self.filter.entries_of(row, one_step=True), **carry}
+        drawn = draw_noise(self.filter, entries, row.batch_size, self.filter.structure.modules)
+        if drawn is None:
+            raise ValueError("A module cannot draw its noise before the step, so that the step cannot be made again.")
+        write(row, drawn)
+        return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:
         """Puts the late readings of the last row where they belong; returns the first row that is another."""
