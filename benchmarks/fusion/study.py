@@ -30,7 +30,7 @@ COLUMNS = Columns(
 )
 METHODS = ("plain", "weights")
 SECONDS = 3.0  # that a sensor fails
-WINDOW, BATCH = 250, 32  # steps of a training window, and windows in an update
+WINDOW, BATCH = 200, 36  # steps of a training window, and windows in an update
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Study:
     kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
-    updates: tuple[int, int] = (40, 120)  # of the noise and of the weights
+    updates: tuple[int, int] = (15, 70)  # of the noise and of the weights
     seeds: int = 3  # trainings
     validate: bool = False  # score recordings that are not the test's, to choose by
     processes: int = 1

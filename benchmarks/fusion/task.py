@@ -28,6 +28,7 @@ class Task:
         rate: of the filter's steps, in Hz.
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
+        failing: the sensors of which one fails in a training window; those that matter most stand there twice.
         late: by sensor, by how many more steps its readings come late where it is delayed.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
@@ -43,6 +44,7 @@ class Task:
     rate: float
     offsets: dict[str, Tensor]
     noises: dict[str, Tensor]
+    failing: tuple[str, ...]
     late: dict[str, int]
     train: TensorDict
     test: TensorDict

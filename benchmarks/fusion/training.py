@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import torch
@@ -38,22 +38,23 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
         seed: of the windows and their faults.
     """
     generator, settled = torch.Generator().manual_seed(seed), task.settled
-    names = task.sensors
 
     def integer(low: int, high: int) -> Tensor:
         return torch.randint(low, high, (1,), generator=generator)
+
+    def draw(names: Sequence[str]) -> str:
+        return names[int(integer(0, len(names)))]
 
     def sample(fail: bool) -> TensorDict:
         rows = torch.randint(task.train.shape[0], (batch, 1), generator=generator)
         starts = torch.randint(task.train.shape[1] - window + 1, (batch, 1), generator=generator)
         parts = []
         for number, part in enumerate(task.train[rows, starts + torch.arange(window)].split(1)):
-            name = names[int(integer(0, len(names)))]
             if number % 6 < 2:
-                part = without(part, name)
+                part = without(part, draw(task.sensors))
             elif fail and number % 6 < 5:
                 begin, length = integer(settled.start, window // 2), integer(window // 4, window)
-                fault = FAULTS[int(integer(0, len(FAULTS)))]
+                name, fault = draw(task.failing), draw(FAULTS)
                 part = faulty(task, part, name, fault, begin, begin + length, generator)
             parts.append(part)
         return torch.cat(parts)
@@ -62,7 +63,7 @@ def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: i
         return task.loss(out[:, settled])
 
     fit(task.build(None, False), loss, partial(sample, False), task.parts.parameters(), updates[0], 5e-2)
-    fit(task.build(weights, False), loss, partial(sample, True), weights.parameters(), updates[1], 1e-2)
+    fit(task.build(weights, False), loss, partial(sample, True), weights.parameters(), updates[1], 2e-2)
 
 
 def fit(
@@ -76,7 +77,7 @@ def fit(
     """Minimises a loss of what a filter believes."""
     parameters = list(parameters)
     optimiser = torch.optim.Adam(parameters, lr)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, lr, total_steps=max(updates, 2))
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, lr, total_steps=max(updates, 2), pct_start=0.2)
     for _ in range(updates):
         value = loss(model.sequence(sample(), keep=[("belief", "mean"), ("belief", "var")]))
         optimiser.zero_grad()
