@@ -5,11 +5,12 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
+from benchmarks.fusion import training
 from benchmarks.fusion.arm import finer
 from benchmarks.fusion.car import DT, START, car_task, readings, simulated
 from benchmarks.fusion.study import COLUMNS, Study, page, rows
 from benchmarks.fusion.task import add_features, delayed, faulty, last_seen, without
-from benchmarks.fusion.training import make_weights
+from benchmarks.fusion.training import make_weights, train
 
 
 def test_finer_paths_go_through_the_coarse_ones_and_are_smooth():
@@ -86,6 +87,27 @@ def test_what_is_late_comes_later():
     assert out["a"][0, 2:, 0].tolist() == [0, 1, 2, 3]
     assert out["a_observed"].flatten().tolist() == [False] * 2 + [True] * 4
     assert (out["a_late"] == 2).all()
+
+
+def test_what_the_trainings_see(monkeypatch):
+    """A third of the windows lacks a sensor; in a half of those for the weights one fails, after the start-up."""
+    task, seen = car_task(None, frames=60), []
+    monkeypatch.setattr(training, "fit", lambda model, loss, sample, *_: seen.append(sample()))
+    train(task, make_weights(task), updates=(1, 1), window=200, batch=60)
+    begin = task.settled.start
+    assert begin == round(0.5 * task.rate)
+    for number, windows in enumerate(seen):
+        absent = torch.stack([~windows[f"{name}_observed"].any(1).squeeze(-1) for name in task.sensors])
+        assert absent.any(0).sum() == 20
+        assert (absent.sum(0) <= 1).all()
+        clean = torch.zeros(60, dtype=torch.bool)
+        for row, window in enumerate(windows):
+            starts = (task.train["state"][:, :96] == window["state"][0]).all(-1).nonzero()
+            recording, start = starts[0]
+            same = [(window[name] == task.train[recording, start : start + 200][name]).all(-1) for name in task.sensors]
+            assert all(values[:begin].all() for values in same)
+            clean[row] = all(values.all() for values in same)
+        assert clean.sum() == (60, 30)[number]
 
 
 def test_medians_over_the_seeds_and_the_worst_training():

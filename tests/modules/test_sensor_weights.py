@@ -21,6 +21,7 @@ from torch_denkf.modules import (
     Select,
     SensorAttention,
 )
+from torch_denkf.smoothers import FixedLag
 
 
 class Constant(nn.Module):
@@ -84,6 +85,25 @@ def test_the_network_sees_innovations_in_standard_deviations(float64):
     assert_close(innovations["first"], (rows["first"][:, -1] - mean @ H[:1].mT) / spread.sqrt(), rtol=0, atol=1e-9)
     assert (innovations["second"] == 0).all()
     assert observed.tolist() == [[True, False]] * 3
+
+
+def test_a_late_reading_is_judged_by_what_is_believed_of_its_time(float64):
+    F, Q, H, R = linear_system()
+    network = Constant(1.0, 1.0)
+    rows = frames()
+    rows["first_observed"][:] = True
+    rows["first"] = rows["first"].nan_to_num()
+    rows["second_observed"] = torch.tensor([False] * 7 + [True]).reshape(1, 8, 1).expand(3, 8, 1)
+    make("Kalman", weights=network, delay=2).sequence(rows.copy())
+    first = {"first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt())}
+    alone = FusedFilter(LinearTransition(F, Q), first, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
+    # It arrives at t = 7 and is of t = 5, of which the other sensor's readings up to t = 6 have told.
+    before = FixedLag(alone, 1).sequence(rows[:, :7].copy())["smoothed"][:, -1]
+    spread = (H[1:] @ before["cov"] @ H[1:].mT).squeeze(-1) + R[1:]
+    innovations, observed, _ = network.given
+    expected = (rows["second"][:, -1] - before["mean"] @ H[1:].mT) / spread.sqrt()
+    assert_close(innovations["second"], expected, rtol=0, atol=1e-9)
+    assert observed.all()
 
 
 def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64):
