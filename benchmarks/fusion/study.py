@@ -41,7 +41,7 @@ class Study:
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
     updates: tuple[int, int] = (15, 70)  # of the noise and of the weights
-    seeds: int = 3  # trainings
+    seeds: int = 2  # trainings
     validate: bool = False  # score recordings that are not the test's, to choose by
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?

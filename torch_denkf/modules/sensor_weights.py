@@ -43,7 +43,8 @@ class SensorAttention(nn.Module):
         features: number of features of each sensor that has any.
         size: D, of a token.
         floor: :math:`w_0`, the smallest weight. It keeps a way back: a sensor that was distrusted still corrects
-            the belief a little.
+            the belief a little. A thousand readings of weight 0.001 count as one that is believed: where a sensor reads
+            much more often than the others, or is much more exact, take a smaller one.
 
     Raises:
         ValueError: if a size is not positive, the floor is outside (0, 1), or features are of no sensor.
