@@ -124,5 +124,5 @@ def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: boo
 
     offsets = {"camera": torch.full((7,), 0.4), "encoders": torch.full((6,), 0.2), "force": torch.tensor([0.3])}
     modules = nn.ModuleDict(parts)
-    failing = (*names, "encoders")
-    return Task("UR5", 1 / DT, offsets, noises, failing, late, train, test, modules, build, False, loss, error, "deg")
+    training = ((*names, "encoders"), 0.0, (15, 70))
+    return Task("UR5", 1 / DT, offsets, noises, *training, late, train, test, modules, build, False, loss, error, "deg")

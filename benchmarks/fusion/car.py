@@ -158,5 +158,5 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
     wrong = torch.tensor([-6.0, 0.2])
     offsets = {"camera": wrong, "wheels": wrong, "gps": torch.tensor([15.0, 15.0])}
     modules = nn.ModuleDict(parts)
-    failing = ("camera", "wheels", "gps", "gps")
-    return Task("KITTI", 1 / DT, offsets, noises, failing, late, train, test, modules, build, True, loss, error, "m")
+    training = (("camera", "wheels", "wheels", "gps"), 3.0, (15, 40))
+    return Task("KITTI", 1 / DT, offsets, noises, *training, late, train, test, modules, build, True, loss, error, "m")

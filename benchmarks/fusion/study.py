@@ -40,7 +40,6 @@ class Study:
     kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
-    updates: tuple[int, int] = (15, 70)  # of the noise and of the weights
     seeds: int = 2  # trainings
     validate: bool = False  # score recordings that are not the test's, to choose by
     processes: int = 1
@@ -124,8 +123,8 @@ def job(name: str, seed: int, study: Study) -> list[dict]:
         task.parts.load_state_dict(saved["parts"])
         weights.load_state_dict(saved["weights"])
     else:
-        window = 16 if study.smoke else WINDOW
-        train(task, weights, updates=study.updates, window=window, batch=BATCH, seed=seed)
+        updates, window = ((1, 1), 16) if study.smoke else (task.updates, WINDOW)
+        train(task, weights, updates=updates, window=window, batch=BATCH, seed=seed)
         write_checkpoint(file, {"parts": task.parts.state_dict(), "weights": weights.state_dict()})
     return [{**row, "seed": seed} for row in rows(task, weights)]
 
@@ -171,7 +170,7 @@ def main() -> None:
     """Runs the study; one that was broken off goes on."""
     study = parse(Study)
     if study.smoke:
-        study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), updates=(1, 1), seeds=1)
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), seeds=1)
     tasks = ["UR5"] + ["KITTI"] * (study.kitti is not None or study.smoke)
     runs = [(name, seed) for seed in range(study.seeds) for name in tasks]
     files = {study.out / "parts" / f"{name}-{seed}.json": (name, seed) for name, seed in runs}

@@ -29,6 +29,8 @@ class Task:
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
         failing: the sensors of which one fails in a training window; those that matter most stand there twice.
+        slope: of the weights before training, see :class:`~torch_denkf.modules.SensorAttention`.
+        updates: of the noise and of the weights.
         late: by sensor, by how many more steps its readings come late where it is delayed.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
@@ -45,6 +47,8 @@ class Task:
     offsets: dict[str, Tensor]
     noises: dict[str, Tensor]
     failing: tuple[str, ...]
+    slope: float
+    updates: tuple[int, int]
     late: dict[str, int]
     train: TensorDict
     test: TensorDict

@@ -22,7 +22,7 @@ def make_weights(task: Task, seed: int = 0) -> SensorAttention:
     torch.manual_seed(seed)
     sizes = {name: len(noise) for name, noise in task.noises.items()}
     features = {name: task.train[f"{name}_features"].shape[-1] for name in sizes}
-    return SensorAttention(sizes, features=features, floor=FLOOR)
+    return SensorAttention(sizes, features=features, floor=FLOOR, slope=task.slope)
 
 
 def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: int, batch: int, seed: int = 0) -> None:
