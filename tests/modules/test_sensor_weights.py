@@ -124,10 +124,23 @@ def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64)
     assert_close(attention(values, both, {"b": torch.zeros(5, 3)}), torch.full((5, 2), 0.1))
 
 
+def test_with_a_slope_weights_fall_with_the_innovation_before_training(float64):
+    attention = SensorAttention({"a": 2, "b": 1}, slope=2.0)
+    innovations = {"a": torch.tensor([[3.0, 3.0], [4.0, 0.0]]), "b": torch.tensor([[0.0], [10.0]])}
+    odds = torch.exp(torch.tensor(4.0)) / torch.tensor([[10.0, 1.0], [9.0, 101.0]]) ** 2
+    expected = 1e-3 + (1 - 1e-3) * odds / (1 + odds)
+    assert_close(attention(innovations, torch.ones(2, 2, dtype=torch.bool), {}), expected)
+    assert "slope" in attention.state_dict()
+    assert "slope" not in SensorAttention({"a": 2, "b": 1}).state_dict()
+    with pytest.raises(ValueError, match="slope"):
+        SensorAttention({"a": 2}, slope=-1.0)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_the_gradient_reaches_the_weights(float64, kind):
+def test_the_gradient_reaches_the_weights(float64, kind, slope):
     torch.manual_seed(0)
-    attention = SensorAttention({"first": 1, "second": 1}, size=4)
+    attention = SensorAttention({"first": 1, "second": 1}, size=4, slope=slope)
     with torch.no_grad():
         for parameter in attention.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
