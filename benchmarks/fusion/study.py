@@ -40,7 +40,7 @@ class Study:
     kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
-    seeds: int = 2  # trainings
+    seeds: int = 3  # trainings
     validate: bool = False  # score recordings that are not the test's, to choose by
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?
