@@ -7,8 +7,16 @@ from torch.testing import assert_close
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
 from tests.filters.test_fused import BELIEF, DELAY, PATTERNS, B, T, arrived, arriving, fused, readings, sensors
-from torch_denkf.filters import FusedFilter, ParticleFilter, Refiltering
-from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation, SensorAttention
+from torch_denkf.filters import FusedFilter, Gated, Monitored, ParticleFilter, Refiltering
+from torch_denkf.modules import (
+    ConstantNoise,
+    GaussianLikelihood,
+    GaussianPrior,
+    InnovationMonitor,
+    LinearObservation,
+    MonitoredSensor,
+    SensorAttention,
+)
 
 LATE = {"late": ("second", "second_observed")}
 MEMBERS = torch.randn(7, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -148,3 +156,57 @@ def test_what_is_refused(float64):
     filter.update_at_reset = True
     with pytest.raises(ValueError, match="update_at_reset"):
         Refiltering(filter, LATE, DELAY)
+
+
+def test_an_entry_or_a_filter_that_would_be_misread_is_refused(float64):
+    filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])
+    for late in ({"late": "second"}, {"late": ("second_observed",)}):
+        with pytest.raises(ValueError, match="last, of its mask"):
+            Refiltering(filter, late, DELAY)
+    for keys in (("second", "late"), ("third", "second_observed")):
+        with pytest.raises(ValueError, match="does not read"):
+            Refiltering(filter, {"late": keys}, DELAY)
+    for options in ({"delay": DELAY}, {"delay": DELAY, "late": "late"}):
+        for kind, joint in (("Kalman", False), ("Kalman", True), ("ensemble", False)):
+            with pytest.raises(ValueError, match="late twice"):
+                Refiltering(fused(kind, members=MEMBERS, joint=joint, **options), LATE, DELAY)
+    refiltering = Refiltering(filter, LATE, DELAY)
+    with pytest.raises(ValueError, match=r"second_observed\.bool"):
+        refiltering.sequence(frames.copy().update({"second_observed": frames["second_observed"].double()}))
+    for dtype in (torch.float64, torch.bool):
+        with pytest.raises(ValueError, match=r"late\.long"):
+            refiltering.sequence(frames.copy().update({"late": frames["late"].to(dtype)}))
+    flat = TensorDict({**frames[0].to_dict(), "late": frames["late"][0, :, 0]}, [T])
+    with pytest.raises(ValueError, match=r"\[\*B, 1\]"):
+        refiltering.sequence(flat)
+
+
+def test_a_row_that_begins_another_episode_is_refused(float64):
+    refiltering, frames = Refiltering(fused("Kalman"), LATE, DELAY), arriving(readings(), PATTERNS["out of order"])
+    rows = frames.unbind(1)
+    with pytest.raises(ValueError, match="is_init"):
+        refiltering.step(refiltering.start(rows[0]), rows[1].copy().update({"is_init": torch.ones(B, 1).bool()}))
+    frames = frames.exclude("is_init")
+    frames["next", "done"] = torch.zeros(B, T, 1, dtype=torch.bool)
+    refiltering.sequence(frames.copy())
+    frames["next", "done"][1, 5] = True
+    with pytest.raises(ValueError, match="cut it there"):
+        refiltering.sequence(frames)
+
+
+def test_a_dictionary_is_a_row_of_one_robot(float64):
+    filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])[0]
+    refiltering = Refiltering(filter, LATE, DELAY)
+    window = refiltering.start({})
+    for row in frames.unbind(0)[1:]:
+        window = refiltering.step(window, row.exclude("is_init").to_dict())
+    expected = refiltering.sequence(frames.copy())
+    assert_close(window.belief["belief", "mean"], expected["belief", "mean"][-1], rtol=0, atol=0)
+
+
+def test_what_stands_around_a_filter_goes_inside(float64):
+    monitor = InnovationMonitor({"second": MonitoredSensor("info", 1)})
+    refiltering = Refiltering(fused("Kalman"), LATE, DELAY)
+    for wrap in (Gated, lambda filter: Monitored(filter, monitor)):
+        with pytest.raises(TypeError, match="Refiltering goes outermost"):
+            wrap(refiltering)

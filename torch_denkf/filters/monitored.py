@@ -31,6 +31,7 @@ class Monitored(Filter):
         monitor: what to watch, see :class:`~torch_denkf.modules.InnovationMonitor`.
 
     Raises:
+        TypeError: if the filter is none.
         KeyError: if the filter does not write what the monitor reads.
         ValueError: if the filter writes under the monitor's ``monitor_key`` already, as another monitor does.
 
@@ -48,6 +49,7 @@ class Monitored(Filter):
     """
 
     def __init__(self, filter: Filter, monitor: InnovationMonitor):
+        _check_filter("Monitored", filter)
         check_module("monitor", monitor)
         read = [key for key in monitor.in_keys if key not in monitor.state_keys]
         missing = [key for key in map(unravel_key, read) if key not in filter.out_keys]
@@ -124,6 +126,7 @@ class Gated(Filter):
         places: Sequence[str] | None = None,
         **options: Unpack[GateOptions],
     ):
+        _check_filter("Gated", filter)
         modules = OrderedDict(named_modules_of(filter))
         found = [name for name, module in modules.items() if any(_analyses(module))]
         count = sum(1 for name in found for _ in _analyses(modules[name]))
@@ -171,6 +174,14 @@ class Gated(Filter):
             gate.rate = rate
             gate.calibrate(outputs, **options)
         return self
+
+
+def _check_filter(name: str, filter: object) -> None:
+    if not isinstance(filter, Filter):
+        raise TypeError(
+            f"{name} goes around a torch_denkf Filter; got {type(filter).__name__}. A Refiltering goes outermost: "
+            f"Refiltering({name}(filter, ...), ...)."
+        )
 
 
 def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:

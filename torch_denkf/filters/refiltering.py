@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
 
-from torch_denkf._checks import check_count
-from torch_denkf.filters._entries import write
+from torch_denkf._checks import check_count, check_mask, check_shape
+from torch_denkf.filters._entries import of_one_robot, write
 from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._slices import starts_of
 from torch_denkf.filters._steps import where_rows
 from torch_denkf.filters.base import Filter
+from torch_denkf.modules.fused import StateObservation
 
 __all__ = ["Refiltering", "RefilteringWindow"]
 
@@ -44,8 +47,10 @@ class Refiltering:
     since by their covariances instead, at a cost that does not depend on how late the reading is; of an ensemble with
     process noise they are sample covariances. That filter also runs as a policy and in a transform.
 
+    It is no :class:`Filter`, and goes around all others: ``Refiltering(Gated(FixedLag(filter, 10)), late, lag)``.
+
     All rows of the batch begin their episode together. A reading is not used if it belongs to the time before the first
-    step, or to more than ``lag`` steps ago.
+    step, or to more than ``lag`` steps ago. It takes the place of what its sensor had read at that time.
 
     Args:
         filter: whose sensors have no ``delay`` of their own.
@@ -54,7 +59,8 @@ class Refiltering:
         lag: the largest number of steps by which a reading can be late.
 
     Raises:
-        ValueError: if ``lag`` is not positive, or the filter updates its first belief.
+        ValueError: if ``lag`` is not positive, the filter updates its first belief or has a sensor with a ``delay``, or
+            ``late`` names what the filter does not read, or no reading with its mask.
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,14 +81,17 @@ class Refiltering:
         check_count("lag", lag)
         if filter.update_at_reset:
             raise ValueError("The filter has update_at_reset=True, and a reading of the first frame could come late.")
+        models = [module for module in filter.modules() if isinstance(module, StateObservation)]
+        if any(model.delay or model.late_key is not None for model in models):
+            raise ValueError("A sensor of the filter has a delay= or late=, and would be late twice; leave them out.")
         self.filter, self.lag = filter, lag
-        self.late = {unravel_key(key): tuple(map(unravel_key, keys)) for key, keys in late.items()}
+        self.late = {unravel_key(key): _read_with(key, keys, filter) for key, keys in late.items()}
 
-    def start(self, row: TensorDictBase) -> RefilteringWindow:
+    def start(self, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
         """The belief at the start of an episode, see :meth:`Filter.initialise`."""
-        return RefilteringWindow((), (self.filter.initialise(row.copy()),))
+        return RefilteringWindow((), (self.filter.initialise(of_one_robot(self.filter, row).copy()),))
 
-    def step(self, window: RefilteringWindow, row: TensorDictBase) -> RefilteringWindow:
+    def step(self, window: RefilteringWindow, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
         """One step.
 
         Args:
@@ -94,8 +103,13 @@ class Refiltering:
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if a module can draw its noise only within the step.
+            ValueError: if a module can draw its noise only within the step, the row begins another episode, or an entry
+                of ``late`` is not of whole numbers ``[*B, 1]``.
         """
+        row = of_one_robot(self.filter, row)
+        begins = starts_of(row, self.filter.init_key, step=True)
+        if begins is not None and begins.any():
+            raise ValueError(f"{self.filter.init_key!r} marks a row that begins another episode; take it to start().")
         rows = [*window.rows, self._with_noise(row, window.belief)][-self.lag - 1 :]
         beliefs = list(window.beliefs[-len(rows) :])
         first = self._place(rows)
@@ -112,7 +126,7 @@ class Refiltering:
             ValueError: if another episode begins within it.
         """
         time, controls = tensordict.ndim - 1, self.filter.structure.controls
-        begins = tensordict.get(self.filter.init_key, None)
+        begins = starts_of(tensordict, self.filter.init_key)
         if begins is not None and begins.narrow(time, 1, begins.shape[time] - 1).any():
             raise ValueError("Another episode begins within the sequence; cut it there.")
         rows = tensordict.unbind(time)
@@ -144,6 +158,8 @@ class Refiltering:
         first = last
         for key, keys in self.late.items():
             late, mask = rows[last][key], keys[-1]
+            _check_late(key, late, rows[last])
+            check_mask(str(mask), rows[last][mask])
             for steps in range(1, last + 1):
                 here = (late == steps) & rows[last][mask].any(-1, keepdim=True)
                 if here.any():
@@ -153,3 +169,21 @@ class Refiltering:
                     rows[last - steps] = old.copy().update(new)
             rows[last] = rows[last].copy().set(mask, rows[last][mask] & (late == 0))
         return first
+
+
+def _read_with(key: NestedKey, keys: Sequence[NestedKey], filter: Filter) -> tuple[NestedKey, ...]:
+    """The keys of a reading and of its mask, which the filter must read."""
+    if isinstance(keys, str) or len(keys) < 2:
+        raise ValueError(f"late[{key!r}] is the keys of a reading and, last, of its mask; got {keys!r}.")
+    found = tuple(map(unravel_key, keys))
+    for one in found:
+        if one not in filter.in_keys:
+            raise ValueError(f"late[{key!r}] names {one!r}, which the filter does not read; it reads {filter.in_keys}.")
+    return found
+
+
+def _check_late(key: NestedKey, late: Tensor, row: TensorDictBase) -> None:
+    """Raises unless an entry says by how many steps a reading is late."""
+    check_shape(str(key), late, (*row.batch_size, 1), "[*B, 1]")
+    if late.is_floating_point() or late.dtype == torch.bool:
+        raise ValueError(f"{key!r} holds steps, as int64; got {late.dtype}. Pass {key}.long().")
