@@ -1,5 +1,7 @@
 """Gates and monitors around filters of several sensors: against the filter by hand, and readings that are hidden."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -12,11 +14,15 @@ from torch_denkf.filters import Filter, FusedFilter, FusedSensor, Gated, Monitor
 from torch_denkf.modules import (
     ConstantNoise,
     EKFAnalysis,
+    EnsembleAnalysis,
+    GaussianPrior,
     InnovationMonitor,
+    LearnedTransition,
     LinearObservation,
     LinearTransition,
     MomentPrior,
     MonitoredSensor,
+    Select,
 )
 
 NAMES = ("first", "second")
@@ -102,6 +108,34 @@ def test_single_readings_of_a_joint_update_are_left_out_of_no_wrapped_filter(wra
     row = filter.initialise(readings(2))
     with pytest.raises(ValueError, match="hide them with their masks"):
         filter.step(row, without=["first"])
+
+
+@pytest.mark.parametrize("told", [1, 3])
+def test_another_number_of_components_than_the_reading_has_is_refused(told):
+    monitor = InnovationMonitor({"both": MonitoredSensor("info", told)})
+    for filter in (Gated(fused(joint=True), told), Monitored(fused(joint=True), monitor)):
+        with pytest.raises(ValueError, match="pass observation_dim=2"):
+            filter.sequence(readings(2, 4))
+
+
+def test_a_gate_knows_the_size_of_a_joint_reading(float64):
+    told, found = (Gated(fused(joint=True), *dim).sequence(readings(2, 9)) for dim in ((2,), ()))
+    assert (told["gate", "factor"] > 1).any()
+    assert_close(found["belief", "mean"], told["belief", "mean"], rtol=0, atol=0)
+
+
+def test_a_joint_update_with_perturbed_readings_draws_its_noise_before_the_step(float64):
+    filter = FusedFilter(
+        LearnedTransition(torch.nn.Linear(2, 2)),
+        {"first": FusedSensor(Select([0]), [0.3]), "second": FusedSensor(Select([0, 1]), [0.3, 0.2])},
+        initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=5),
+        process_noise=[0.1, 0.1],
+        joint=True,
+        analysis=partial(EnsembleAnalysis, "perturbed"),
+    )
+    frames = TensorDict({"first": torch.zeros(4, 1), "second": torch.zeros(4, 2)}, [4])
+    noise = filter.draw_noise(frames)["noise", "analysis"]
+    assert noise.shape == (4, 5, 3)
 
 
 def test_two_analyses_in_one_place_have_gates_of_their_own(float64):

@@ -238,12 +238,14 @@ class _Updates:
             "noise": ("sensor", "joint_noise"),
             "observed": ("forecast", "observed"),
         }
+        sizes = [_observation_dim(sensor) for sensor in sensors.values()]
         join = JoinedReading(
             [wired[name].reading for name in sensors],
             [wired[name].noise for name in sensors],
             [sensor.angles for sensor in sensors.values()],
             reading_key=keys["reading"],
             noise_key=keys["noise"],
+            observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
         )
         model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
         angles = _joint_angles(sensors)

@@ -7,11 +7,24 @@ from torch import Tensor
 
 from torch_denkf.functional import chi_square_quantile
 
-__all__ = ["IDENTITY", "chi_square_table", "empirical_quantile", "score_table"]
+__all__ = ["IDENTITY", "check_observation_dim", "chi_square_table", "empirical_quantile", "score_table"]
 
 _LEVELS = (0.01, *(0.05 * n for n in range(1, 20)), 0.975, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9999)
 #: Knots and heights ``[2, N]`` of the map that changes nothing.
 IDENTITY = torch.arange(len(_LEVELS) + 2.0).repeat(2, 1)
+
+
+def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
+    """Raise unless the innovations ``[*B, O]`` have as many components as ``name`` was told.
+
+    Raises:
+        ValueError: if they have not.
+    """
+    if innovation.shape[-1] != expected:
+        raise ValueError(
+            f"{name} was told observation_dim={expected}, and the reading has {innovation.shape[-1]} components; "
+            f"pass observation_dim={innovation.shape[-1]}."
+        )
 
 
 def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:

@@ -198,6 +198,7 @@ class JoinedReading(SubModel):
         angles: components of each reading that are angles in radians.
         reading_key: all readings, ``[*B, O]``.
         noise_key: all variances ``[*B, O]``, or one covariance ``[*B, O, O]`` if any sensor has one.
+        observation_dim: O of all, where it is known.
 
     Example:
         >>> from tensordict import TensorDict
@@ -217,8 +218,10 @@ class JoinedReading(SubModel):
         *,
         reading_key: NestedKey,
         noise_key: NestedKey,
+        observation_dim: int | None = None,
     ):
         super().__init__(nn.Identity(), [*reading_keys, *noise_keys], [reading_key, noise_key])
+        self.observation_dim = observation_dim
         self.angles = [list(dims) for dims in angles]
 
     def compute(self, *values, batch_size):

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import adapt, chi_square_quantile, disbelief, interpolate, spread_about_mean
 from torch_denkf.modules._base import Call, Entries, SubModel, flat_noise, writes
-from torch_denkf.modules._calibration import IDENTITY, chi_square_table, empirical_quantile
+from torch_denkf.modules._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
 from torch_denkf.modules.kalman import KalmanAnalysis
@@ -221,6 +221,7 @@ class GatedAnalysis(InPlaceOf):
             entries = self._wider(entries, log_inflation.exp())
         out = self.module.on_entries(entries, call)
         nis, innovation = (out[self.info_key, name] for name in ("nis", "innovation"))
+        check_observation_dim(self.observation_dim, innovation, f"the gate {self.gate_key!r}")
         part, freedom = self._parts(entries, nis, innovation)
         dtype = nis.dtype
         calibrated = interpolate(part, *self.tables.to(dtype).unbind(1)).clamp_min(0)

@@ -23,7 +23,13 @@ from torch_denkf.functional import (
     observe,
 )
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._calibration import IDENTITY, chi_square_table, empirical_quantile, score_table
+from torch_denkf.modules._calibration import (
+    IDENTITY,
+    check_observation_dim,
+    chi_square_table,
+    empirical_quantile,
+    score_table,
+)
 
 __all__ = ["InnovationMonitor", "MonitoredSensor"]
 
@@ -206,6 +212,7 @@ class InnovationMonitor(SubModel):
         info = unravel_key(sensor.info_key)
         info = (info,) if isinstance(info, str) else info
         nis, innovation = (self.required(entries, (*info, entry)) for entry in ("nis", "innovation"))
+        check_observation_dim(sensor.observation_dim, innovation, f"the monitored sensor at {sensor.info_key!r}")
         noise = None if sensor.noise_key is None else self.required(entries, unravel_key(sensor.noise_key))
         mask = entries.get(unravel_key(sensor.observed_key))
         # Without a mask to be read, as where an observation model makes it: what is not observed has no innovation.
