@@ -210,3 +210,29 @@ def test_what_stands_around_a_filter_goes_inside(float64):
     for wrap in (Gated, lambda filter: Monitored(filter, monitor)):
         with pytest.raises(TypeError, match="Refiltering goes outermost"):
             wrap(refiltering)
+
+
+def test_two_sensors_late_in_one_row_and_a_late_entry_without_a_reading(float64):
+    filter = fused("Kalman")
+    frames = readings()
+    for name in ("first", "second"):
+        frames[f"{name}_observed"][:] = True
+    order, rows = frames.clone(), frames.clone()
+    late = {"first": 3, "second": 1}  # at t = 7; nothing was read at the times that they belong to
+    for name, steps in late.items():
+        rows[f"{name}_late"] = torch.zeros(B, T, 1, dtype=torch.int64)
+        rows[f"{name}_late"][:, 7] = steps
+        rows[name][:, 7], rows[f"{name}_observed"][:, 7 - steps] = frames[name][:, 7 - steps], False
+        order[f"{name}_observed"][:, 7] = False
+    rows["first_late"][:, 9], rows["first_observed"][:, 9] = (
+        2,
+        False,
+    )  # says nothing: t = 7 has no reading, t = 9 neither
+    rows["second_late"][:, 9], rows["second_observed"][:, 9] = 1, False  # t = 8 keeps its own
+    for name in late:
+        order[f"{name}_observed"][:, 9] = False
+    keys = {f"{name}_late": (name, f"{name}_observed") for name in late}
+    for mapping in (keys, dict(reversed(keys.items()))):
+        out = Refiltering(filter, mapping, DELAY).sequence(rows.clone())
+        for key in BELIEF:
+            assert_close(out[key][:, -1], filter.sequence(order.clone())[key][:, -1], rtol=0, atol=1e-10)
