@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import linear_denkf, linear_system
 from torch_denkf.filters import FusedFilter, FusedSensor, Gated
-from torch_denkf.modules import GatedAnalysis, GaussianPrior, LearnedTransition, LinearObservation
+from torch_denkf.modules import GatedAnalysis, GateOptions, GaussianPrior, LearnedTransition, LinearObservation
 from torch_denkf.smoothers import EnKS, FixedLag
 
 WRONG = (7, 8, 13)
@@ -98,12 +98,15 @@ def test_a_gate_of_late_readings_is_as_good_as_a_mask(float64):
 def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
     torch.manual_seed(0)
     clean = TensorDict({"observation": torch.randn(4, 200, 2)}, [4, 200])
-    gated = Gated(linear_denkf(), 2, window=2).calibrate([clean], margin=1.5)
+    options = {"response": "huber", "window": 2, "rate": 2e-3, "freedom": 5.0, "patience": 7, "by_component": True}
+    options |= {"adapt_noise": 0.01, "adapt_inflation": 0.02, "gate_key": "door"}
+    assert set(options) == set(GateOptions.__annotations__)
+    gated = Gated(linear_denkf(), 2, **options).calibrate([clean], margin=1.5)
     inside = next(module for module in FixedLag(gated, 3).modules() if isinstance(module, GatedAnalysis))
     assert torch.equal(inside.tables, gated.gates[0].tables)
-    assert inside.slack > 1
+    assert (inside.slack > 1).all()
     assert torch.equal(inside.slack, gated.gates[0].slack)
-    assert (inside.window, inside.rate) == (2, gated.gates[0].rate)
+    assert {name: getattr(inside, name) for name in options} == options
 
 
 def test_a_smoother_of_a_gated_filter_leaves_out_what_the_gate_rejects(float64):
