@@ -12,7 +12,7 @@ from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
 
 STEPS, STRIDE, PROCESS, START, START_STD = 75, 0.05, 0.025, -0.85, 0.1
-RIDGES = (((0.0, 0.0), (0.005, 1.0)), ((0.0, -0.8), (1.0, 0.01)), ((0.0, 0.8), (1.0, 0.01)))  # means, variances
+RIDGES = (((-0.4, -0.8), (0.16, 0.01)), ((0.0, 0.0), (0.01, 0.64)), ((0.4, 0.8), (0.16, 0.01)))  # means, variances
 
 
 def altitude(position: Tensor) -> Tensor:

@@ -13,10 +13,14 @@ class Seen(Transform):
     """Writes ``"seen"`` ``[*B, O + 1 + A]``: the last reading that came, whether it came now, and the last action.
 
     All that a filter reads in a step, without NaN.
+
+    Args:
+        scale: what a reading is divided by.
     """
 
-    def __init__(self):
+    def __init__(self, scale: float = 1.0):
         super().__init__(in_keys=["observation", "observed"], out_keys=["seen"])
+        self.scale = scale
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before = tensordict["seen"][..., : next_tensordict["observation"].shape[-1]]
@@ -28,7 +32,7 @@ class Seen(Transform):
 
     def _write(self, tensordict: TensorDictBase, before: Tensor, action: Tensor) -> TensorDictBase:
         observed = tensordict["observed"]
-        reading = torch.where(observed, tensordict["observation"], before)
+        reading = torch.where(observed, tensordict["observation"] / self.scale, before)
         return tensordict.set("seen", torch.cat([reading, observed.to(reading.dtype), action], -1))
 
     def transform_observation_spec(self, observation_spec):

@@ -32,7 +32,7 @@ class Task:
         steps: of an episode.
         count: worlds at once.
         limit: of an action.
-        scale: of a state, for the networks.
+        scale: of a state, for the networks; the readings are in units of the first of them.
         prior: mean and standard deviations of a state anywhere in an episode.
         settings: of PPO.
     """
@@ -56,9 +56,9 @@ TASKS = {
         hike.STEPS,
         count=32,
         limit=1.0,
-        scale=(1.0, 1.0),
+        scale=(0.2, 0.2),
         prior=((0.8, 0.8), (0.8, 0.8)),
-        settings=Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25),
+        settings=Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25, lr=5e-4),
     ),
     "pendulum": Task(
         pendulum.Pendulum,
@@ -118,7 +118,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     if filter is not None:
         env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys))
     if "seen" in arm.keys:
-        env.append_transform(Seen())
+        env.append_transform(Seen(task.scale[0]))
     if arm.stack > 1:
         env.append_transform(CatFrames(arm.stack, dim=-1, in_keys=["seen"], out_keys=["stack"]))
     return env
