@@ -71,4 +71,4 @@ class Learner:
             with torch.no_grad():
                 for log_variance in self.noises:
                     log_variance.clamp_(min=2 * math.log(LEAST))
-        return float(value)
+        return value.item()

@@ -17,6 +17,7 @@ from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, clamp, networks
 from benchmarks.control.inputs import Seen
 from benchmarks.control.learning import Learner
 from benchmarks.control.ppo import PPO, Settings
+from torch_denkf.envs import NoisyPendulumEnv
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.transforms import DEnKFTransform
 
@@ -61,13 +62,13 @@ TASKS = {
         settings=Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25, lr=5e-4),
     ),
     "pendulum": Task(
-        pendulum.Pendulum,
+        pendulum.world,
         pendulum.unlearned_filter,
         None,
         pendulum.STEPS,
         count=16,
-        limit=pendulum.TORQUE,
-        scale=(1.0, 1.0, pendulum.SPEED),
+        limit=NoisyPendulumEnv.MAX_TORQUE,
+        scale=(1.0, 1.0, NoisyPendulumEnv.MAX_SPEED),
         prior=((0.0, 0.0, 0.0), (0.7, 0.7, 3.0)),
         settings=Settings(gamma=0.95, lmbda=0.9, minibatch=320, slice=40, reward=0.1),
     ),
