@@ -106,9 +106,7 @@ def ppo(
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, args.batches)
     logs, curve, rows = RunLogs(args.out, ("csv", "tensorboard") if args.tensorboard else ("csv",)), [], COUNT * STEPS
     logs.open({})
-    collector = Collector(
-        make_env(COUNT, args.seed), actor, frames_per_batch=rows, total_frames=args.batches * rows
-    )
+    collector = Collector(make_env(COUNT, args.seed), actor, frames_per_batch=rows, total_frames=args.batches * rows)
     for number, data in enumerate(bar := tqdm(collector, total=args.batches, desc="PPO", disable=None)):
         curve.append(data["next", "reward"].sum((1, 2)).mean().item())
         values = {"return": curve[-1]}

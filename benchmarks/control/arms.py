@@ -83,7 +83,7 @@ class ActorHead(Head):
 
 
 def _memory(kind: str, width: int, name: str) -> TensorDictModuleBase:
-    """torchrl's LSTM or GRU on what is seen."""
+    """An LSTM or a GRU of torchrl's on what is seen."""
     states = [f"{name}_hidden", f"{name}_cell"][: 2 if kind == "lstm" else 1]
     keys = {"in_keys": ["seen", *states], "out_keys": [f"{name}_memory", *(("next", key) for key in states)]}
     return {"lstm": LSTMModule, "gru": GRUModule}[kind](input_size=width, hidden_size=WIDTH, **keys)

@@ -91,7 +91,11 @@ def page(rows: Sequence[dict]) -> str:
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
             lines.append(line(cell, len(found[0]), *map(_text, found)))
-        lines += ["", "Thousands of environment steps until the mean return is the LSTM's at its end (tests are 20 % apart).", ""]
+        lines += [
+            "",
+            "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
+            "",
+        ]
         learning = [arm for arm in names if arm != "truth"]
         lines += head("cell", *learning)
         for cell in cells(rows, task):
@@ -100,8 +104,8 @@ def page(rows: Sequence[dict]) -> str:
         ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
     lines += [
-        "Each test is of 100 episodes, in which a policy takes the mean of its actions. The truth is read in the cell without",
-        "noise, and is the same in all.",
+        "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth runs in the",
+        "cell without noise, and is the same in all.",
         "",
         "![Return against the noise of the readings](control.png)",
         "",

@@ -12,7 +12,7 @@ from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import write_page
 from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, cell_name, run
+from benchmarks.control.run import Budget, run
 
 BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
 MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
@@ -72,10 +72,10 @@ def main() -> None:
     """Runs the study; one that was broken off goes on."""
     study, budget = parse(Study), Budget()
     if study.smoke:
-        study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1)
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
         budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, first=1, further=1, window=4)
         for task in CELLS:
-            CELLS[task] = [(0.0, 0.0)]
+            CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
     for seed in range(study.seeds):
         side_by_side(list(jobs(study, seed, budget)), study.processes, f"seed {seed}")
     rows = complete(study)

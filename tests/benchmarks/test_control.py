@@ -153,7 +153,7 @@ def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter()
     assert best < after < best + 0.04
     assert before > best + 0.1
     strides = learned["transition"].module["transition"].module.weight[:, 2:]
-    torch.testing.assert_close(strides, hike.STRIDE * torch.eye(2), atol=0.01, rtol=0)
+    torch.testing.assert_close(strides, hike.STRIDE * torch.eye(2), atol=0.02, rtol=0)
 
 
 def test_a_taught_filter_learns_the_pendulum():
