@@ -31,6 +31,7 @@ class Swing(m.SubModel):
         torque = (action / NoisyPendulumEnv.MAX_TORQUE).unsqueeze(-2).expand_as(velocity)
         features = [angle.cos(), angle.sin(), velocity / NoisyPendulumEnv.MAX_SPEED, torque]
         velocity = velocity + self.module(torch.cat(features, -1))
+        velocity = velocity.clamp(-NoisyPendulumEnv.MAX_SPEED, NoisyPendulumEnv.MAX_SPEED)
         angle = angle + NoisyPendulumEnv.DT * velocity
         return torch.cat([angle.cos(), angle.sin(), velocity], -1)
 

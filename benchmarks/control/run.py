@@ -15,7 +15,7 @@ from torchrl.modules import get_primers_from_module
 from benchmarks.control import hike, pendulum
 from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, clamp, networks
 from benchmarks.control.inputs import Seen
-from benchmarks.control.learning import Learner
+from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.ppo import PPO, Settings
 from torch_denkf.envs import NoisyPendulumEnv
 from torch_denkf.filters import DEnKF, Filter
@@ -36,6 +36,7 @@ class Task:
         scale: of a state, for the networks; the readings are in units of the first of them.
         prior: mean and standard deviations of a state anywhere in an episode.
         settings: of PPO.
+        learning: of the filter.
     """
 
     world: Callable[[int, float, float, int], EnvBase]
@@ -47,6 +48,7 @@ class Task:
     scale: tuple[float, ...]
     prior: tuple[tuple[float, ...], tuple[float, ...]]
     settings: Settings
+    learning: Learning
 
 
 TASKS = {
@@ -60,6 +62,7 @@ TASKS = {
         scale=(0.2, 0.2),
         prior=((0.8, 0.8), (0.8, 0.8)),
         settings=Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25, lr=5e-4),
+        learning=Learning(),
     ),
     "pendulum": Task(
         pendulum.world,
@@ -71,6 +74,7 @@ TASKS = {
         scale=(1.0, 1.0, NoisyPendulumEnv.MAX_SPEED),
         prior=((0.0, 0.0, 0.0), (0.7, 0.7, 3.0)),
         settings=Settings(gamma=0.95, lmbda=0.9, minibatch=320, slice=40, reward=0.1),
+        learning=Learning(window=64, windows=16, first=75, further=6, noise_lr=9e-2),
     ),
 }
 
@@ -84,18 +88,14 @@ class Budget:
         tests: in a run, evenly spaced.
         episodes: of a test.
         members: of an ensemble.
-        first: updates of a filter before the policy moves, on one batch of random actions.
-        further: updates of a filter after each of the policy's batches.
-        window: steps of a filter's updates.
+        updates: of a filter, as a share of the task's.
     """
 
     env_steps: int = 100_000
     tests: int = 5
     episodes: int = 100
     members: int = 32
-    first: int = 150
-    further: int = 10
-    window: int = 16
+    updates: float = 1.0
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
@@ -138,7 +138,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
         filter = task.exact(cell[0])
     elif arm.filter:
         filter = task.unlearned(budget.members)
-        learner = Learner(filter, task.prior, batches * task.count, budget.window, arm.filter == "taught")
+        learner = Learner(filter, task.prior, batches * task.count, task.learning, arm.filter == "taught")
     env = make_env(task, arm, task.count, cell, 2 * seed, filter)
     tests = make_env(task, arm, budget.episodes, cell, 2 * seed + 1, filter)
     actions = env.full_action_spec["action"].shape[-1]
@@ -155,7 +155,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
         data = rollout(env, None if random else policy, task.steps, ExplorationType.RANDOM)
         if learner is not None:
             learner.add(data)
-            learner.update(budget.first if random else budget.further)
+            learner.update(round(budget.updates * (task.learning.first if random else task.learning.further)))
         if not random:
             ppo.update(data)
         if (number + 1) * budget.tests // batches > number * budget.tests // batches:

@@ -73,7 +73,7 @@ def main() -> None:
     study, budget = parse(Study), Budget()
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
-        budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, first=1, further=1, window=4)
+        budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, updates=0.02)
         for task in CELLS:
             CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
     for seed in range(study.seeds):

@@ -11,7 +11,7 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from benchmarks.control import hike, pendulum
 from benchmarks.control.arms import ARMS, ActorHead, Head, clamp, networks
-from benchmarks.control.learning import Learner
+from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO
 from benchmarks.control.run import TASKS, make_env, rollout
@@ -138,7 +138,7 @@ def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter()
     """On the hike: the innovations' likelihood within 0.04 nats a reading of the exact one's, from over 0.1."""
     torch.manual_seed(0)
     learned, exact = hike.unlearned_filter(32), hike.exact_filter(0.2)
-    learner = Learner(learned, TASKS["hike"].prior, 64, 16)
+    learner = Learner(learned, TASKS["hike"].prior, 64, Learning())
     learner.add(hike.MountainHike(64, 0.2, seed=0).rollout(hike.STEPS))
     test = hike.MountainHike(200, 0.2, seed=1).rollout(hike.STEPS).exclude("next")
 
@@ -160,7 +160,7 @@ def test_a_taught_filter_learns_the_pendulum():
     """Half of the error of the velocity that the untaught filter has."""
     torch.manual_seed(0)
     filter = pendulum.unlearned_filter(16)
-    learner = Learner(filter, TASKS["pendulum"].prior, 16, 16, taught=True)
+    learner = Learner(filter, TASKS["pendulum"].prior, 16, Learning(), taught=True)
     learner.add(pendulum.world(16, 0.1, 0.0, 0).rollout(100))
     test = pendulum.world(16, 0.1, 0.0, 1).rollout(100).exclude("next")
 
