@@ -35,17 +35,18 @@ COUNT, STEPS, NOISE = 16, 200, 0.2  # pendulums side by side; steps of an episod
 
 
 class Swing(SubModel):
-    """The filter's motion: what pulls and how strong the motor is, in 1/s^2 (per Nm), is learned from one on."""
+    """The filter's motion: what pulls and how strong the motor is, in 1/s^2 (per Nm), is learned from nothing."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
-        self.logs = nn.Parameter(torch.zeros(2))
+        self.tenths = nn.Parameter(torch.zeros(2))
 
     def compute(self, state: Tensor, torque: Tensor) -> Tensor:  # [*B, E, 3]: cosine, sine, rad/s; [*B, 1]
-        pull, motor = self.logs.exp()
+        pull, motor = 10 * self.tenths
         torque = torque.clamp(-NoisyPendulumEnv.MAX_TORQUE, NoisyPendulumEnv.MAX_TORQUE)
         cos, sin, speed = state.split(1, -1)
         speed = speed + NoisyPendulumEnv.DT * (pull * sin + motor * torque.unsqueeze(-2))
+        speed = speed.clamp(-NoisyPendulumEnv.MAX_SPEED, NoisyPendulumEnv.MAX_SPEED)
         angle = torch.atan2(sin, cos) + NoisyPendulumEnv.DT * speed
         return torch.cat([angle.cos(), angle.sin(), speed], -1)
 
@@ -54,7 +55,7 @@ class LearningFilter:
     """A filter of [cosine, sine, speed], and its training on the episodes ``[B, T]`` that came so far."""
 
     def __init__(self, episodes: int):
-        gusts = ConstantNoise([0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        gusts = ConstantNoise([0.1], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
         parts = {
             "transition": NoisyTransition(Swing(), gusts, dims=[2], before=True),
             "sensor": None,  # the encoder is read as it is
@@ -66,20 +67,22 @@ class LearningFilter:
         self.filter = DEnKF(**parts, initial=first, update_at_reset=True)
         # Windows begin anywhere in an episode, where the speed is not known.
         self.loss = DEnKFLoss.ad_enkf(DEnKF(**parts, initial=later, update_at_reset=True))
-        self.optimiser = torch.optim.Adam(self.filter.parameters(), lr=2e-2)
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=32)
+        self.optimiser = torch.optim.Adam(self.filter.parameters(), lr=0.1)
+        self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimiser, 0.993)
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=16)
 
     def learn(self, data: TensorDict, updates: int) -> dict[str, float]:
         self.buffer.extend(data.select("observation", "observed", "action"))
         for _ in range(updates):
-            start = torch.randint(data.shape[1] - 15, ())
-            loss = self.loss(self.buffer.sample()[:, start : start + 16])["loss_nll"]
+            start = torch.randint(data.shape[1] - 63, ())
+            loss = self.loss(self.buffer.sample()[:, start : start + 64])["loss_nll"]
             self.optimiser.zero_grad()
             loss.backward()
             self.optimiser.step()  # the collector's filter is this one
+            self.schedule.step()
         error = (data["belief", "mean"] - data["state"])[..., 2].square().mean().sqrt()  # for the log alone
-        pull, motor = self.filter["transition"].module["transition"].logs.exp()
-        return {"loss_filter": loss.item(), "speed_rmse": error.item(), "pull": pull.item(), "motor": motor.item()}
+        pull, motor = self.filter["transition"].module["transition"].tenths.mul(10).tolist()
+        return {"loss_filter": loss.item(), "speed_rmse": error.item(), "pull": pull, "motor": motor}
 
 
 def make_actor(module: nn.Module, in_keys: list, *before: TensorDictModuleBase) -> ProbabilisticActor:
@@ -153,7 +156,7 @@ def parse(doc: str, name: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs") / name)
     parser.add_argument("--batches", type=int, default=31, help="3,200 steps each")
-    parser.add_argument("--updates", type=int, default=10, help="of a filter, after each batch")
+    parser.add_argument("--updates", type=int, default=5, help="of a filter, after each batch")
     parser.add_argument("--noise", type=float, default=NOISE, help="of the readings")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tensorboard", action="store_true", help="logs for it, too")

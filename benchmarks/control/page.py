@@ -104,8 +104,8 @@ def page(rows: Sequence[dict]) -> str:
         ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
     lines += [
-        "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth runs in the",
-        "cell without noise, and is the same in all.",
+        "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth is the",
+        "same in all cells, and runs in the one without noise.",
         "",
         "![Return against the noise of the readings](control.png)",
         "",

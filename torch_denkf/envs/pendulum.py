@@ -60,8 +60,18 @@ class NoisyPendulumEnv(LinearGaussianEnv):
     ):
         # Readings, masks and the time limit are a linear system's; motion and reward are not.
         one = torch.eye(3)
-        options = {"missing": missing, "max_steps": max_steps, "batch_size": batch_size, "seed": seed, "device": device}
-        super().__init__(one, one[:2], [0.0] * 3, [noise] * 2, control=one[:, 2:], **options)
+        super().__init__(
+            one,
+            one[:2],
+            [0.0] * 3,
+            [noise] * 2,
+            control=one[:, 2:],
+            missing=missing,
+            max_steps=max_steps,
+            batch_size=batch_size,
+            seed=seed,
+            device=device,
+        )
         dtype = torch.get_default_dtype()
         self.action_spec = Bounded(-self.MAX_TORQUE, self.MAX_TORQUE, (*self.batch_size, 1), dtype=dtype)
 
