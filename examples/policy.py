@@ -31,7 +31,7 @@ from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, NoisyPendulumEnv
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, NoisyTransition, Select, SubModel
 from torch_denkf.training import RunLogs
 
-COUNT, STEPS, NOISE = 16, 200, 0.2  # pendulums side by side; steps of an episode; of the cosine and sine that are read
+COUNT, STEPS, NOISE = 16, 200, 0.1  # pendulums side by side; steps of an episode; of the cosine and sine that are read
 
 
 class Swing(SubModel):
@@ -55,7 +55,7 @@ class LearningFilter:
     """A filter of [cosine, sine, speed], and its training on the episodes ``[B, T]`` that came so far."""
 
     def __init__(self, episodes: int):
-        gusts = ConstantNoise([0.1], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        gusts = ConstantNoise([0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
         parts = {
             "transition": NoisyTransition(Swing(), gusts, dims=[2], before=True),
             "sensor": None,  # the encoder is read as it is
@@ -67,17 +67,19 @@ class LearningFilter:
         self.filter = DEnKF(**parts, initial=first, update_at_reset=True)
         # Windows begin anywhere in an episode, where the speed is not known.
         self.loss = DEnKFLoss.ad_enkf(DEnKF(**parts, initial=later, update_at_reset=True))
-        self.optimiser = torch.optim.Adam(self.filter.parameters(), lr=0.1)
+        self.optimiser = torch.optim.Adam(self.filter.parameters(), lr=0.05)
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimiser, 0.993)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=16)
 
-    def learn(self, data: TensorDict, updates: int) -> dict[str, float]:
+    def learn(self, data: TensorDict, updates: int, length: int) -> dict[str, float]:
+        """Makes updates on windows of a length."""
         self.buffer.extend(data.select("observation", "observed", "action"))
         for _ in range(updates):
-            start = torch.randint(data.shape[1] - 63, ())
-            loss = self.loss(self.buffer.sample()[:, start : start + 64])["loss_nll"]
+            start = torch.randint(data.shape[1] - length + 1, ())
+            loss = self.loss(self.buffer.sample()[:, start : start + length])["loss_nll"]
             self.optimiser.zero_grad()
             loss.backward()
+            nn.utils.clip_grad_norm_(self.filter.parameters(), 1.0)
             self.optimiser.step()  # the collector's filter is this one
             self.schedule.step()
         error = (data["belief", "mean"] - data["state"])[..., 2].square().mean().sqrt()  # for the log alone
@@ -100,7 +102,7 @@ def ppo(
     critic: TensorDictModule,
     args: argparse.Namespace,
     slice_length: int = 1,
-    learn: Callable[[TensorDict, int], dict[str, float]] | None = None,
+    learn: Callable[[TensorDict, int, int], dict[str, float]] | None = None,
 ) -> float:
     """Trains a policy on batches of whole episodes, in slices of time; the mean return of 100 test episodes."""
     gae = GAE(gamma=0.95, lmbda=0.9, value_network=critic, average_gae=True, deactivate_vmap=True)
@@ -114,7 +116,7 @@ def ppo(
         curve.append(data["next", "reward"].sum((1, 2)).mean().item())
         values = {"return": curve[-1]}
         if learn is not None:
-            values |= learn(data, args.updates if number else 10 * args.updates)
+            values |= learn(data, args.updates, 64) if number else learn(data, 20 * args.updates, 16)
         logs.log(values, step=(number + 1) * rows)
         bar.set_postfix({name: f"{value:.2f}" for name, value in values.items()})
         if learn is not None and number == 0:

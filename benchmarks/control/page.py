@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.stats import bootstrap, trim_mean
 
-from benchmarks.common.arguments import command, processor
+from benchmarks.common.arguments import processor
 from benchmarks.common.plots import plt, save
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.control.arms import ARMS
@@ -53,7 +53,7 @@ def last(rows: Sequence[dict]) -> list[dict]:
 
 
 def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]:
-    """The final returns over seeds; of what reads the truth those of the cell without noise."""
+    """The final returns, by seed; of what reads the truth those of the cell without noise."""
     chosen = pick(rows, task=task, arm=arm) if arm == "truth" else pick(rows, task=task, cell=cell, arm=arm)
     return [row["return"] for row in last(chosen)]
 
@@ -91,6 +91,12 @@ def page(rows: Sequence[dict]) -> str:
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
             lines.append(line(cell, len(found[0]), *map(_text, found)))
+        others = [arm for arm in ("LSTM", "GRU", "Kalman") if arm in names]
+        lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
+        lines += head("cell", *others)
+        for cell in cells(rows, task):
+            belief = np.array(returns(rows, task, cell, "belief mean"))
+            lines.append(line(cell, *(_text(belief - returns(rows, task, cell, other)) for other in others)))
         lines += [
             "",
             "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
@@ -109,15 +115,13 @@ def page(rows: Sequence[dict]) -> str:
         "",
         "![Return against the noise of the readings](control.png)",
         "",
-        f"* Command: `{command('control')}`.",
+        "* Command: `python -m benchmarks.control`. A seed counts where all arms of a cell have run with it.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",
     ]
     return "\n".join(lines) + "\n"
 
 
 def _text(values: Sequence[float]) -> str:
-    if not values:
-        return ""
     center, low, high = summary(values)
     return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
 

@@ -197,4 +197,5 @@ def test_tables():
     assert reached(table, "hike", "noise 0", "belief mean") == "2"
     assert reached(table, "hike", "noise 0", "LSTM") == "3"
     text = page(table)
+    assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
     assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
