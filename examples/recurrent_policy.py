@@ -6,7 +6,8 @@ Actor and critic share an ``LSTMModule`` of 64 units that reads the encoder and 
 it: ``InitTracker`` marks resets, a primer carries the hidden state through the environment, and the loss is fed slices
 of time, each of which begins with the hidden state that was collected there. PPO, its settings and the logs are those
 of policy.py.
-RESULT
+
+It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -511, on the belief -188 (one run each).
 """
 
 from __future__ import annotations
