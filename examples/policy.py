@@ -8,8 +8,8 @@ environment. The filter learns gravity and motor from what the policy collects, 
 the readings (``DEnKFLoss.ad_enkf``): it never sees the true state. recurrent_policy.py is the same with torchrl's LSTM.
 
 It takes about one minute of one core. Return of 100 new episodes after 99,200 steps: -188 on the belief, and -511 with
-the LSTM (one run each); a policy that reads the true state returns about -150. The filter ends with a pull of 15.00 / s^2
-and a motor of 3.01 / s^2 per Nm, which are 15 and 3.
+the LSTM (one run each); a policy that reads the true state returns about -150. The filter ends with a pull of 15.00
+and a motor of 3.01, which are 15 and 3.
 """
 
 from __future__ import annotations

@@ -81,6 +81,7 @@ def reached(rows: Sequence[dict], task: str, cell: str, arm: str) -> str:
 
 def page(rows: Sequence[dict]) -> str:
     """The tables."""
+    drawn = any(len(noises(rows, task)) > 1 for task in TITLES)
     lines = ["# Policies that read a belief, against policies that remember", ""]
     for task, title in TITLES.items():
         names = arms(rows, task)
@@ -113,8 +114,7 @@ def page(rows: Sequence[dict]) -> str:
         "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth is the",
         "same in all cells, and runs in the one without noise.",
         "",
-        "![Return against the noise of the readings](control.png)",
-        "",
+        *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
         "* Command: `python -m benchmarks.control`. A seed counts where all arms of a cell have run with it.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",
     ]
@@ -126,14 +126,21 @@ def _text(values: Sequence[float]) -> str:
     return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
 
 
+def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
+    """Noises of a task's cells in which all readings come."""
+    return {cell: float(cell.split()[1]) for cell in cells(rows, task) if "missing" not in cell}
+
+
 def draw(rows: Sequence[dict], file: Path) -> None:
-    """Return against the noise of the readings, where all come: a line for each arm."""
-    tasks = [task for task in TITLES if pick(rows, task=task)]
+    """Return against the noise of the readings, where all come: a line for each arm of tasks that have two noises."""
+    tasks = [task for task in TITLES if len(noises(rows, task)) > 1]
+    if not tasks:
+        return
     figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
     for axis, task in zip(axes[0], tasks, strict=True):
-        noises = {cell: float(cell.split()[1]) for cell in cells(rows, task) if "missing" not in cell}
         for number, arm in enumerate(arms(rows, task)):
-            points = sorted((noise, *summary(returns(rows, task, cell, arm))) for cell, noise in noises.items())
+            chosen = noises(rows, task).items()
+            points = sorted((noise, *summary(returns(rows, task, cell, arm))) for cell, noise in chosen)
             noise, center, low, high = np.array(points).T
             style = "--" if arm in ("truth", "Kalman") else "-"
             axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{number}", label=arm)

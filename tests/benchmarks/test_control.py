@@ -12,7 +12,7 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 from benchmarks.control import hike, pendulum
 from benchmarks.control.arms import ARMS, ActorHead, Head, clamp, networks
 from benchmarks.control.learning import Learner, Learning
-from benchmarks.control.page import interquartile_mean, page, reached, summary
+from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO
 from benchmarks.control.run import TASKS, make_env, rollout
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
@@ -197,5 +197,14 @@ def test_tables():
     assert reached(table, "hike", "noise 0", "belief mean") == "2"
     assert reached(table, "hike", "noise 0", "LSTM") == "3"
     text = page(table)
+    assert "control.png" not in text  # one noise makes no line
     assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
     assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
+
+
+def test_the_picture_is_of_tasks_with_two_noises(tmp_path):
+    table = list(rows())
+    draw(table, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+    draw([*table, *({**row, "cell": "noise 0.2"} for row in table if row["arm"] != "truth")], tmp_path / "two.png")
+    assert (tmp_path / "two.png").exists()
