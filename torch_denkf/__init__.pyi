@@ -45,6 +45,7 @@ from .filters import (
     MixtureParticleFilter,
     Monitored,
     ParticleFilter,
+    Refiltering,
 )
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
@@ -123,6 +124,7 @@ __all__ = [
     "RTSSmoother",
     "Recording",
     "RecordingReplay",
+    "Refiltering",
     "ReplayEnv",
     "SaltAndPepper",
     "SensorLoss",
