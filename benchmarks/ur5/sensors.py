@@ -55,6 +55,7 @@ class Statistics:
     scale: Tensor
     rate: Tensor  # root mean square of a joint's change in a step, [7] rad
     acceleration: Tensor  # of the change's change
+    jerk: Tensor  # of that one's change
     pixel_loc: Tensor
     pixel_scale: Tensor
     size: int
@@ -62,13 +63,13 @@ class Statistics:
     @classmethod
     def of(cls, states: Tensor, pool: FramePool) -> Statistics:
         """Of sequences ``[N, T, 10]`` and of pictures."""
-        flat, rate = states.flatten(0, -2), states[..., :7].diff(dim=-2)
+        flat = states.flatten(0, -2)
+        changes = (states[..., :7].diff(dim=-2, n=order) for order in (1, 2, 3))
         pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
         return cls(
             flat.mean(0),
             flat.std(0),
-            rate.square().mean((0, 1)).sqrt(),
-            rate.diff(dim=-2).square().mean((0, 1)).sqrt(),
+            *(change.square().mean((0, 1)).sqrt() for change in changes),
             pixels.mean((0, 2, 3)),
             pixels.std((0, 2, 3)),
             pixels.shape[-1],

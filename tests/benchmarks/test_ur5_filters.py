@@ -68,25 +68,37 @@ def test_a_factor_scales_the_samples_around_their_mean():
 def test_rates_are_the_joints_changes_and_an_episode_begins_at_rest():
     sequence = states(2, 5)
     full = with_rates(sequence)
-    torch.testing.assert_close(full[:, 1:, 10:], sequence[:, 1:, :7] - sequence[:, :-1, :7])
+    torch.testing.assert_close(full[:, 1:, 10:17], sequence[:, 1:, :7] - sequence[:, :-1, :7])
+    torch.testing.assert_close(full[:, 1:, 17:], full[:, 1:, 10:17] - full[:, :-1, 10:17])
     assert float(full[:, 0, 10:].abs().max()) == 0.0
 
 
 def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
     torch.manual_seed(0)
     motion = ArmMotion(FACTS)
-    state = torch.cat([states(6), 0.01 * torch.randn(6, 7)], -1)
+    state = torch.cat([states(6), 0.01 * torch.randn(6, 14)], -1)
     moved = motion(state)
-    torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:])
-    torch.testing.assert_close(moved[:, 10:], torch.sigmoid(torch.tensor(4.0)) * state[:, 10:])  # before training
+    torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:17])
+    damped, lasting = torch.tensor([6.0, 2.0]).sigmoid()
+    torch.testing.assert_close(moved[:, 10:17], damped * state[:, 10:17] + lasting * state[:, 17:])  # before training
+    torch.testing.assert_close(moved[:, 17:], moved[:, 10:17] - state[:, 10:17])
     expected = motion.place(moved[:, :7]) + 0.5 * (state[:, 7:10] - motion.place(state[:, :7]))
     torch.testing.assert_close(moved[:, 7:10], expected)
+
+
+def test_noise_of_an_acceleration_moves_its_joint_and_its_rate_in_the_same_step():
+    torch.manual_seed(0)
+    recipe = FILTERS["dekf"](SENSORS["keypoints"].build(FACTS, 4), SENSORS["keypoints"], FACTS, ArmMotion(FACTS), ERRORS)
+    matrix = recipe.modules()["transition"].process_noise.matrix
+    column = matrix[:, 3 + 2]  # the place comes first, then J1 to J7: a3
+    assert column.nonzero().flatten().tolist() == [2, 12, 19]
+    assert matrix[:, 0].nonzero().flatten().tolist() == [7]  # x
 
 
 def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_fingers_through_an_object():
     motion = ArmMotion(FACTS, actions=True)
     motion.pull.data.fill_(1.0)
-    state = torch.cat([states(1), torch.zeros(1, 7)], -1)
+    state = torch.cat([states(1), torch.zeros(1, 14)], -1)
     action = state[:, :7] + 0.02
     action[:, 6] = state[:, 6] - 0.5
     moved = motion(torch.cat([state, action], -1))
@@ -97,7 +109,7 @@ def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_finger
 def test_biases_fade_and_add_to_the_reading():
     motion = ArmMotion(FACTS)
     network = WithBias(motion)
-    state = torch.cat([states(3), torch.zeros(3, 7), torch.ones(3, 10)], -1)
+    state = torch.cat([states(3), torch.zeros(3, 14), torch.ones(3, 10)], -1)
     moved = network(state)
     torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
     torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
@@ -141,7 +153,7 @@ def readings():
     torch.manual_seed(0)
     motion = ArmMotion(FACTS)
     motion.damping.data.fill_(12.0)  # rates last
-    state = torch.cat([states(3), 0.01 * torch.randn(3, 7)], -1)
+    state = torch.cat([states(3), 0.01 * torch.randn(3, 7), torch.zeros(3, 7)], -1)
     path = [state]
     with torch.no_grad():
         state[:, 7:10] = motion.place(state[:, :7])
@@ -183,16 +195,17 @@ def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right
 
 
 def test_localisation_keeps_covariances_and_the_gripper_apart():
-    state, reading = localisation(27)
+    state, reading = localisation(34)
     assert torch.linalg.eigvalsh(reading).min() > -1e-6  # its product with a covariance is one (Schur)
-    assert torch.equal(state[17:], reading)  # biases
+    assert torch.equal(state[24:], reading)  # biases
     assert torch.equal(state[:7], state[10:17])  # rates go with their joints
-    gripper = [6, 16, 23]
-    arm = [index for index in range(27) if index not in gripper]
+    assert torch.equal(state[:7], state[17:24])  # and so do accelerations
+    gripper = [6, 16, 23, 30]
+    arm = [index for index in range(34) if index not in gripper]
     assert (state[arm, 6] == 0).all()
     assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
     assert (state[gripper, 6] == 1).all()
-    assert torch.equal(localisation(17)[0], state[:17])
+    assert torch.equal(localisation(24)[0], state[:24])
 
 
 def test_a_head_on_features_is_the_sensor_on_pictures():
