@@ -1,9 +1,9 @@
 """Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes beside EKF, UKF and particle filter.
 
-The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model noise.
-All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an ensemble
-filter its inflation and the radius of its localisation, a Gaussian filter its inflation, the particle filter the width
-of the kernel that moves copies apart.
+The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model
+noise. All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an
+ensemble filter its inflation and the radius of its localisation, a Gaussian filter its inflation, the particle
+filter the width of the kernel that moves copies apart.
 
     python -m benchmarks.lorenz96 frontier      # benchmarks/lorenz96/results/frontier.{md,csv,png}
 """
@@ -22,6 +22,7 @@ from tensordict import TensorDict
 
 from benchmarks.common.arguments import command, processor
 from benchmarks.common.plots import draw_frontier
+from benchmarks.common.scores import processor_ms
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.lorenz96.learned import FORCING, Lorenz96, evaluate, tapers
 from benchmarks.lorenz96.schemes import VARIABLES, simulate
@@ -100,18 +101,6 @@ def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
     return found
 
 
-def milliseconds(filter: Filter, record: TensorDict) -> float:
-    """A step of one record in time of the processor: the least of some runs, after one that compiles."""
-    seconds = []
-    with torch.no_grad():
-        filter.sequence(record.copy())
-        for _ in range(RUNS):
-            begun = time.process_time()
-            filter.sequence(record.copy())
-            seconds.append(time.process_time() - begun)
-    return 1e3 * min(seconds) / record.shape[-1]
-
-
 def row_of(name: str, size: int, settings: dict[str, Make], data: dict[str, TensorDict], skip: int, chunk: int) -> dict:
     """Chooses a setting on the validation records; its error on the test records, and its time."""
     scores = {}
@@ -124,8 +113,9 @@ def row_of(name: str, size: int, settings: dict[str, Make], data: dict[str, Tens
     filter, one = settings[best](), data["test"][:1, :TIMED]
     row = {"filter": name, "members": size, "setting": best, "validation_rmse": scores[best]}
     row["rmse"] = evaluate(filter, data["test"]["state"], data["test"], skip)
-    row["eager_ms_per_step"] = milliseconds(filter, one)
-    row["ms_per_step"] = milliseconds(filter.compile(chunk=chunk), one)
+    for column, steps in (("eager_ms_per_step", 0), ("ms_per_step", chunk)):
+        filter.compile(chunk=steps)
+        row[column] = processor_ms(lambda: filter.sequence(one.copy()), TIMED, RUNS)
     return row
 
 
@@ -164,11 +154,11 @@ class Frontier:
         lines = [
             "# Lorenz-96: error against milliseconds a step",
             "",
-            f"{VARIABLES} variables, all observed with R = 1, no model noise, steps of 0.05 time units; all filters know the "
-            "equations and R, and begin around the truth with a standard deviation of 1. The setting is chosen on "
-            f"{self.records} validation records; the RMSE is taken on {self.records} others of {self.steps} steps without the "
-            f"first {self.burn_in}. The readings' own RMSE is 1. ms: processor time, one record, one thread, the least of {RUNS} runs of "
-            f"{TIMED} steps, each step compiled.",
+            f"{VARIABLES} variables, all observed with R = 1, no model noise, steps of 0.05 time units; all "
+            f"filters know the equations and R, and begin around the truth with a standard deviation of 1. The "
+            f"setting is chosen on {self.records} validation records; the RMSE is taken on {self.records} others "
+            f"of {self.steps} steps without the first {self.burn_in}. The readings' own RMSE is 1. ms: processor "
+            f"time, one record, one thread, the least of {RUNS} runs of {TIMED} steps, each step compiled.",
             "",
             *head(*titles),
         ]

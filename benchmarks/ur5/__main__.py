@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
+from benchmarks.ur5.frontier import draw
 from benchmarks.ur5.gallery import draw_all
 from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
@@ -30,6 +31,9 @@ def main() -> None:
     study, begun = parse(Study), time.time()
     if study.command == "pictures" and not study.smoke:
         print(*draw_all(study.out), sep="\n")
+        return
+    if study.command == "frontier" and not study.smoke:
+        print(*draw(study), sep="\n")
         return
     study = smoke(study) if study.smoke else study
     try:

@@ -88,7 +88,9 @@ def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
 
 def test_noise_of_an_acceleration_moves_its_joint_and_its_rate_in_the_same_step():
     torch.manual_seed(0)
-    recipe = FILTERS["dekf"](SENSORS["keypoints"].build(FACTS, 4), SENSORS["keypoints"], FACTS, ArmMotion(FACTS), ERRORS)
+    recipe = FILTERS["dekf"](
+        SENSORS["keypoints"].build(FACTS, 4), SENSORS["keypoints"], FACTS, ArmMotion(FACTS), ERRORS
+    )
     matrix = recipe.modules()["transition"].process_noise.matrix
     column = matrix[:, 3 + 2]  # the place comes first, then J1 to J7: a3
     assert column.nonzero().flatten().tolist() == [2, 12, 19]

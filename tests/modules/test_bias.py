@@ -35,7 +35,9 @@ def motion():
 
 def parts():
     bias = FadingBias(torch.tensor(STD, dtype=torch.double), TIME, trainable=False)
-    q = ConstantNoise(torch.tensor([0.0, Q], dtype=torch.double), in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    q = ConstantNoise(
+        torch.tensor([0.0, Q], dtype=torch.double), in_key=("belief", "mean"), out_key=("forecast", "noise")
+    )
     r = ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading")
     return bias, BiasedTransition(motion(), bias), BiasedNoise(q, bias), BiasedObservation(Select([0]), bias), r
 
@@ -124,7 +126,10 @@ def test_a_likelihood_learns_size_and_time():
     innovation, covs = out["info", "innovation"], out["info", "nis"]
     likelihood = -0.5 * (covs + (innovation.square() / covs).clamp_min(1e-12).log())[:, 1:].sum((1, 2))
     slopes = torch.stack(
-        [torch.cat(torch.autograd.grad(value, [bias.log_std, bias.log_time], retain_graph=True)) for value in likelihood]
+        [
+            torch.cat(torch.autograd.grad(value, [bias.log_std, bias.log_time], retain_graph=True))
+            for value in likelihood
+        ]
     )
     assert (slopes.mean(0).abs() < 4 * slopes.std(0) / runs**0.5).all()
     with torch.no_grad():
@@ -161,4 +166,6 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="not as many for each of the 2"):
         BiasedObservation(Select([0, 1]), FadingBias([1.0] * 3, time=1.0))(td)
     with pytest.raises(ValueError, match="splits a state of 1"):
-        BiasedObservation(Select([0]), FadingBias([1.0], time=1.0))(TensorDict({("forecast", "ensemble"): torch.zeros(3, 1)}, []))
+        BiasedObservation(Select([0]), FadingBias([1.0], time=1.0))(
+            TensorDict({("forecast", "ensemble"): torch.zeros(3, 1)}, [])
+        )

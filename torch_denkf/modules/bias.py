@@ -8,9 +8,9 @@ slower.
 
 .. math:: b_t = \rho \circ b_{t-1} + \eta_t, \quad \rho = e^{-1 / \tau}, \quad \eta_t \sim N(0, \sigma^2 (1 - \rho^2))
 
-Give the transition, the process noise and the observation the same :class:`FadingBias`, and the initial belief S + K
-dimensions: ``FadingBias.std`` for the biases. The filter then is the optimal one for "coloured" reading errors, which for
-linear systems is the Kalman filter of the augmented state.
+Give the transition, the process noise and the observation the same :class:`FadingBias`, and the initial belief S +
+K dimensions: ``FadingBias.std`` for the biases. For a linear system with such "coloured" reading errors the filter
+then is the optimal one: the Kalman filter of the augmented state.
 
 Source: Bryson & Henrikson 1968, J. Spacecraft Rockets 5 ("Estimation using sampled data containing sequentially
 correlated noise"); Uhlenbeck & Ornstein 1930.
@@ -49,7 +49,9 @@ class FadingBias(nn.Module):
         (0.904..., 0.725...)
     """
 
-    def __init__(self, std: Sequence[float] | Tensor, time: float | Sequence[float] | Tensor, *, trainable: bool = True):
+    def __init__(
+        self, std: Sequence[float] | Tensor, time: float | Sequence[float] | Tensor, *, trainable: bool = True
+    ):
         super().__init__()
         std = as_standard_deviations("std", std)
         time = torch.as_tensor(time, dtype=std.dtype).expand_as(std)

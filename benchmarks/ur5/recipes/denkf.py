@@ -33,7 +33,13 @@ def localisation(size: int) -> tuple[Tensor, Tensor]:
 
 @register
 class DEnKF(UR5Recipe):
-    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples."""
+    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples.
+
+    Attributes:
+        scheme: of the update: trained with ``"sensor"``, it may be run with another one on the samples' mean.
+    """
+
+    scheme = "sensor"
 
     def modules(self):
         return OrderedDict(
@@ -41,7 +47,7 @@ class DEnKF(UR5Recipe):
             transition=NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True),
             near=NearForecast(self.preset),
             observation=self.observation(),
-            analysis=EnsembleAnalysis("sensor", taper=localisation(self.size), sensor_key=NEAR),
+            analysis=EnsembleAnalysis(self.scheme, taper=localisation(self.size), sensor_key=NEAR),
         )
 
     def belief(self, std, state_key):
