@@ -7,6 +7,7 @@ they are trained on states of the training demos before any filter is, and furth
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -128,6 +129,28 @@ class MotionLoss(nn.Module):
         return {"loss_rates": torch.stack(errors).sum(), "loss_place": place.abs().mean() / PLACE_UNIT}
 
 
+@torch.no_grad()
+def open_loop(
+    motion: ArmMotion, states: Tensor, actions: Tensor, ahead: Sequence[int] = (1, 5, 10)
+) -> dict[str, float]:
+    """Mean absolute errors of the joints, degrees, so many steps after true states, without any reading.
+
+    Args:
+        motion: to be tested.
+        states: sequences ``[N, T, 10]``.
+        actions: ``[N, T, 7]``.
+        ahead: numbers of steps, rising.
+    """
+    full, last = with_rates(states), states.shape[-2] - max(ahead)
+    moved, errors = full[:, :last], {}
+    for step in range(max(ahead)):
+        moved = motion(torch.cat([moved, actions[:, step : step + last]], -1) if motion.actions else moved)
+        if step + 1 in ahead:
+            error = (moved - full[:, step + 1 : step + 1 + last])[..., :JOINTS].abs().mean()
+            errors[f"after_{step + 1}_deg"] = float(error.rad2deg())
+    return errors
+
+
 def train_motion(
     motion: ArmMotion, states: Tensor, actions: Tensor, *, out: Path, seed: int, updates: int
 ) -> ArmMotion:
@@ -146,6 +169,11 @@ def train_motion(
     def sample(generator: torch.Generator, length: int | None) -> TensorDict:
         return paths(torch.randint(max(held, 1), (512,), generator=generator))
 
+    unseen = slice(held // starts, held // starts + 60)
+
+    def far() -> dict[str, float]:
+        return open_loop(motion, states[unseen], actions[unseen]) if states.shape[1] > 20 and held < count else {}
+
     loss = MotionLoss(motion)
     checked = (
         paths(torch.arange(held, count)[:: max((count - held) // 4000, 1)]) if held < count else paths(torch.arange(1))
@@ -154,7 +182,7 @@ def train_motion(
         motion,
         Stage("motion", loss, sample, updates, lr=5e-3),
         out=out,
-        validate=lambda: {"error": float(sum(loss(checked).values()))},
+        validate=lambda: {"error": float(sum(loss(checked).values())), **far()},
         validate_every=max(updates // 4, 1),
         save_every=max(updates // 2, 1),
         seed=seed,

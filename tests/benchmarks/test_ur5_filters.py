@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from benchmarks.common.arms import AtRest, WithBias
 from benchmarks.ur5.evaluation import errors
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
-from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, with_rates
+from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, open_loop, with_rates
 from benchmarks.ur5.readings import read_head
 from benchmarks.ur5.recipes import FILTERS
 from benchmarks.ur5.recipes.denkf import localisation
@@ -95,6 +95,20 @@ def test_noise_of_an_acceleration_moves_its_joint_and_its_rate_in_the_same_step(
     column = matrix[:, 3 + 2]  # the place comes first, then J1 to J7: a3
     assert column.nonzero().flatten().tolist() == [2, 12, 19]
     assert matrix[:, 0].nonzero().flatten().tolist() == [7]  # x
+
+
+def test_open_loop_errors_are_those_of_a_constant_acceleration():
+    motion = ArmMotion(FACTS).double()
+    motion.damping.data.fill_(30.0)
+    motion.lasting.data.fill_(30.0)  # what moves goes on for ever
+    time = torch.arange(30.0, dtype=torch.double)
+    states = torch.cat([1e-5 * time.pow(3).unsqueeze(-1).expand(30, 7), torch.zeros(30, 3)], -1).unsqueeze(0)
+    found = open_loop(motion, states, torch.zeros(1, 30, 7, dtype=torch.double), ahead=(1, 5))
+    start = with_rates(states)[0, :25, [0, 10, 17]]
+    for n in (1, 5):
+        expected = start[:, 0] + n * start[:, 1] + n * (n + 1) / 2 * start[:, 2]
+        error = (states[0, n : n + 25, 0] - expected).abs().mean().rad2deg()
+        assert found[f"after_{n}_deg"] == pytest.approx(float(error), rel=1e-6)
 
 
 def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_fingers_through_an_object():
