@@ -63,11 +63,12 @@ def conditions_of(clean: TensorDict, salted: TensorDict) -> dict[str, TensorDict
 
 
 def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) -> list[dict]:
-    """The sensor alone. The right one of the two J6 is granted to it; where it sees nothing, its last reading stays."""
+    """The sensor alone; where it sees nothing, its last reading stays."""
     rows = []
     for condition, reading in readings.items():
         truth, samples = reading["state"], reading["sensor", "ensemble"]
-        near = truth[..., WRIST]
+        near = preset.side_of(samples.mean(-2))
+        near = near + 2 * torch.pi * ((truth[..., WRIST] - near) / (2 * torch.pi)).round()  # whole turns do not count
         read = preset.state_of(samples.mean(-2), near)
         members = preset.state_of(samples, near.unsqueeze(-1).expand(samples.shape[:-1]))
         seen = reading["observed"][:, 1:]

@@ -26,8 +26,7 @@ FAIRNESS = (
     "All filters of a sensor start from the same sensor's weights and the same learned motion, and learn from the same "
     "windows of its readings with as many updates; each then trains its own copy of the sensor's head. Each has one "
     "number (a factor on the noise, or tempering of weights) chosen from the same seven values for the coverage on the "
-    "same validation demos. 'sensor' is the mean of its samples, with J6 turned by half a turn where that is nearer to "
-    "the truth; where nothing is seen its last reading stays."
+    "same validation demos. 'sensor' is the mean of its samples; where nothing is seen its last reading stays."
 )
 
 

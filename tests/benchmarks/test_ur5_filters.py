@@ -14,7 +14,7 @@ from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading
 from benchmarks.ur5.readings import read_head
 from benchmarks.ur5.recipes import FILTERS
 from benchmarks.ur5.recipes.denkf import localisation
-from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, wrist_of
+from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
 from benchmarks.ur5.training import run_filter
 from tests.benchmarks.ur5_for_tests import FACTS, states
 
@@ -33,15 +33,33 @@ def test_a_reading_of_the_turned_wrist_gives_the_state_back_from_any_angle_withi
 def test_a_radian_of_the_wrist_is_a_unit_of_its_reading():
     state = states(3).double().requires_grad_()
     reading = TurnedWrist()(state)
-    slope = torch.stack([torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6)])
-    torch.testing.assert_close(slope.norm(dim=0), torch.ones(3, dtype=torch.double))
+    slope = torch.stack(
+        [torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6, 7, 8)]
+    )
+    torch.testing.assert_close(slope[:2].norm(dim=0), torch.ones(3, dtype=torch.double))
+    torch.testing.assert_close(slope[2:].norm(dim=0), torch.ones(3, dtype=torch.double))
+
+
+def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_forecast():
+    state = states(50)
+    state[:, 5] = torch.linspace(-3, 3, 50)
+    reading = TurnedWrist()(state)
+    for near in (state[:, 5] + 2.5, state[:, 5] - 2.5 + 2 * math.pi, state[:, 5] + 0.4):
+        turns = (wrist_of(reading, side_of(reading, near))[:, 5] - state[:, 5]) / (2 * math.pi)
+        torch.testing.assert_close(turns, turns.round(), atol=1e-5, rtol=0)  # the same angle, on the forecast's turn
+        assert ((side_of(reading, near) - near).abs() < math.pi).all()
+    torch.testing.assert_close(side_of(reading), state[:, 5])
+    reading[:, 7:9] *= 0.2
+    other = wrist_of(reading, side_of(reading, state[:, 5] + math.pi))[:, 5]
+    torch.testing.assert_close(other, state[:, 5] + math.pi, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_samples_turn_to_the_side_of_the_forecast(weighted):
+def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast(weighted):
     state = states(2)
     state[:, 5] = torch.tensor([1.0, 1.0])
     samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
+    samples[..., 7:9] = 0.0
     forecast = torch.zeros(2, 3, SIZE)
     forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
     td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
@@ -177,7 +195,7 @@ def readings():
             path.append(motion(path[-1]))
     path = torch.stack(path, 1)
     sensor = SENSORS["keypoints"].build(FACTS, 32)
-    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 11)
+    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 13)
     encoding = torch.zeros(3, 40, 64)
     td = TensorDict({"state": path[..., :10], "motion": path, "action": path[..., :7]}, [3, 40])
     td["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [3, 40])
@@ -234,7 +252,7 @@ def test_a_head_on_features_is_the_sensor_on_pictures():
     head = sensor.module["head"].forward(codes["code"], sample=False)
     torch.testing.assert_close(whole["sensor", "ensemble"][:, 0], sensor.loc + sensor.scale * head)
     sensor.module["head"].sample = True
-    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 11)
+    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 13)
 
 
 def test_a_belief_at_rest_is_padded():
