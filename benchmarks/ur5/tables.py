@@ -93,16 +93,17 @@ def _blackouts(rows: Sequence[dict]) -> list[str]:
 
 
 def _sizes(rows: Sequence[dict], resized: Sequence[dict]) -> list[str]:
-    if not resized:
-        return []
-    same = {key: resized[0][key] for key in ("filter", "sensor", "domain", "training")}
-    own = pick(rows, condition="clean", **same)
+    lines: list[str] = []
+    keys = ("filter", "sensor", "domain", "training")
     titles = ("members", "CRPS, validation demos", "joints deg", "end effector cm", "90 % hold", "ms")
-    lines = [f"Size of the ensemble, {same['filter']}, clean", "", *head(*titles)]
-    for size in sorted({row["ensemble_size"] for row in own}):
-        at = pick(own, ensemble_size=size)
-        covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
-        cells = [over_seeds(at, "validation_crps", "{:.3f}"), over_seeds(at, "joint_mae_deg")]
-        cells += [over_seeds(at, "ee_mae_cm", "{:.3f}"), covered, over_seeds(at, "ms_per_step")]
-        lines.append(line(size, *cells))
+    for same in dict.fromkeys(tuple(row[key] for key in keys) for row in resized):
+        own = pick(rows, condition="clean", **dict(zip(keys, same, strict=True)))
+        lines += [f"Size of the ensemble, {same[0]} on {same[1]}, clean", "", *head(*titles)]
+        for size in sorted({row["ensemble_size"] for row in own}):
+            at = pick(own, ensemble_size=size)
+            covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
+            cells = [over_seeds(at, "validation_crps", "{:.3f}"), over_seeds(at, "joint_mae_deg")]
+            cells += [over_seeds(at, "ee_mae_cm", "{:.3f}"), covered, over_seeds(at, "ms_per_step")]
+            lines.append(line(size, *cells))
+        lines.append("")
     return lines
