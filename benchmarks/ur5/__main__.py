@@ -50,7 +50,8 @@ def main() -> None:
     header = f"`{command('ur5')}`: {(time.time() - begun) / 60:.0f} min"
     report(study.out, COLUMNS, rows, markdown(rows, header))
     if study.smoke:
-        print(*draw_all(study.out))
+        for after in AFTERWARDS.values():
+            print(*after(study))
 
 
 if __name__ == "__main__":

@@ -114,12 +114,12 @@ def size_rows(
     names: dict,
     validation: TensorDict,
     *,
-    compiled: bool = False,
+    chunk: int | None = None,
 ) -> list[dict]:
     """A trained filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
 
-    Rows also have the CRPS on ``validation``, features of other demos, by which a size may be chosen. With ``compiled``
-    ``ms_per_step`` is processor time of compiled steps, and ``eager_ms_per_step`` of eager ones.
+    Rows also have the CRPS on ``validation``, features of other demos, by which a size may be chosen. With ``chunk``
+    ``ms_per_step`` is processor time of compiled chunks of so many steps, and ``eager_ms_per_step`` of eager steps.
     """
     rows = []
     for size in sizes:
@@ -133,17 +133,17 @@ def size_rows(
         out = torch.cat(parts)
         row = {**names, "condition": "clean", "ensemble_size": size, "demos": len(out)}
         crps = validation_crps(recipe, model, read_all(sensor, validation, size))
-        times = processor_times(recipe, model, first) if compiled else costs(recipe, model, first)
+        times = costs(recipe, model, first) if chunk is None else processor_times(recipe, model, first, chunk)
         rows.append({**row, **scores(out), **times, "validation_crps": crps})
     return rows
 
 
-def processor_times(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """Milliseconds of the processor a step of one demo, eager and compiled."""
+def processor_times(recipe: UR5Recipe, model: Filter, readings: TensorDict, chunk: int) -> dict[str, float]:
+    """Milliseconds of the processor a step of one demo, eager and compiled in chunks; 0 compiles nothing."""
     row, behind, times = readings[:1, :TIMED], recipe.behind(model), {}
     row = with_hint(row, row["state"][:, 0])
-    for column, chunk in (("eager_ms_per_step", 0), ("ms_per_step", 1)):
-        behind.compile(chunk=chunk)
+    for column, steps in (("eager_ms_per_step", 0), ("ms_per_step", chunk)):
+        behind.compile(chunk=steps)
         times[column] = processor_ms(lambda: behind.sequence(row.copy()), row.shape[1])
     return times
 

@@ -61,8 +61,9 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
     for scheme in SCHEMES if name == "denkf" else (None,):
         names = {"filter": f"DEnKF, {scheme}" if scheme else name, "sensor": base.kind, "seed": base.seed}
         make, sizes = partial(_recipe, base, name, scheme), base.study.sizes if scheme else (MEMBERS,)
+        chunk = 0 if base.study.smoke else 1
         for row in size_rows(
-            make, sensor, base.codes("test"), sizes, saved, names, base.codes("validation"), compiled=True
+            make, sensor, base.codes("test"), sizes, saved, names, base.codes("validation"), chunk=chunk
         ):
             yield {**row, "members": row["ensemble_size"] if scheme else members_of(name)}
 

@@ -176,7 +176,7 @@ def run(study: Study) -> list[Path]:
     for kind in study.sensors:
         base = Base(study, kind, "sim", study.seeds[0])
         tune, test = (_read(base, role) for role in ("tune", "test"))
-        studied[kind] = limits(tune, test), slopes(*tune)
+        studied[kind] = limits(tune, test, updates=2 if study.smoke else UPDATES), slopes(*tune)
     file = study.out / "limits.md"
     write_page(page(studied), file)
     return [file]
