@@ -65,7 +65,8 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
         for row in size_rows(
             make, sensor, base.codes("test"), sizes, saved, names, base.codes("validation"), chunk=chunk
         ):
-            yield {**row, "members": row["ensemble_size"] if scheme else members_of(name)}
+            row["members"] = row["ensemble_size"] if scheme else members_of(name)
+            yield {column: row[column] for column in COLUMNS.names}
 
 
 def _recipe(base: Base, name: str, scheme: str | None, size: int) -> UR5Recipe:

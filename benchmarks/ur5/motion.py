@@ -183,6 +183,7 @@ def train_motion(
         Stage("motion", loss, sample, updates, lr=5e-3),
         out=out,
         validate=lambda: {"error": float(sum(loss(checked).values())), **far()},
+        monitor="error",
         validate_every=max(updates // 4, 1),
         save_every=max(updates // 2, 1),
         seed=seed,
