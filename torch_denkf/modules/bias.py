@@ -49,6 +49,9 @@ class FadingBias(nn.Module):
         (0.904..., 0.725...)
     """
 
+    log_std: Tensor
+    log_time: Tensor
+
     def __init__(
         self, std: Sequence[float] | Tensor, time: float | Sequence[float] | Tensor, *, trainable: bool = True
     ):
