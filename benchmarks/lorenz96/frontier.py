@@ -21,6 +21,7 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.common.arguments import command, processor
+from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.plots import draw_frontier
 from benchmarks.common.scores import processor_ms
 from benchmarks.common.tables import Columns, head, line, write_page
@@ -119,6 +120,10 @@ def row_of(name: str, size: int, settings: dict[str, Make], data: dict[str, Tens
     return row
 
 
+def _rows(*arguments) -> list[dict]:
+    return [row_of(*arguments, chunk=1)]
+
+
 @dataclass
 class Frontier:
     """Error against milliseconds a step: ensemble filters of many sizes, EKF, UKF, particle filter."""
@@ -128,6 +133,7 @@ class Frontier:
     steps: int = 600  # of each
     burn_in: int = 100  # of these, which do not count
     out: Path = Path("benchmarks/lorenz96/results/frontier.md")
+    rows: Path = Path("runs/lorenz96-frontier")  # what was broken off goes on from here
     smoke: bool = False  # one size on short records, nothing compiled, nothing written
 
     def __call__(self) -> None:
@@ -140,8 +146,12 @@ class Frontier:
         roles = dict(zip(("validation", "test"), data.split(self.records), strict=True))
         rows = []
         for (name, size), settings in candidates(self.sizes).items():
-            tried = dict(list(settings.items())[:1]) if self.smoke else settings
-            rows.append(row_of(name, size, tried, roles, self.burn_in, 0 if self.smoke else 1))
+            if self.smoke:
+                rows.append(row_of(name, size, dict(list(settings.items())[:1]), roles, self.burn_in, 0))
+            else:
+                file = self.rows / f"{name}-{size}-{self.records}-{self.steps}-{self.burn_in}.json"
+                once(file, partial(_rows, name, size, settings, roles, self.burn_in))
+                rows += read_rows([file])
             print(line(*(f"{v:.3g}" if isinstance(v, float) else v for v in rows[-1].values())), flush=True)
         write_page(self._page(rows, time.perf_counter() - began), None if self.smoke else self.out)
         if not self.smoke:
