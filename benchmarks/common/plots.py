@@ -60,8 +60,11 @@ def draw_frontier(
         for end in (0, -1) if len(own) > 1 else ():
             axis.annotate(str(own[end]["members"]), points[end], (4, 4), textcoords="offset points", fontsize=8)
     axis.set(xscale="log", yscale="log", xlabel="ms a step, one thread", ylabel=label)
+    for scale in (axis.xaxis, axis.yaxis):
+        scale.set_major_formatter("{x:g}")
+        scale.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
     if len(kept) < len(rows):
-        axis.set_title(f"{len(rows) - len(kept)} rows with an error above {limit:g} are not shown", fontsize=9)
+        axis.set_title(f"not shown, with an error above {limit:g}: {len(rows) - len(kept)}", fontsize=9)
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=9)
     save(figure, path)

@@ -42,6 +42,8 @@ from torch_denkf.modules import (
 TIMED, RUNS = 50, 10  # steps of one record, so many times
 DIMS = list(range(VARIABLES))
 FEW = 32  # up to so many members may be localised: more do without, and local systems of many members take seconds
+ROTATED = 128  # up to so many members run as an etkf: the rotation of more takes longer than the step
+
 INFLATIONS, RADII = (1.0, 1.01, 1.02, 1.04, 1.07, 1.12), (4.0, 8.0, None)
 GAUSSIAN_INFLATIONS = (1.02, 1.05, 1.1, 1.2, 1.3, 1.5)
 KERNELS = (0.25, 0.5, 1.0, 2.0)
@@ -91,6 +93,8 @@ def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
     """Filters by name and size, and their settings."""
     found: dict[tuple[str, int], dict[str, Make]] = {}
     for (name, scheme), size in product(SCHEMES.items(), sizes):
+        if scheme == "etkf" and size > ROTATED:
+            continue
         grid = product(RADII if size <= FEW else (None,), INFLATIONS)
         found[name, size] = {
             f"radius {r or 'none'}, inflation {i}": partial(ensemble, scheme, size, r, i) for r, i in grid

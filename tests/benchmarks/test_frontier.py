@@ -26,7 +26,7 @@ def test_a_line_is_drawn_for_each_filter_in_order_of_members(tmp_path, monkeypat
     lines = {line.get_label(): line.get_xydata().tolist() for line in axis.lines}
     assert lines == {"a": [[0.1, 0.3], [0.4, 0.2]], "b": [[0.2, 0.25]]}
     assert [text.get_text() for text in axis.texts] == ["8", "64"]
-    assert axis.get_title().startswith("1 rows with an error above 2")
+    assert axis.get_title() == "not shown, with an error above 2: 1"
     assert (tmp_path / "a.png").stat().st_size > 1000
     with pytest.raises(ValueError, match="no rows to draw of 1"):
         plots.draw_frontier(ROWS[-1:], tmp_path / "b.png", error="rmse", label="RMSE", limit=2.0)
