@@ -8,6 +8,7 @@ from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.bias import BiasedNoise, BiasedObservation, BiasedTransition, FadingBias
 from torch_denkf.modules.black import BlackIsMissing
 from torch_denkf.modules.carried import WithState
 from torch_denkf.modules.check import check_analysis
@@ -87,6 +88,10 @@ __all__ = [
     "GaussianAround",
     "CholeskyNoise",
     "MappedNoise",
+    "FadingBias",
+    "BiasedTransition",
+    "BiasedNoise",
+    "BiasedObservation",
     "UnicycleNoise",
     "as_process_noise",
     "EKFTransition",
