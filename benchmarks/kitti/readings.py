@@ -23,7 +23,9 @@ def read_sensor(sensor: SubModel, data: TensorDict, kind: str, mirrored: bool = 
         sensor.eval()
         for index in torch.arange(len(data)).split(chunk):
             frames = rows(data, index, kind)
-            readings.append(sensor(mirror(frames) if mirrored else frames).exclude("flow", "road", "two_view", "pixels"))
+            readings.append(
+                sensor(mirror(frames) if mirrored else frames).exclude("flow", "road", "two_view", "pixels")
+            )
         sensor.train(was_training)
     return torch.cat(readings)
 

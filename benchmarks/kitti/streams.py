@@ -106,7 +106,9 @@ def spans(stream: Stream, sensor: str) -> list[Stream]:
 
 def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
     """Rows of a stream as the sensor reads them, and what it should read: the velocities of all steps of the pair."""
-    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road", "two_view"), index)
+    frames = frames_at(
+        stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road", "two_view"), index
+    )
     lags = torch.arange(LONGEST)
     velocity = stream["state"][(index.unsqueeze(-1) - lags).clamp_min(0)][..., 3:]
     return frames.set("target_observation", (velocity * (lags < frames["steps"]).unsqueeze(-1)).sum(-2))

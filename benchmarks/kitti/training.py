@@ -39,13 +39,13 @@ class Budget:
 
 
 @torch.no_grad()
-def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> TensorDict:
+def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict], seed: int = 0) -> TensorDict:
     """Filters readings of one length side by side, ``[K, N]``, each from its true first state."""
     batch = torch.stack([reading.copy() for reading in readings])
     batch["is_init"] = torch.zeros(*batch.batch_size, 1, dtype=torch.bool)
     batch["is_init"][:, 0] = True
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         return recipe.part(model, sensor=False).sequence(batch)
 
 

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["CELL", "FOCUS_PRIOR", "FOCUS_STD", "FLOW_SHAPE", "ROAD_PITCHES", "ROAD_SHAPE", "ROAD_SHIFTS", "TWO_VIEW_SHAPE"]
+__all__ = [
+    "CELL",
+    "FOCUS_PRIOR",
+    "FOCUS_STD",
+    "FLOW_SHAPE",
+    "ROAD_PITCHES",
+    "ROAD_SHAPE",
+    "ROAD_SHIFTS",
+    "TWO_VIEW_SHAPE",
+]
 
 FLOW_SHAPE = (3, 25, 79)  # channels of coarse_flow, rows, columns: of every camera
 CELL = 0.05  # m along the road
