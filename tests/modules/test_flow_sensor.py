@@ -336,7 +336,7 @@ def test_corners_tell_turn_and_pitch_where_there_are_any(float64):
     frame["two_view"] = torch.tensor([0.05, 0.0, 0.0, 0.0, -0.02, 1e-3, 1e-3, 0.9])
     out = sensor(frame)
     torch.testing.assert_close(out["sensor", "ensemble"][:, 1], torch.full((5,), 0.05 / DT))
-    encoding = out["sensor", "encoding"][-12:]  # seven cues of the flow and the road, five of the corners
+    encoding = out["sensor", "encoding"][-12:].tolist()  # seven cues of the flow and the road, five of the corners
     assert encoding[1] == pytest.approx(-0.02 / 0.005, abs=1e-6)
     assert encoding[-1] == pytest.approx(0.9)
     frame["two_view"] = torch.zeros(8)
