@@ -96,12 +96,14 @@ class CarSettings:
 def velocity_analysis(lags: int) -> EnsembleAnalysis:
     """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
 
-    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations.
+    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
+    multiplies the present velocities alone: those of past steps would be multiplied again in each step.
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
         "sensor",
         taper=(own, torch.eye(2)),
+        inflated=VELOCITIES,
         forecast_key=("forecast", "clone"),
         observed_key=("forecast", "observed"),
         belief_key="analysis",
