@@ -132,17 +132,21 @@ class EnsembleAnalysis(EnsembleUpdate):
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
-            factor = self.inflation
-            if self.inflated is not None:
-                factor = torch.ones_like(ensemble[..., :1, :])
-                factor[..., self.inflated] = self.inflation
-            inflated = inflate(ensemble, factor)
+            inflated = inflate(ensemble, self._factor(ensemble))
             if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
                 inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean = ensemble_mean(ensemble)
         cov = (ensemble_cov(ensemble),) if self.covariance else ()
         return ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood, *cov
+
+    def _factor(self, ensemble) -> float | torch.Tensor:
+        """Of the inflation: one for all components, or ``[*B, 1, S]``."""
+        if self.inflated is None:
+            return self.inflation
+        factor = torch.ones_like(ensemble[..., :1, :])
+        factor[..., self.inflated] = self.inflation
+        return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
         """What the reading says of earlier states of the same members; neither inflation nor relaxation touches them.

@@ -55,11 +55,18 @@ def track_corners(previous: np.ndarray, current: np.ndarray) -> tuple[np.ndarray
     corners = cv2.goodFeaturesToTrack(previous, _CORNERS, _QUALITY, _APART)
     if corners is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
-    settings = {"winSize": _WINDOW, "maxLevel": _LEVELS, "criteria": (3, 30, 0.01)}
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, corners, None, **settings)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(current, previous, moved, None, **settings)
+    moved, found = _track(previous, current, corners)
+    back, again = _track(current, previous, moved)
     kept = (found & again).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < _BACK)
     return corners[kept, 0], moved[kept, 0]
+
+
+def _track(previous: np.ndarray, current: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where corners ``[K, 1, 2]`` are in the other image, and whether they were found ``[K, 1]``."""
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]  # cv2 does not say that None is to make
+        previous, current, corners, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=(3, 30, 0.01)
+    )
+    return moved, found
 
 
 def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
