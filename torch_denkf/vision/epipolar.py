@@ -54,7 +54,7 @@ def track_corners(previous: np.ndarray, current: np.ndarray) -> tuple[np.ndarray
     """
     corners = cv2.goodFeaturesToTrack(previous, _CORNERS, _QUALITY, _APART)
     if corners is None:
-        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)  # type: ignore[unreachable]  # cv2 says it is never None
     moved, found = _track(previous, current, corners)
     back, again = _track(current, previous, moved)
     kept = (found & again).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=-1).ravel() < _BACK)
