@@ -58,7 +58,7 @@ setup(
         "examples": ["matplotlib", "tensorboard"],
         # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
         "hub": ["huggingface_hub>=1.0"],
-        # Collection over machines, torchrl's RayCollector, in examples/collect_ray.py alone: 75 MB.
+        # Collection over machines, torchrl's RayCollector, in examples/many_machines.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [

@@ -7,8 +7,11 @@ ORDER = (
     "all_filters",
     "own_recordings",
     "two_sensors",
+    "late_readings",
+    "smoothing",
     "training",
     "diagnostics",
+    "monitor",
     "policy",
     "to_robot",
 )

@@ -11,7 +11,7 @@ if __name__ == "__main__":
     torch.set_default_dtype(torch.float64)
     out = Path(sys.argv[1])
     # End to end is not clipped: the gradient after a step is that before.
-    trainer = make_trainer(out, noise_in_batch=True, stages=("end_to_end",))
+    trainer = make_trainer(out, noise_in_batch=True, stages=("end_to_end",), updates=20)
     trainer.model.unused = torch.nn.Parameter(torch.ones(1))
     rank, gradients = trainer.processes.rank, []
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._options import options_of
 from torch_denkf.filters.base import Filter
-from torch_denkf.modules import GatedAnalysis, GateOptions, InnovationMonitor, KalmanAnalysis, WithState
+from torch_denkf.modules import GatedAnalysis, GateOptions, InnovationMonitor, KalmanAnalysis, LaggedAnalysis, WithState
 from torch_denkf.modules._base import SubModel, check_module, named_modules_of
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
@@ -178,7 +178,7 @@ def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
     if type(module) is TensorDictSequential:
         for _, part in named_modules_of(module):
             yield from _analyses(part)
-    elif isinstance(module, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
+    elif isinstance(module, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis | LaggedAnalysis):
         yield module
 
 

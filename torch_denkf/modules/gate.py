@@ -18,7 +18,7 @@ from torch_denkf.modules._calibration import IDENTITY, chi_square_table, empiric
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
 from torch_denkf.modules.kalman import KalmanAnalysis
-from torch_denkf.modules.past import InPlaceOf
+from torch_denkf.modules.past import InPlaceOf, LaggedAnalysis
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
@@ -86,7 +86,8 @@ class GatedAnalysis(InPlaceOf):
 
     Args:
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
-            :class:`EKFAnalysis` or :class:`UKFAnalysis`; its keys and its noise are kept.
+            :class:`EKFAnalysis` or :class:`UKFAnalysis`; or a :class:`LaggedAnalysis`, whose past a reading then
+            corrects as far as it is believed. Its keys and its noise are kept.
         observation_dim: O, components of the reading.
         response: see :class:`GateOptions`, like all that follows.
         window: likewise.
@@ -142,12 +143,13 @@ class GatedAnalysis(InPlaceOf):
         adapt_inflation: float = 0.0,
         gate_key: str = "gate",
     ):
-        if not isinstance(analysis, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
+        update = analysis.module if isinstance(analysis, LaggedAnalysis) else analysis
+        if not isinstance(update, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
             raise TypeError(
                 f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around "
                 "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
             )
-        of_ensemble = isinstance(analysis, EnsembleUpdate)
+        of_ensemble = isinstance(update, EnsembleUpdate)
         if by_component and not of_ensemble:
             raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
         if response not in ("reject", "student", "huber"):
@@ -188,6 +190,18 @@ class GatedAnalysis(InPlaceOf):
     def noise_sizes(self, *values):
         """Those of the analysis."""
         return self.module.noise_sizes(*values)
+
+    def around(self, analysis: SubModel) -> GatedAnalysis:
+        """The same gate, with the same calibration, around another analysis.
+
+        Args:
+            analysis: of the same reading, e.g. a :class:`LaggedAnalysis` of the one inside.
+        """
+        options = {name: getattr(self, name) for name in GateOptions.__annotations__}
+        gate = GatedAnalysis(analysis, self.observation_dim, **options)
+        for name in ("tables", "slack", "limits", "usual"):
+            setattr(gate, name, getattr(self, name))
+        return gate
 
     def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
         """The state before anything was observed, in the order of ``state_keys``."""

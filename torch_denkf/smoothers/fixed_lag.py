@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import options_of
-from torch_denkf.modules import ResampledTransition
+from torch_denkf.modules import GatedAnalysis, ResampledTransition
 from torch_denkf.modules._base import named_modules_of
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules.past import EnsemblePast, LaggedAnalysis, LaggedBelief, WithEnsemblePast
@@ -157,6 +157,8 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
         nonlocal found
         if type(module) is TensorDictSequential:
             return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
+        if isinstance(module, GatedAnalysis):
+            return module.around(lagged(module.module))
         if isinstance(module, EnsembleUpdate) or hasattr(module, "info_key"):
             found = True
             return LaggedAnalysis(module)  # which refuses what it cannot wrap

@@ -1,0 +1,113 @@
+"""Gates and lags in either order: what the gate rejects corrects neither the belief nor the past."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from tests.filters.factories import linear_denkf, linear_system
+from torch_denkf.filters import FusedFilter, FusedSensor, Gated
+from torch_denkf.modules import GatedAnalysis, GaussianPrior, LearnedTransition, LinearObservation
+from torch_denkf.smoothers import EnKS, FixedLag
+
+WRONG = (7, 8, 13)
+
+
+def readings(steps=20):
+    torch.manual_seed(0)
+    frames = TensorDict({"observation": torch.randn(2, steps, 2)}, [2, steps])
+    frames["observed"] = torch.ones(2, steps, 1, dtype=torch.bool)
+    return frames
+
+
+def off(frames, key="observation"):
+    frames = frames.copy()
+    frames[key] = frames[key].clone()
+    frames[key][:, WRONG] += 200.0
+    return frames
+
+
+def hidden(frames, out, key="observed", gate="gate"):
+    """The recordings without what a gate rejected, which is more than what is wrong: it opens a little later."""
+    rejected = out[gate, "factor"].isinf()
+    assert rejected[:, WRONG].all()
+    assert rejected.sum() <= 4 * len(frames) * len(WRONG)
+    return frames.copy().set(key, frames[key] & ~rejected)
+
+
+GATE = {"response": "reject", "window": 1, "rate": 1e-6}
+ORDERS = {
+    "gate inside": lambda filter: FixedLag(Gated(filter, 2, **GATE), 4),
+    "gate outside": lambda filter: Gated(FixedLag(filter, 4), 2, **GATE),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("scheme", ["etkf", "sakov"])
+def test_what_is_rejected_is_as_good_as_hidden(float64, order, scheme):
+    out = ORDERS[order](linear_denkf(scheme)).sequence(off(readings()))
+    expected = FixedLag(linear_denkf(scheme), 4).sequence(hidden(readings(), out))
+    for key in (("belief", "ensemble"), ("belief", "past"), ("smoothed", "ensemble")):
+        assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
+
+
+def test_a_reading_that_counts_less_corrects_the_past_less(float64):
+    """Student's t enlarges R: the past moves as with that R from the beginning."""
+    frames = off(readings())
+    gated = ORDERS["gate outside"](linear_denkf()).gates[0]
+    gated.response, gated.limits = "student", gated.limits / 1e3
+    one = frames[:, 7].copy()
+    torch.manual_seed(1)
+    members = torch.randn(2, 6, 2)
+    one["forecast"] = TensorDict({"ensemble": members, "observation": members, "past": torch.randn(2, 6, 4, 2)}, [2])
+    one["sensor"] = {"noise": torch.full((2, 2), 0.5)}
+    for key, value in zip(gated.state_keys, gated.initial_state([2]), strict=True):
+        one[key] = value
+    inside = gated.module.module
+    one[inside.in_keys[3]] = one["sensor", "noise"]
+    out = gated(one.copy())
+    assert (out["gate", "factor"] > 2).all()
+    one[inside.in_keys[3]] = one["sensor", "noise"] * out["gate", "factor"]
+    expected = gated.module(one.copy())
+    for key in (("belief", "ensemble"), ("forecast", "past")):
+        assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
+
+
+def late(ensemble_size=8):
+    F, _, H, R = linear_system()
+    moves = torch.nn.Linear(2, 2, bias=False)
+    moves.weight.data = F
+    sensors = {"late": FusedSensor(LinearObservation(H), R.sqrt(), delay=3)}
+    initial = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=ensemble_size)
+    return FusedFilter(LearnedTransition(moves, residual=False), sensors, initial=initial, process_noise=[0.3, 0.3])
+
+
+def test_a_gate_of_late_readings_is_as_good_as_a_mask(float64):
+    frames = TensorDict({"late": readings()["observation"]}, [2, 20])
+    frames["late_observed"] = readings()["observed"]
+    frames = late().draw_noise(frames, generator=torch.Generator().manual_seed(0))
+    gated = Gated(late(), **{**GATE, "rate": 1e-9})
+    torch.manual_seed(2)  # of the initial ensemble
+    out = gated.sequence(off(frames, "late"))
+    torch.manual_seed(2)
+    expected = late().sequence(hidden(frames, out, "late_observed"))
+    for key in (("belief", "ensemble"), ("smoothed", "ensemble")):
+        assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
+
+
+def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
+    torch.manual_seed(0)
+    clean = TensorDict({"observation": torch.randn(4, 200, 2)}, [4, 200])
+    gated = Gated(linear_denkf(), 2, window=2).calibrate([clean], margin=1.5)
+    inside = next(module for module in FixedLag(gated, 3).modules() if isinstance(module, GatedAnalysis))
+    assert torch.equal(inside.tables, gated.gates[0].tables)
+    assert inside.slack > 1
+    assert torch.equal(inside.slack, gated.gates[0].slack)
+    assert (inside.window, inside.rate) == (2, gated.gates[0].rate)
+
+
+def test_a_smoother_of_a_gated_filter_leaves_out_what_the_gate_rejects(float64):
+    gated = Gated(linear_denkf(), 2, **GATE)
+    smoothed, out = EnKS(gated, lag=4)(off(readings())), gated.sequence(off(readings()))
+    expected = EnKS(linear_denkf(), lag=4)(hidden(readings(), out))
+    assert_close(smoothed["smoothed", "mean"], expected["smoothed", "mean"], rtol=1e-12, atol=1e-12)
