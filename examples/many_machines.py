@@ -17,6 +17,8 @@ For many machines: ``ray start --head`` on one and ``ray start --address HEAD:63
 auto`` and more collectors here. Each worker takes one core and needs this package; it gets the folder ``examples/``
 from here. On a busy machine workers start slowly: ray 2.60 waits half a minute for them, or as long as
 RAY_agent_register_timeout_ms says, and torchrl waits a minute for the first exchange of weights.
+
+In one process, 10 minutes of a core: the reward of a step rises from 0.38 to 0.82, of at most 1. One run.
 """
 
 from __future__ import annotations
