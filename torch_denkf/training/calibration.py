@@ -30,7 +30,7 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
     Example:
         >>> settings = {}
         >>> apply = lambda value: settings.update(inflation=value)
-        >>> choose([0.5, 1.0, 2.0], apply, error=lambda: (settings["inflation"] - 1.8) ** 2)
+        >>> choose([0.5, 1.0, 2.0, 4.0], apply, error=lambda: (settings["inflation"] - 1.8) ** 2)
         2.0
         >>> settings
         {'inflation': 2.0}
