@@ -34,7 +34,7 @@ FAIRNESS = (
     "In each fold and seed all filters start from the same sensor's weights and learn from the same windows of its "
     "readings, with as many updates and steps back-propagated, at the same rate; each then trains its own copy of the "
     "sensor end to end for as many updates. Each has one number (inflation, or tempering of particle weights) chosen "
-    "from the same seven values by the CRPS of the velocities times the path's error on the same validation readings."
+    "from the same nine values by the CRPS of the velocities times the path's error on the same validation readings."
 )
 TITLES = {"dead_reckoning": "dead reckoning", "floor": "floor: true v and theta_dot"}
 HEADLINES = ("m/m", "of its sensor", "deg/m", "devkit", "CRPS v", "CRPS theta_dot", "coverage v", "coverage theta_dot")

@@ -23,7 +23,7 @@ from torch_denkf.odometry.scores import EndToEndLoss
 from torch_denkf.odometry.streams import all_frames, lose_frames
 from torch_denkf.training import Stage, parameters_without, read_checkpoint
 
-INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4)
+INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.6, 2.0)
 FLOOR = 1e-8  # of the variances of v and theta_dot
 
 
