@@ -94,8 +94,9 @@ def markdown(rows: Sequence[dict], header: str) -> str:
     shown = [(condition, *method) for condition in CONDITIONS for method in methods]
     for condition, name, sensor in [*shown, ("clean", "floor", "truth")]:
         own = pick([*rows, *floor], condition=condition, window=window, filter=name, sensor=sensor)
-        devkit = f"{plain(own, 'devkit_t_rel_percent')}, {plain(own, 'devkit_r_rel_deg_per_m', 100)}"
-        cells = [summary(own, END_POINT[0]), plain(own, "of_dead_reckoning"), summary(own, END_POINT[1]), devkit]
+        devkit = [plain(own, "devkit_t_rel_percent"), plain(own, "devkit_r_rel_deg_per_m", 100)]
+        cells = [summary(own, END_POINT[0]), plain(own, "of_dead_reckoning"), summary(own, END_POINT[1])]
+        cells.append(", ".join(filter(None, devkit)))
         cells += [plain(own, key) for key in ("crps_v_m_per_s", "crps_theta_dot_deg_per_s")]
         cells += [summary(own, key) for key in ("coverage90_v", "coverage90_theta_dot")]
         lines.append(line(condition, TITLES.get(name, name), sensor, *cells))
