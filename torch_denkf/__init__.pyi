@@ -44,6 +44,7 @@ from .filters import (
     MixtureParticleFilter,
     Monitored,
     ParticleFilter,
+    Refiltering,
 )
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
@@ -121,6 +122,7 @@ __all__ = [
     "RTSSmoother",
     "Recording",
     "RecordingReplay",
+    "Refiltering",
     "ReplayEnv",
     "SaltAndPepper",
     "SensorLoss",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from statistics import median
 
 import torch
 from tensordict import TensorDict
@@ -22,14 +23,14 @@ from benchmarks.fusion.training import make_weights, train
 from torch_denkf.training import read_checkpoint, write_checkpoint
 
 COLUMNS = Columns(
-    names=("task", "method", "sensors", "condition", "error", "error_without", "error_ratio"),
+    names=("task", "method", "sensors", "condition", "seed", "error", "error_without", "error_ratio"),
     text=("task", "method", "sensors", "condition"),
-    whole=(),
-    order=lambda row: (row["task"], row["condition"], row["sensors"], row["method"]),
+    whole=("seed",),
+    order=lambda row: (row["task"], row["condition"], row["sensors"], row["method"], row["seed"]),
 )
 METHODS = ("plain", "weights")
 SECONDS = 3.0  # that a sensor fails
-WINDOW, BATCH = 50, 32  # steps of a training window, and windows in an update
+WINDOW, BATCH = 200, 36  # steps of a training window, and windows in an update
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,9 @@ class Study:
 
     kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
     out: Path = Path("runs/fusion")
-    demos: int = 3  # of the UR5, for training and for the test each
-    updates: tuple[int, int] = (10, 60)  # of the noise and of the weights
+    demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
+    seeds: int = 3  # trainings
+    validate: bool = False  # score recordings that are not the test's, to choose by
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?
 
@@ -79,7 +81,7 @@ def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
         for (sensors, condition), error in by_case.items():
             row = {"task": task.name, "method": method, "sensors": sensors, "condition": condition}
             if condition == "as it is":
-                out.append({**row, "error": rms(error)})
+                out.append({**row, "error": rms(error[:, task.settled])})
                 continue
             failed = condition.partition(":")[0]
             others = " + ".join(name for name in task.sensors if name != failed)
@@ -93,7 +95,7 @@ def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
             milliseconds = 1e3 * int(data[f"{name}_late"].max()) / task.rate
             text = f"{name}: {milliseconds:.0f} ms late, {'heeded' if heed else 'ignored'}"
             row = {"task": task.name, "method": "plain", "sensors": " + ".join(task.sensors), "condition": text}
-            out.append({**row, "error": rms(error)})
+            out.append({**row, "error": rms(error[:, task.settled])})
     return out
 
 
@@ -107,32 +109,38 @@ def rms(error: torch.Tensor) -> float:
     return float(error.square().mean().sqrt())
 
 
-def job(name: str, study: Study) -> list[dict]:
-    """All of one task."""
+def job(name: str, seed: int, study: Study) -> list[dict]:
+    """All of one task, trained with one seed."""
     torch.set_num_threads(1)
     if name == "UR5":
-        task = arm_task(demos=2, steps=3) if study.smoke else arm_task(demos=study.demos)
+        sizes = {"demos": (2, 2), "steps": 3} if study.smoke else {"demos": study.demos}
+        task = arm_task(**sizes, validate=study.validate)
     else:
-        task = car_task(study.kitti, frames=6) if study.smoke else car_task(study.kitti)
-    weights, file = make_weights(task), study.out / f"{name}.pt"
+        task = car_task(study.kitti, frames=6 if study.smoke else 60, validate=study.validate)
+    weights, file = make_weights(task, seed), study.out / f"{name}-{seed}.pt"
     if file.exists():
         saved = read_checkpoint(file)
         task.parts.load_state_dict(saved["parts"])
         weights.load_state_dict(saved["weights"])
     else:
-        train(task, weights, updates=study.updates, window=16 if study.smoke else WINDOW, batch=BATCH)
+        updates, window = ((1, 1), 16) if study.smoke else (task.updates, WINDOW)
+        train(task, weights, updates=updates, window=window, batch=BATCH, seed=seed)
         write_checkpoint(file, {"parts": task.parts.state_dict(), "weights": weights.state_dict()})
-    return rows(task, weights)
+    return [{**row, "seed": seed} for row in rows(task, weights)]
 
 
-def one_file(file: Path, name: str, study: Study) -> None:
+def one_file(file: Path, name: str, seed: int, study: Study) -> None:
     """A job of its own process: rows into a file."""
-    once(file, partial(job, name, study))
+    once(file, partial(job, name, seed, study))
 
 
 def page(found: Sequence[dict], study: Study) -> str:
-    """Tables of both tasks."""
-    lines = ["# Several sensors in one filter", ""]
+    """Tables of both tasks: medians over the seeds."""
+
+    def middle(rows: Sequence[dict], column: str = "error") -> str:
+        return f"{median(row[column] for row in rows):.3g}"
+
+    lines = ["# Several sensors in one filter", "", f"Medians of {study.seeds} trainings.", ""]
     for task, unit in (("UR5", "degrees, six joints"), ("KITTI", "m, each coordinate")):
         own = pick(found, task=task)
         if not own:
@@ -140,19 +148,19 @@ def page(found: Sequence[dict], study: Study) -> str:
         lines += [f"## {task}: root mean square error, {unit}", "", *head("sensors", *METHODS)]
         subset = pick(own, condition="as it is")
         for sensors in dict.fromkeys(row["sensors"] for row in subset):
-            errors = [pick(subset, sensors=sensors, method=method)[0]["error"] for method in METHODS]
-            lines.append(line(sensors, *(f"{error:.3g}" for error in errors)))
+            lines.append(line(sensors, *(middle(pick(subset, sensors=sensors, method=method)) for method in METHODS)))
         lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, beside the error of the"]
         lines += ["filter that never had the sensor, in the same time.", ""]
-        lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times")
+        lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times", "worst training")
         failing = [row for row in own if "error_ratio" in row]
         for condition in dict.fromkeys(row["condition"] for row in failing):
-            plain, weighed = (pick(failing, condition=condition, method=method)[0] for method in METHODS)
-            cells = [plain["error"], weighed["error"], weighed["error_without"]]
-            cells += [plain["error_ratio"], weighed["error_ratio"]]
-            lines.append(line(condition, *(f"{cell:.3g}" for cell in cells)))
+            plain, weighed = (pick(failing, condition=condition, method=method) for method in METHODS)
+            cells = [middle(plain), middle(weighed), middle(weighed, "error_without")]
+            cells += [middle(rows, "error_ratio") for rows in (plain, weighed)]
+            lines.append(line(condition, *cells, f"{max(row['error_ratio'] for row in weighed):.3g}"))
         lines += ["", "A sensor comes late:", "", *head("delay", "error")]
-        lines += [line(row["condition"], f"{row['error']:.3g}") for row in own if "late" in row["condition"]]
+        late = dict.fromkeys(row["condition"] for row in own if "late" in row["condition"])
+        lines += [line(condition, middle(pick(own, condition=condition))) for condition in late]
         lines.append("")
     lines += [f"* Command: `{command('fusion')}`.", f"* Hardware: {processor()}; torch {torch.__version__}."]
     return "\n".join(lines) + "\n"
@@ -162,10 +170,12 @@ def main() -> None:
     """Runs the study; one that was broken off goes on."""
     study = parse(Study)
     if study.smoke:
-        study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), updates=(1, 1))
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), seeds=1)
     tasks = ["UR5"] + ["KITTI"] * (study.kitti is not None or study.smoke)
-    files = {study.out / "parts" / f"{name}.json": name for name in tasks}
-    side_by_side([partial(one_file, file, name, study) for file, name in files.items()], study.processes, "fusion")
+    runs = [(name, seed) for seed in range(study.seeds) for name in tasks]
+    files = {study.out / "parts" / f"{name}-{seed}.json": (name, seed) for name, seed in runs}
+    jobs = [partial(one_file, file, *run, study) for file, run in files.items()]
+    side_by_side(jobs, study.processes, "fusion")
     found = read_rows(files)
     COLUMNS.write(found, study.out / "fusion.csv")
     write_page(page(found, study), study.out / "fusion.md")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ __all__ = ["FAULTS", "FEATURE_STEPS", "Task", "add_features", "delayed", "faulty
 
 #: What a sensor does for a while, without a word.
 FAULTS = ("frozen", "offset", "noise")
+STARTUP = 0.5  # seconds, in which the first readings come
 FEATURE_STEPS = 5  # readings of which the spread is a feature
 
 
@@ -27,6 +28,9 @@ class Task:
         rate: of the filter's steps, in Hz.
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
+        failing: the sensors of which one fails in a training window; those that matter most stand there twice.
+        slope: of the weights before training, see :class:`~torch_denkf.modules.SensorAttention`.
+        updates: of the noise and of the weights.
         late: by sensor, by how many more steps its readings come late where it is delayed.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
@@ -42,6 +46,9 @@ class Task:
     rate: float
     offsets: dict[str, Tensor]
     noises: dict[str, Tensor]
+    failing: tuple[str, ...]
+    slope: float
+    updates: tuple[int, int]
     late: dict[str, int]
     train: TensorDict
     test: TensorDict
@@ -56,6 +63,11 @@ class Task:
     def sensors(self) -> list[str]:
         """Names of all sensors."""
         return list(self.offsets)
+
+    @property
+    def settled(self) -> slice:
+        """The steps that are scored: all but those of the start-up."""
+        return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
 
 
 def without(data: TensorDict, *sensors: str) -> TensorDict:
@@ -74,15 +86,15 @@ def faulty(
     bad = ((time >= begin.unsqueeze(-1)) & (time < end.unsqueeze(-1))).unsqueeze(-1)
     reading = data[sensor]
     if fault == "frozen":
-        held = reading.gather(1, (begin - 1).clamp(min=0).reshape(-1, 1, 1).expand(-1, 1, reading.shape[-1]))
-        wrong = held.expand_as(reading)
+        index = last_seen(data, sensor).gather(1, (begin - 1).clamp(min=0).reshape(-1, 1, 1))
+        wrong = reading.gather(1, index.expand(-1, 1, reading.shape[-1])).expand_as(reading)
     elif fault == "offset":
         wrong = reading + task.offsets[sensor]
     else:
         wrong = reading + 10 * task.noises[sensor] * torch.randn(reading.shape, generator=generator)
     out = data.copy()
     out[sensor] = torch.where(bad, wrong, reading)
-    return add_features(out, sensor)
+    return add_features(out, {sensor: task.noises[sensor]})
 
 
 def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
@@ -95,22 +107,38 @@ def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
     return out
 
 
-def add_features(data: TensorDict, *sensors: str) -> TensorDict:
-    """Adds what tells of a frozen or a noisy sensor: how much its last readings differ, as a logarithm.
+def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
+    """Adds what tells of a frozen or a noisy sensor, ``NAME_features`` ``[N, T, O + 1]``.
 
-    The sensor's readings are held between the steps at which they are taken.
+    They are how much each component of its last readings differs, a logarithm of standard deviations, and how many of
+    them are exactly the present one. The sensor's readings are held between the steps at which they are taken.
+
+    Args:
+        data: recordings ``[N, T]``.
+        noises: standard deviations of the readings of those sensors.
     """
     out = data.copy()
-    for name in sensors:
-        reading, seen = data[name], data[f"{name}_observed"]
-        time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
-        spread, index = torch.zeros_like(reading), torch.where(seen, time, 0).cummax(1).values
-        present = reading.gather(1, index.expand_as(reading))
-        before = present
+    for name, noise in noises.items():
+        last = last_seen(data, name)
+        index = last
+        present = before = data[name].gather(1, index.expand_as(data[name]))
+        spread, same = torch.zeros_like(present), torch.zeros_like(present[..., :1])
+        still = torch.ones_like(same, dtype=torch.bool)
         for _ in range(FEATURE_STEPS):
-            index = torch.where(seen, time, 0).cummax(1).values.gather(1, (index - 1).clamp(min=0))
-            earlier = reading.gather(1, index.expand_as(reading))
-            spread = spread + (before - earlier).abs() / FEATURE_STEPS
-            before = earlier
-        out[f"{name}_features"] = (spread + 1e-3 * reading.abs().mean() + 1e-6).log()
+            earlier = last.gather(1, (index - 1).clamp(min=0))
+            # Before its first reading a sensor has not repeated itself.
+            still = still & (earlier < index)
+            index = earlier
+            value = data[name].gather(1, index.expand_as(data[name]))
+            still = still & (value == present).all(-1, keepdim=True)
+            spread, same = spread + (before - value).abs() / FEATURE_STEPS, same + still
+            before = value
+        out[f"{name}_features"] = torch.cat([(spread / noise + 0.01).log(), same], -1)
     return out
+
+
+def last_seen(data: TensorDict, sensor: str) -> Tensor:
+    """The step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
+    seen = data[f"{sensor}_observed"]
+    time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
+    return torch.where(seen, time, 0).cummax(1).values

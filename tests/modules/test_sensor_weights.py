@@ -21,6 +21,7 @@ from torch_denkf.modules import (
     Select,
     SensorAttention,
 )
+from torch_denkf.smoothers import FixedLag
 
 
 class Constant(nn.Module):
@@ -86,6 +87,25 @@ def test_the_network_sees_innovations_in_standard_deviations(float64):
     assert observed.tolist() == [[True, False]] * 3
 
 
+def test_a_late_reading_is_judged_by_what_is_believed_of_its_time(float64):
+    F, Q, H, R = linear_system()
+    network = Constant(1.0, 1.0)
+    rows = frames()
+    rows["first_observed"][:] = True
+    rows["first"] = rows["first"].nan_to_num()
+    rows["second_observed"] = torch.tensor([False] * 7 + [True]).reshape(1, 8, 1).expand(3, 8, 1)
+    make("Kalman", weights=network, delay=2).sequence(rows.copy())
+    first = {"first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt())}
+    alone = FusedFilter(LinearTransition(F, Q), first, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
+    # It arrives at t = 7 and is of t = 5, of which the other sensor's readings up to t = 6 have told.
+    before = FixedLag(alone, 1).sequence(rows[:, :7].copy())["smoothed"][:, -1]
+    spread = (H[1:] @ before["cov"] @ H[1:].mT).squeeze(-1) + R[1:]
+    innovations, observed, _ = network.given
+    expected = (rows["second"][:, -1] - before["mean"] @ H[1:].mT) / spread.sqrt()
+    assert_close(innovations["second"], expected, rtol=0, atol=1e-9)
+    assert observed.all()
+
+
 def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64):
     torch.manual_seed(0)
     attention = SensorAttention({"a": 2, "b": 1}, features={"b": 3}, floor=0.1)
@@ -104,10 +124,23 @@ def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64)
     assert_close(attention(values, both, {"b": torch.zeros(5, 3)}), torch.full((5, 2), 0.1))
 
 
+def test_with_a_slope_weights_fall_with_the_innovation_before_training(float64):
+    attention = SensorAttention({"a": 2, "b": 1}, slope=2.0)
+    innovations = {"a": torch.tensor([[3.0, 3.0], [4.0, 0.0]]), "b": torch.tensor([[0.0], [10.0]])}
+    odds = torch.exp(torch.tensor(4.0)) / torch.tensor([[10.0, 1.0], [9.0, 101.0]]) ** 2
+    expected = 1e-3 + (1 - 1e-3) * odds / (1 + odds)
+    assert_close(attention(innovations, torch.ones(2, 2, dtype=torch.bool), {}), expected)
+    assert "slope" in attention.state_dict()
+    assert "slope" not in SensorAttention({"a": 2, "b": 1}).state_dict()
+    with pytest.raises(ValueError, match="slope"):
+        SensorAttention({"a": 2}, slope=-1.0)
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0])
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_the_gradient_reaches_the_weights(float64, kind):
+def test_the_gradient_reaches_the_weights(float64, kind, slope):
     torch.manual_seed(0)
-    attention = SensorAttention({"first": 1, "second": 1}, size=4)
+    attention = SensorAttention({"first": 1, "second": 1}, size=4, slope=slope)
     with torch.no_grad():
         for parameter in attention.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))

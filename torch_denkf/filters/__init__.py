@@ -10,6 +10,7 @@ from torch_denkf.filters.kalman import KalmanFilter
 from torch_denkf.filters.monitored import Gated, Monitored
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
 from torch_denkf.filters.recurrent import LSTMFilter
+from torch_denkf.filters.refiltering import Refiltering, RefilteringWindow
 from torch_denkf.filters.ukf import UKF
 
 __all__ = [
@@ -29,4 +30,6 @@ __all__ = [
     "GaussianOptions",
     "Gated",
     "Monitored",
+    "Refiltering",
+    "RefilteringWindow",
 ]

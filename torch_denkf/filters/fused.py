@@ -104,9 +104,9 @@ class FusedFilter(Filter):
     Readings that come late need the last L states beside the belief, L the largest delay. An ensemble carries them as
     :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
     systems gives what readings in their order give. With process noise and few members, the sample covariances of an
-    ensemble make a difference between late and in order, which falls with more members. Where there is a delay, the
-    belief of L steps ago stands under ``("smoothed", ...)``. A reading that belongs to the time before the episode is
-    not observed.
+    ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
+    is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
+    belongs to the time before the episode is not observed.
 
     Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.

@@ -33,7 +33,7 @@ class SensorAttention(nn.Module):
     .. math::
         z_m &= f_m(e_m, \log(1 + e_m^2), \varphi_m), \quad
         c_m = \sum_n \mathrm{softmax}_n\!\left(\frac{(W_q z_m)^T W_k z_n}{\sqrt D}\right) W_v z_n \\
-        w_m &= w_0 + (1 - w_0)\,\sigma(g(z_m, c_m) + 4)
+        w_m &= w_0 + (1 - w_0)\,\sigma(g(z_m, c_m) + 4 - a_m \log(1 + \overline{e_m^2}))
 
     So a sensor is judged by how well it agrees with the forecast, and by what the others say at the same time. The
     filter divides R by the weight: a reading of weight 0.01 counts as one with ten times the standard deviation.
@@ -43,7 +43,11 @@ class SensorAttention(nn.Module):
         features: number of features of each sensor that has any.
         size: D, of a token.
         floor: :math:`w_0`, the smallest weight. It keeps a way back: a sensor that was distrusted still corrects
-            the belief a little.
+            the belief a little. A thousand readings of weight 0.001 count as one that is believed: where a sensor reads
+            much more often than the others, or is much more exact, take a smaller one.
+        slope: a, before training; 0 leaves the term out. A filter that has followed a sensor finds nothing wrong with
+            it any more, and a loss does not tell how it could have known. With a slope of 2 a reading three standard
+            deviations off has a weight of a third before training, one ten off a weight of 0.005.
 
     Raises:
         ValueError: if a size is not positive, the floor is outside (0, 1), or features are of no sensor.
@@ -67,6 +71,7 @@ class SensorAttention(nn.Module):
         features: Mapping[str, int] | None = None,
         size: int = 16,
         floor: float = 1e-3,
+        slope: float = 0.0,
     ):
         super().__init__()
         features = dict(features or {})
@@ -76,7 +81,9 @@ class SensorAttention(nn.Module):
         for name, count in {**observations, **features, "size": size}.items():
             check_count(name, count)
         check_number("floor", floor, above=0, below=1)
+        check_number("slope", slope, least=0)
         self.names, self.floor = tuple(observations), floor
+        self.slope = nn.Parameter(torch.full((len(self.names),), float(slope))) if slope else None
         self.embed = nn.ModuleDict(
             {
                 name: nn.Sequential(nn.Linear(2 * count + features.get(name, 0), size), nn.ELU(), nn.Linear(size, size))
@@ -112,6 +119,9 @@ class SensorAttention(nn.Module):
         seen = observed.unsqueeze(-2) | torch.eye(len(self.names), dtype=torch.bool, device=observed.device)
         context = match.masked_fill(~seen, -torch.inf).softmax(-1) @ self.value(token)
         score = self.score(torch.cat([token, context], -1)).squeeze(-1)
+        if self.slope is not None:
+            wrong = torch.stack([innovations[name].square().mean(-1).log1p() for name in self.names], -1)
+            score = score - self.slope * wrong
         return self.floor + (1 - self.floor) * (score + 4).sigmoid()
 
 

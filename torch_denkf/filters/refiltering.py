@@ -1,0 +1,155 @@
+"""Readings that come late, put where they belong: the steps since are made again, with the same noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+
+from torch_denkf._checks import check_count
+from torch_denkf.filters._entries import write
+from torch_denkf.filters._noise import draw_noise
+from torch_denkf.filters._steps import where_rows
+from torch_denkf.filters.base import Filter
+
+__all__ = ["Refiltering", "RefilteringWindow"]
+
+
+class RefilteringWindow(NamedTuple):
+    """The last steps of a filter.
+
+    Attributes:
+        rows: what each step read, with its noise and the readings that came later; the oldest first.
+        beliefs: the belief before the first of them, and what each wrote.
+    """
+
+    rows: tuple[TensorDictBase, ...]
+    beliefs: tuple[TensorDictBase, ...]
+
+    @property
+    def belief(self) -> TensorDictBase:
+        """What the last step wrote."""
+        return self.beliefs[-1]
+
+
+class Refiltering:
+    """Filters the last steps once more when a reading comes late, with any filter.
+
+    The belief is that of the filter which gets each reading when it is taken, to rounding, also for ensembles with
+    process noise and for particles: each step keeps the noise that it drew. A step without a late reading costs a step
+    of the filter, one with a reading of k steps ago k + 1. A :class:`FusedFilter` with a ``delay`` corrects the states
+    since by their covariances instead, at a cost that does not depend on how late the reading is; of an ensemble with
+    process noise they are sample covariances. That filter also runs as a policy and in a transform.
+
+    All rows of the batch begin their episode together. A reading is not used if it belongs to the time before the first
+    step, or to more than ``lag`` steps ago.
+
+    Args:
+        filter: whose sensors have no ``delay`` of their own.
+        late: for each sensor that can be late the key of an entry ``[*B, 1]``, int64, by how many steps its reading
+            is; and the keys of what comes with the reading, the last of them its mask ``[*B, 1]`` or ``[*B, O]``.
+        lag: the largest number of steps by which a reading can be late.
+
+    Raises:
+        ValueError: if ``lag`` is not positive, or the filter updates its first belief.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+        >>> late = Refiltering(kf, {"late": ("observation", "observed")}, lag=2)
+        >>> drive = TensorDict({"observation": torch.tensor([[0.0], [0.0], [3.0], [5.0]])}, [4])
+        >>> drive["late"] = torch.tensor([[0], [0], [0], [2]])  # the last one was read two steps before, at t = 1
+        >>> drive["observed"] = torch.tensor([[False], [False], [True], [True]])
+        >>> order = TensorDict({"observation": torch.tensor([[0.0], [5.0], [3.0], [0.0]])}, [4])
+        >>> order["observed"] = torch.tensor([[False], [True], [True], [False]])
+        >>> torch.equal(late.sequence(drive)["belief", "mean"][-1], kf.sequence(order)["belief", "mean"][-1])
+        True
+    """
+
+    def __init__(self, filter: Filter, late: Mapping[NestedKey, tuple[NestedKey, ...]], lag: int):
+        check_count("lag", lag)
+        if filter.update_at_reset:
+            raise ValueError("The filter has update_at_reset=True, and a reading of the first frame could come late.")
+        self.filter, self.lag = filter, lag
+        self.late = {unravel_key(key): tuple(map(unravel_key, keys)) for key, keys in late.items()}
+
+    def start(self, row: TensorDictBase) -> RefilteringWindow:
+        """The belief at the start of an episode, see :meth:`Filter.initialise`."""
+        return RefilteringWindow((), (self.filter.initialise(row.copy()),))
+
+    def step(self, window: RefilteringWindow, row: TensorDictBase) -> RefilteringWindow:
+        """One step.
+
+        Args:
+            window: the last steps; it is not changed.
+            row: what :meth:`Filter.step` reads, ``[*B]``, beside the belief.
+
+        Returns:
+            The window with this step, whose ``belief`` is that of t.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a module can draw its noise only within the step.
+        """
+        rows = [*window.rows, self._with_noise(row, window.belief)][-self.lag - 1 :]
+        beliefs = list(window.beliefs[-len(rows) :])
+        first = self._place(rows)
+        del beliefs[first + 1 :]
+        for row in rows[first:]:
+            out = self.filter.step(row.copy().update(beliefs[-1].select(*self.filter.carry_keys)))
+            beliefs.append(out.select(*self.filter.out_keys))
+        return RefilteringWindow(tuple(rows), tuple(beliefs))
+
+    def sequence(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Filters one episode ``[*B, T]`` and writes what each step wrote when it was made first.
+
+        Raises:
+            ValueError: if another episode begins within it.
+        """
+        time, controls = tensordict.ndim - 1, self.filter.structure.controls
+        begins = tensordict.get(self.filter.init_key, None)
+        if begins is not None and begins.narrow(time, 1, begins.shape[time] - 1).any():
+            raise ValueError("Another episode begins within the sequence; cut it there.")
+        rows = tensordict.unbind(time)
+        window = self.start(rows[0])
+        beliefs = [window.belief]
+        for before, row in pairwise(rows):
+            window = self.step(window, row.copy().update(before.select(*controls, strict=False)))
+            beliefs.append(window.belief)
+        for key in self.filter.out_keys:
+            like = beliefs[-1].get(key)
+            values = [belief.get(key, None) for belief in beliefs]
+            tensordict.set(key, torch.stack([torch.zeros_like(like) if v is None else v for v in values], time))
+        return tensordict
+
+    def _with_noise(self, row: TensorDictBase, belief: TensorDictBase) -> TensorDictBase:
+        """The row and all noise of its step."""
+        row = row.copy()
+        carry = {key: belief[key] for key in self.filter.carry_keys}
+        entries = {**self.filter.entries_of(row, one_step=True), **carry}
+        drawn = draw_noise(self.filter, entries, row.batch_size, self.filter.structure.modules)
+        if drawn is None:
+            raise ValueError("A module cannot draw its noise before the step, so that the step cannot be made again.")
+        write(row, drawn)
+        return row
+
+    def _place(self, rows: list[TensorDictBase]) -> int:
+        """Puts the late readings of the last row where they belong; returns the first row that is another."""
+        last = len(rows) - 1
+        first = last
+        for key, keys in self.late.items():
+            late, mask = rows[last][key], keys[-1]
+            for steps in range(1, last + 1):
+                here = (late == steps) & rows[last][mask].any(-1, keepdim=True)
+                if here.any():
+                    first = min(first, last - steps)
+                    old = rows[last - steps]
+                    new = {name: where_rows(here, rows[last][name], old[name]) for name in keys}
+                    rows[last - steps] = old.copy().update(new)
+            rows[last] = rows[last].copy().set(mask, rows[last][mask] & (late == 0))
+        return first
