@@ -35,6 +35,7 @@ from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePo
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.sensor_weights import SensorAttention, SensorWeights, WeightedNoise
 from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
+from torch_denkf.modules.signs import SignGate
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -67,6 +68,7 @@ __all__ = [
     "ScaledNoise",
     "ImageSensor",
     "BlackIsMissing",
+    "SignGate",
     "VectorSensor",
     "FlowSensor",
     "MemberGain",

@@ -8,13 +8,19 @@ import numpy as np
 from torch_denkf.vision.camera import KITTI_HEIGHT, CanonicalCamera
 from torch_denkf.vision.exposure import same_exposure
 from torch_denkf.vision.flow import coarse_flow, dense_flow, median_turn
+from torch_denkf.vision.hidden import continue_flow, continue_picture
 from torch_denkf.vision.road import road_correlation
 
 __all__ = ["image_motion"]
 
 
 def image_motion(
-    previous: np.ndarray, current: np.ndarray, calibration, *, height: float = KITTI_HEIGHT
+    previous: np.ndarray,
+    current: np.ndarray,
+    calibration,
+    *,
+    height: float = KITTI_HEIGHT,
+    hidden: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarse optical flow and road correlation between two images of one calibrated camera.
 
@@ -27,6 +33,9 @@ def image_motion(
         current: grey image ``[H, W]``, uint8.
         calibration: (fx, fy, cx, cy) in pixels of the images.
         height: of the camera over the road, in m.
+        hidden: where something hides the street in both images, ``[H, W]``, bool, see
+            :func:`torch_denkf.vision.static_region`: pictures and flow are continued over it from around it. ``None``
+            for nowhere.
 
     Returns:
         The flow, ``FLOW_SHAPE`` (see :func:`coarse_flow`), and the correlation of the road, ``ROAD_SHAPE`` (see
@@ -43,6 +52,14 @@ def image_motion(
     camera = CanonicalCamera.near(calibration)
     previous, current = (camera.view(cv2.medianBlur(image, 3), calibration) for image in (previous, current))
     previous, current = same_exposure(previous, current)
+    hole = None if hidden is None or not hidden.any() else camera.view(hidden.astype(np.uint8), calibration) > 0
+    if hole is not None:
+        previous, current = (continue_picture(image, hole) for image in (previous, current))
     flow = dense_flow(previous, current, camera)
+    if hole is not None:
+        flow, mismatch = continue_flow(flow, coarse_flow(flow, previous, current, camera), hole, camera)
     road = road_correlation(previous, current, camera, median_turn(flow), height)
-    return coarse_flow(flow, previous, current, camera), road
+    coarse = coarse_flow(flow, previous, current, camera)
+    if hole is not None:
+        coarse[2] = mismatch
+    return coarse, road
