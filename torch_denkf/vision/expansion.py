@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from torch_denkf.vision.camera import CanonicalCamera
-from torch_denkf.vision.shapes import FLOW_SHAPE
+from torch_denkf.vision.shapes import FLOW_SHAPE, FOCUS_PRIOR, FOCUS_STD
 
 __all__ = ["Expansion", "coarse_cells", "focus_of_expansion"]
 
-_FOCUS, _FOCUS_STD = (0.0, -0.01), (0.06, 0.05)  # before anything is seen: a camera looks where the car goes
 _TURN_STD = 0.3  # rad, of each angle: no prior, but a car that stands still needs one
 _ITERATIONS = 7
 _EVERY = 2  # of the columns: neighbours say nearly the same
@@ -83,8 +82,8 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
     cells = coarse_cells().to(flow.device, dtype).view(2, height, width)
     x, y = cells[..., _EVERY // 2 :: _EVERY].flatten(1)
     trust = (1 - mismatch).clamp_min(0).square()
-    prior = torch.tensor([0.0, 0.0, 0.0, *_FOCUS], dtype=dtype, device=flow.device)
-    precision = torch.tensor([_TURN_STD] * 3 + list(_FOCUS_STD), dtype=dtype, device=flow.device) ** -2
+    prior = torch.tensor([0.0, 0.0, 0.0, *FOCUS_PRIOR], dtype=dtype, device=flow.device)
+    precision = torch.tensor([_TURN_STD] * 3 + list(FOCUS_STD), dtype=dtype, device=flow.device) ** -2
     estimate = prior.expand(len(flow), 5)
     for _ in range(_ITERATIONS):
         residual, jacobian, far = _across(right, down, x, y, estimate)

@@ -17,9 +17,11 @@ from torch_denkf.vision import (
     KITTI_HEIGHT,
     PICTURE_SIGNS,
     ROAD_SHAPE,
+    TWO_VIEW_SHAPE,
     image_motion,
     picture_signs,
     static_region,
+    two_view_motion,
 )
 
 __all__ = ["with_motion"]
@@ -33,6 +35,7 @@ def with_motion(
     height: float = KITTI_HEIGHT,
     cache: str | Path | bool | None = True,
     keep_images: bool = True,
+    two_view: bool = False,
     signs: bool = False,
     repair: bool = False,
 ) -> TensorDict:
@@ -46,6 +49,8 @@ def with_motion(
     ``signs`` [N, 4]          with ``signs=True``, float32: see :func:`torch_denkf.vision.picture_signs`
     ========= =============== =========================================================================================
 
+    With ``two_view`` also ``"two_view"`` ``[N, 8]``, float32: see :func:`torch_denkf.vision.two_view_motion`.
+
     All are zero in rows whose image, or the one before, is missing; after :func:`torch_denkf.data.bridge_gaps` the one
     before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
     25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
@@ -56,6 +61,7 @@ def with_motion(
         height: of the camera over the road, in m.
         cache: as in :func:`torch_denkf.data.read_kitti_drive`.
         keep_images: False leaves the images out of the result, which makes it light.
+        two_view: also track corners, for a sensor that reads them; 12 ms a frame at 125 x 414 pixels.
         signs: whether the images' signs of a failing camera are added.
         repair: whether the flow is continued over what stands still before the moving camera, see
             :func:`torch_denkf.vision.static_region`: dirt, or a box.
@@ -81,13 +87,14 @@ def with_motion(
         raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")
 
     def compute() -> TensorDict:
-        return _compute(drive, height, signs, repair)
+        return _compute(drive, height, signs, repair, two_view)
 
     directory = cache_folder(cache)
     if directory is None:
         motion = compute()
     else:
         options = f" {signs} {repair}" if signs or repair else ""
+        options += " two_view" * two_view
         key = f"{_FORMAT} {height} {tuple(drive['image'].shape)}{options}"
         digest = hashlib.blake2b(key.encode(), digest_size=10)
         for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
@@ -97,14 +104,18 @@ def with_motion(
             digest.update(after.contiguous().numpy().data)
         motion = cached(directory / f"motion-{digest.hexdigest()}", compute)
     drive = drive.copy() if keep_images else drive.exclude("image")
-    return drive.update({key: motion[key] for key in ("flow", "road", "signs") if key in motion})
+    return drive.update({key: motion[key] for key in ("flow", "road", "signs", "two_view") if key in motion})
 
 
-def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool) -> TensorDict:
+def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool, two_view: bool) -> TensorDict:
     rows = drive.batch_size[0]
     flow = torch.zeros(rows, *FLOW_SHAPE, dtype=torch.float16)
     road = torch.zeros(rows, *ROAD_SHAPE, dtype=torch.float16)
-    found = torch.zeros(rows, len(PICTURE_SIGNS))
+    motion = {"flow": flow, "road": road}
+    if signs:
+        motion["signs"] = torch.zeros(rows, len(PICTURE_SIGNS))
+    if two_view:
+        motion["two_view"] = torch.zeros(rows, *TWO_VIEW_SHAPE)
     steps, calibration = steps_at(drive, torch.arange(rows)).squeeze(-1).tolist(), drive["calibration"].tolist()
     for row in range(rows):
         if steps[row]:
@@ -113,9 +124,10 @@ def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool) ->
             arrays = image_motion(previous, current, calibration[row], height=height, **hidden)
             flow[row], road[row] = (torch.from_numpy(array).half() for array in arrays)
             if signs:
-                found[row] = torch.from_numpy(picture_signs(previous, current))
-    motion = TensorDict({"flow": flow, "road": road}, batch_size=[rows])
-    return motion.set("signs", found) if signs else motion
+                motion["signs"][row] = torch.from_numpy(picture_signs(previous, current))
+            if two_view:
+                motion["two_view"][row] = torch.from_numpy(two_view_motion(previous, current, calibration[row]))
+    return TensorDict(motion, batch_size=[rows])
 
 
 def _grey(image: torch.Tensor):
