@@ -25,6 +25,7 @@ from .data.ur5.replay import UR5ExperienceReplay
 from .deployment import PackagedStep, export_step, load_step
 from .envs.kitti import KITTIReplayEnv
 from .envs.linear import LinearGaussianEnv
+from .envs.pendulum import NoisyPendulumEnv
 from .envs.replay import ReplayEnv
 from .envs.ur5.expert import UR5Expert
 from .envs.ur5.table import UR5TableEnv
@@ -108,6 +109,7 @@ __all__ = [
     "LastAction",
     "LeRobotReplay",
     "LinearGaussianEnv",
+    "NoisyPendulumEnv",
     "MissingFrames",
     "MixtureParticleFilter",
     "MixtureLoss",

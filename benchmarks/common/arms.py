@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -93,7 +94,8 @@ class ArmRecipe(Recipe):
         motion: trained before.
         process_std: what motion and bias do not know in a step before training, for each of ``noisy``.
         noisy: dimensions of the state that the process noise acts on.
-        rates: those of them that are rates, one for each moving number.
+        rates: those of them that are rates, one for each moving number; or accelerations, or what else drives these.
+        moved: dimensions that the noise of ``rates`` moves in the same step, one after the other; by default the first.
     """
 
     actions = False
@@ -102,6 +104,11 @@ class ArmRecipe(Recipe):
     process_std: Tensor
     noisy: list[int]
     rates: list[int]
+
+    @property
+    def moved(self) -> Sequence[Sequence[int]]:
+        """The first numbers of the state, as many as there are rates."""
+        return (range(len(self.rates)),)
 
     @property
     def size(self) -> int:

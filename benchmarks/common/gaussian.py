@@ -32,7 +32,8 @@ class Extended(ArmRecipe):
 
     def modules(self):
         matrix = torch.eye(self.size)[:, self.noisy]
-        matrix[range(len(self.rates)), [self.noisy.index(rate) for rate in self.rates]] = 1.0
+        for rows in self.moved:
+            matrix[list(rows), [self.noisy.index(rate) for rate in self.rates]] = 1.0
         return OrderedDict(
             noise=self.noise(),
             transition=self.forecast(MappedNoise(self.process_noise(), matrix)),

@@ -50,6 +50,18 @@ def cost(model: Filter, run: Callable[[], object], steps: int) -> dict[str, floa
     return {"parameters": sum(parameters.values()), "ms_per_step": 1e3 * min(seconds) / steps}
 
 
+@torch.no_grad()
+def processor_ms(run: Callable[[], object], steps: int, runs: int = 10) -> float:
+    """Milliseconds of the processor a step, which other jobs hardly change: the least of some runs after a first."""
+    run()
+    seconds = []
+    for _ in range(runs):
+        begun = time.process_time()
+        run()
+        seconds.append(time.process_time() - begun)
+    return 1e3 * min(seconds) / steps
+
+
 class SensorLoss(nn.Module):
     """CRPS of a sensor's samples against what it should read, in units of a good sensor's errors.
 

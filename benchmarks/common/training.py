@@ -9,17 +9,18 @@ from torch import Tensor
 
 from benchmarks.common.recipes import Recipe
 from torch_denkf.filters import Filter
-from torch_denkf.training import FilterTrainer, Stage, choose_for_coverage, read_checkpoint, write_checkpoint
+from torch_denkf.training import FilterTrainer, Stage, choose, choose_for_coverage, read_checkpoint, write_checkpoint
 
 
 def fit_filter(
     recipe: Recipe,
     model: Filter,
     stages: Callable[[], Sequence[Stage]],
-    coverage: Callable[[], Tensor],
+    coverage: Callable[[], Tensor] | None,
     *,
     out: Path,
     inflations: Sequence[float],
+    error: Callable[[], float] | None = None,
     notes: dict | None = None,
     **settings,
 ) -> None:
@@ -29,9 +30,10 @@ def fit_filter(
         recipe: the model's.
         model: trained in place; it is left on its best parameters.
         stages: makes the stages.
-        coverage: of the model's 90 % intervals on validation data.
+        coverage: of the model's 90 % intervals on validation data, by which the inflation is chosen.
         out: checkpoints and logs.
         inflations: to choose from.
+        error: of the model on validation data, by which the inflation is chosen where there is no coverage.
         notes: plain values and tensors to leave in the file, too.
         **settings: of :class:`~torch_denkf.training.FilterTrainer`.
     """
@@ -41,7 +43,16 @@ def fit_filter(
         return
     trainer = FilterTrainer(model, stages(), out=out, **settings)
     trainer.fit()
-    inflation = choose_for_coverage(inflations, lambda factor: recipe.set_inflation(model, factor), coverage)
+
+    def apply(factor: float) -> None:
+        recipe.set_inflation(model, factor)
+
+    if error is not None:
+        inflation = choose(inflations, apply, error)
+    elif coverage is not None:
+        inflation = choose_for_coverage(inflations, apply, coverage)
+    else:
+        raise TypeError("fit_filter chooses the inflation by coverage or by error; pass one of them")
     if trainer.processes.is_main:
         write_checkpoint(file, {"model": model.state_dict(), "inflation": inflation, **(notes or {})})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, pstdev
 
 import torch
 from tensordict import TensorDict
@@ -36,6 +36,7 @@ from torch_denkf.training import hold_last
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
 WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more
 TIMED = 100  # steps to time a filter on
+DRAWS = 3  # runs of a filter that draws random numbers: its errors are means over them
 
 
 def last_velocities(reading: TensorDict, dt: float) -> Tensor:
@@ -68,31 +69,42 @@ def evaluate(
         part = Part(replace(stream, condition=condition))
         readings[condition] = [all_frames(read_spans(model["sensor"], part, cache, kind))]
     pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
-    out = run_filter(recipe, model, [reading for _, reading in pairs])
     first = pairs[0][1][:TIMED]
     costs = cost(model, lambda: run_filter(recipe, model, [first]), len(first))
     rows, beliefs = defaultdict(list), {}
-    for (condition, reading), belief in zip(pairs, out, strict=True):
-        beliefs.setdefault(condition, belief)
-        truth = clean["state"].double()
-        common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed}
+    truth, dt = clean["state"].double(), recipe.facts.dt
+
+    def add(name: str, condition: str, reading: TensorDict, states: Tensor, scores: dict[str, float]) -> None:
+        common = {"sensor": kind, "drive": stream.name, "condition": condition, "seed": seed, "filter": name}
         common["blind"] = 1 - float(reading["observed"][1:].float().mean())
-        estimates = {filter_name: belief["belief", "mean"][:, :5].double()}
-        estimates["dead_reckoning"] = integrate(last_velocities(reading, recipe.facts.dt), truth, recipe.facts.dt)
-        if condition == "clean":
-            estimates["floor"] = integrate(truth[:, VELOCITIES], truth, recipe.facts.dt)
-        for name, states in estimates.items():
-            scores = {**calibration(belief), **costs} if name == filter_name else {}
-            for row in errors(states, truth):
-                rows[condition, name, row["window"]].append({**common, **scores, "filter": name, **row})
-    return [_mean(group) for group in rows.values()], beliefs
+        for row in errors(states, truth):
+            rows[condition, name, row["window"]].append({**common, **row, **scores})
+
+    for draw in range(DRAWS):
+        out = run_filter(recipe, model, [reading for _, reading in pairs], seed=draw)
+        for (condition, reading), belief in zip(pairs, out, strict=True):
+            beliefs.setdefault(condition, belief)
+            states = belief["belief", "mean"][:, :5].double()
+            add(filter_name, condition, reading, states, {**calibration(belief), **costs})
+        if "ensemble" not in out["belief"]:
+            break  # the same each time
+    for condition, reading in pairs:
+        add("dead_reckoning", condition, reading, integrate(last_velocities(reading, dt), truth, dt), {})
+    add("floor", "clean", pairs[0][1], integrate(truth[:, VELOCITIES], truth, dt), {})
+    means = {key: _mean(group) for key, group in rows.items()}
+    for (condition, name, window), row in means.items():
+        own = means[condition, "dead_reckoning", window]["translation_m_per_m"]
+        if name == filter_name:
+            row["of_dead_reckoning"] = row["translation_m_per_m"] / own
+    return list(means.values()), beliefs
 
 
 def _mean(rows: list[dict]) -> dict:
-    """One row of several that differ in their numbers alone: which frames are missing is chance."""
-    return {
+    """One row of several that differ in their numbers alone: which frames are missing is chance, as are draws."""
+    mean = {
         key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
     }
+    return {**mean, "spread_m_per_m": pstdev(row["translation_m_per_m"] for row in rows)}
 
 
 def errors(states: Tensor, truth: Tensor) -> list[dict]:
@@ -103,6 +115,9 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
         "mae_v_m_per_s": float(velocity.mae[0]),
         "rmse_theta_dot_deg_per_s": float(velocity.rmse[1].rad2deg()),
         "mae_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
+        # Of a point; a belief's replace them.
+        "crps_v_m_per_s": float(velocity.mae[0]),
+        "crps_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
     }
     try:
         devkit = kitti_devkit_error(states[:, :3], truth[:, :3])
@@ -133,12 +148,13 @@ def calibration(belief: TensorDict) -> dict[str, float]:
     members = belief["belief", "ensemble"].shape[1] if equal else None
     mean, variance, truth = (value.double() for value in counted(belief, VELOCITIES, FLOOR))
     covered = interval_coverage(mean, variance, truth, level=0.9)
-    covariance = torch.diag_embed(variance)
+    covariance, crps = torch.diag_embed(variance), crps_gaussian(mean, variance, truth).mean(0)
     return {
         "coverage90": float(covered.mean()),
         "coverage90_v": float(covered[0]),
         "coverage90_theta_dot": float(covered[1]),
-        "crps_v_m_per_s": float(crps_gaussian(mean, variance, truth)[:, 0].mean()),
+        "crps_v_m_per_s": float(crps[0]),
+        "crps_theta_dot_deg_per_s": float(crps[1].rad2deg()),
         "nll": float(gaussian_nll(mean, covariance, truth).mean()),
         "nees": float(nees(mean, covariance, truth).mean),
         "spread_skill": float(spread_skill_ratio(mean, variance, truth, members).mean()),

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from benchmarks.kitti.folds import Part
 from benchmarks.kitti.streams import LONGEST, mirror, rows, spans
+from torch_denkf.data.kitti.frames import MOTION_KEYS
 from torch_denkf.modules import SubModel
 
 
@@ -23,7 +24,7 @@ def read_sensor(sensor: SubModel, data: TensorDict, kind: str, mirrored: bool = 
         sensor.eval()
         for index in torch.arange(len(data)).split(chunk):
             frames = rows(data, index, kind)
-            readings.append(sensor(mirror(frames) if mirrored else frames).exclude("flow", "road", "pixels"))
+            readings.append(sensor(mirror(frames) if mirrored else frames).exclude(*MOTION_KEYS, "pixels"))
         sensor.train(was_training)
     return torch.cat(readings)
 

@@ -22,8 +22,8 @@ SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
 
 
 def flow_sensor(statistics: Statistics) -> SubModel:
-    """Optical flow and road correlation."""
-    return FlowSensor(dt=statistics.dt, ensemble_size=SAMPLES)
+    """Optical flow, road correlation, and the turn by tracked corners."""
+    return FlowSensor(dt=statistics.dt, ensemble_size=SAMPLES, two_view_key="two_view")
 
 
 def image_sensor(statistics: Statistics) -> SubModel:

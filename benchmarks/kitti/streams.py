@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Transform
 from benchmarks.common.jobs import side_by_side
 from torch_denkf.data import frames_at, list_kitti_drives, mirror_drive, read_kitti_drive, with_motion
 from torch_denkf.data.cache import cached
+from torch_denkf.data.kitti.frames import MOTION_KEYS
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
@@ -69,7 +70,7 @@ class Stream:
             drive = disturb(drive)
         valid = drive["frame_valid"]
         paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
-        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None)
+        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None, two_view=True)
         small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
         return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
 
@@ -106,7 +107,7 @@ def spans(stream: Stream, sensor: str) -> list[Stream]:
 
 def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
     """Rows of a stream as the sensor reads them, and what it should read: the velocities of all steps of the pair."""
-    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude("flow", "road"), index)
+    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude(*MOTION_KEYS), index)
     lags = torch.arange(LONGEST)
     velocity = stream["state"][(index.unsqueeze(-1) - lags).clamp_min(0)][..., 3:]
     return frames.set("target_observation", (velocity * (lags < frames["steps"]).unsqueeze(-1)).sum(-2))

@@ -3,40 +3,101 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.monitor.drives import ALWAYS, FAULTS, believed_spans, car_filter, failing, filtered
+from benchmarks.monitor.drives import ALWAYS, FAULTS, SIGNS, believed_spans, car_filter, failing, filtered, side_by_side
 from benchmarks.monitor.scores import Run, afterwards, detection, false_alarms
-from torch_denkf.filters import Filter, Gated
 from torch_denkf.metrics import interval_coverage, kitti_endpoint_error
-from torch_denkf.modules import InnovationMonitor, MonitoredSensor
+from torch_denkf.modules import InnovationMonitor, MonitoredSensor, SignGate
 from torch_denkf.odometry.car import VELOCITIES
+from torch_denkf.vision import FLOW_SIGNS, KITTI_DT, PICTURE_SIGNS
 
-__all__ = ["clean_rows", "drive_rows", "gate_of", "monitor_of", "path_scores"]
+__all__ = ["CHOSEN", "CarGuard", "CarGates", "clean_rows", "drive_rows", "gates_of", "monitor_of", "path_scores"]
 
-GATE = {"response": "reject", "window": 3, "rate": 1e-4, "patience": 30, "by_component": True}
-MARGIN = 1.3  # on what the clean drives show: they are few
-OTHER_KIND = 2.0  # that of a gate whose clean drives are of another kind: rendered ones, for real frames
+#: Up to half of a picture may be sun or shadow, and one brighter than the last by two thirds; 1 % may be any smear.
+FLOOR = (0.01, 0.5, 0.5, 0.5, 0.0, 0.0)
+PICTURES = len(PICTURE_SIGNS)
+BLIND = slice(1, PICTURES)  # behind what is static the flow is continued; such a picture is not blind
+MOVING = 2.0  # m/s: slower cars tell nothing of a scale
 
 
-def monitor_of(clean: Sequence[TensorDict]) -> InnovationMonitor:
+@dataclass(frozen=True)
+class CarGuard:
+    """What is chosen on validation drives, see :mod:`benchmarks.monitor.choice`.
+
+    Attributes:
+        rate: share of the clean readings whose speed is taken from the flow, because it contradicts the road.
+        margin: factor on the monitor's limits.
+        reference: of its cumulative sum.
+    """
+
+    rate: float = 0.1
+    margin: float = 2.0
+    reference: float = 2.0
+
+
+CHOSEN = CarGuard()
+
+
+class CarGates(NamedTuple):
+    """What answers to signs.
+
+    Attributes:
+        pictures: takes out readings by what their pictures show.
+        flow: finds readings that the flow contradicts.
+        scale: factor on the distance by the flow, which makes it the sensor's.
+    """
+
+    pictures: SignGate
+    flow: SignGate
+    scale: float
+
+    def seen(self, reading: TensorDict) -> Tensor:
+        """Which readings the pictures leave, ``[N, 1]``."""
+        signs = TensorDict({"signs": reading["signs"][:, BLIND], "observed": reading["observed"]}, [len(reading)])
+        return self.pictures(signs)["observed"]
+
+    def answered(self, reading: TensorDict) -> TensorDict:
+        """The reading without what its pictures speak against.
+
+        Where the flow contradicts the road, the speed is that of the flow.
+        """
+        out, signs = reading.copy().set("observed", self.seen(reading)), reading["signs"]
+        second = ~self.flow(TensorDict({"signs": signs[:, PICTURES:]}, [len(signs)]))["observed"]
+        second = second & ~reading["plane"].isnan()
+        ensemble = reading["sensor", "ensemble"].clone()
+        speed = self.scale * reading["plane"] / KITTI_DT
+        ensemble[..., 0] += torch.where(second, speed - ensemble[..., 0].mean(-1, keepdim=True), 0.0)
+        return out.set("sensor", reading["sensor"].copy().set("ensemble", ensemble))
+
+
+def monitor_of(beliefs: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> InnovationMonitor:
     """A monitor, calibrated on beliefs of clean drives."""
-    sensor = MonitoredSensor("info", 2, ("forecast", "observed"), noise_key=("sensor", "noise"))
-    return InnovationMonitor({"camera": sensor}, window=3, reference=1.5).calibrate(clean, margin=MARGIN)
+    sensor = MonitoredSensor(
+        "info", 2, ("forecast", "observed"), ("sensor", "noise"), sign_key="signs", signs=len(SIGNS), floor=FLOOR
+    )
+    monitor = InnovationMonitor({"camera": sensor}, window=3, reference=guard.reference)
+    return monitor.calibrate(side_by_side(beliefs), margin=guard.margin)
 
 
-def gate_of(model: Filter, clean: Sequence[TensorDict], margin: float = MARGIN) -> Filter:
-    """A gated filter, calibrated on clean drives' beliefs, which have what the gates saw."""
-    gated = Gated(model, 2, **GATE)
-    for gate in gated.gates:
-        gate.calibrate(clean, margin=margin)
-    return gated
+def gates_of(readings: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> CarGates:
+    """Gates, calibrated on clean readings."""
+    signs = [TensorDict({"signs": each["signs"][1:]}, [len(each) - 1]) for each in readings]
+    pictures = SignGate(PICTURES - 1, rate=1e-3, floor=FLOOR[BLIND])
+    pictures.calibrate([TensorDict({"signs": each["signs"][:, BLIND]}, each.batch_size) for each in signs])
+    flow = SignGate(len(FLOW_SIGNS), rate=guard.rate)
+    flow.calibrate([TensorDict({"signs": each["signs"][:, PICTURES:]}, each.batch_size) for each in signs])
+    plane = torch.cat([each["plane"][1:, 0] for each in readings]) / KITTI_DT
+    read = torch.cat([each["sensor", "ensemble"][1:, :, 0].mean(-1) for each in readings])
+    moving = plane > MOVING
+    return CarGates(pictures, flow, float((read[moving] / plane[moving]).median()))
 
 
 def path_scores(beliefs: TensorDict) -> dict[str, float]:
@@ -52,78 +113,73 @@ def path_scores(beliefs: TensorDict) -> dict[str, float]:
 
 
 def drive_rows(
-    task: str, root: Path, drives: Sequence[str], validation: Sequence[TensorDict], cache: Path, draws: int
+    task: str, root: Path, drives: Sequence[str], calibration: Sequence[TensorDict], cache: Path, draws: int
 ) -> list[dict]:
     """A row for each fault, over all drives.
 
     Args:
-        task: ``"kitti-real"``, of whose drives each one's thresholds come from the others, too, because they are
-            another kind of picture than the rendered validation drives; or ``"kitti-rendered"``.
+        task: ``"kitti-real"``, of whose drives each one's gate is calibrated on the others, because real pictures are
+            of another kind than rendered ones, and its monitor on these, too; or ``"kitti-rendered"``.
         root: folder in KITTI's layout.
         drives: names.
-        validation: clean readings of drives that are in no test.
+        calibration: clean readings of drives that are in no test.
         cache: folder of readings.
         draws: of the filter's noise.
     """
     car, model = car_filter()
     unit = car.settings.unit
-    # Beliefs of a gate that does nothing: those of the filter, with what the gate saw.
-    watching = Gated(model, 2, **{**GATE, "rate": 0.0})
-    clean = [failing(root, name, "clean", cache) for name in drives]
-    others = filtered(watching, validation)
-    own = filtered(watching, clean, draws)
-    if task == "kitti-real":
-        known = [[*others, *own[:place], *own[place + 1 :]] for place in range(len(drives))]
-        tools = [(monitor_of(each), gate_of(model, each, OTHER_KIND)) for each in known]
+    clean = [failing(root, name, "clean", cache, repair=True) for name in drives]
+    own, known = filtered(model, clean, draws), filtered(model, calibration)
+    if task == "kitti-real" and len(drives) > 1:
+        rest = [[*range(place), *range(place + 1, len(drives))] for place in range(len(drives))]
+        monitors = [monitor_of([*known, *(own[k] for k in others)]) for others in rest]
+        gates = [gates_of([clean[k] for k in others]) for others in rest]
     else:
-        tools = [(monitor_of(others), gate_of(model, others))] * len(drives)
-    runs = [run for (monitor, _), belief in zip(tools, own, strict=True) for run in runs_of(monitor, belief)]
-    alarms = false_alarms(runs)
-    gated_clean = answered_by(tools, clean, draws)
-    rows = [{"task": task, "fault": "none", **alarms, **compared(own, gated_clean)}]
+        monitors, gates = [monitor_of(known)] * len(drives), [gates_of(calibration)] * len(drives)
+
+    def answered(readings: Sequence[TensorDict]) -> list[TensorDict]:
+        pairs = zip(gates, readings, strict=True)
+        return filtered(model, [each.answered(reading) for each, reading in pairs], draws)
+
+    sound = answered(clean)
+    alarms = false_alarms([run for each, belief in zip(monitors, own, strict=True) for run in runs_of(each, belief)])
+    rows = [{"task": task, "fault": "none", **alarms, **compared(own, sound)}]
     for fault in FAULTS:
-        runs, errors, sound = [], [], []
+        runs, after, before = [], [], []
         readings = [failing(root, name, fault, cache) for name in drives]
-        beliefs, answered = filtered(model, readings, draws), answered_by(tools, readings, draws)
+        beliefs = filtered(model, readings, draws)
+        guarded = answered([failing(root, name, fault, cache, repair=True) for name in drives])
         for place, reading in enumerate(readings):
             hit = reading["fault"].squeeze(-1)
             if hit.any():
-                runs += runs_of(tools[place][0], beliefs[place])
-                errors.append(afterwards(velocity_error(answered[place], unit), hit).flatten())
-                sound.append(afterwards(velocity_error(gated_clean[place], unit), hit).flatten())
-        ratio = float(torch.cat(errors).mean() / torch.cat(sound).mean())
+                runs += runs_of(monitors[place], beliefs[place])
+                after.append(afterwards(velocity_error(guarded[place], unit), hit).flatten())
+                before.append(afterwards(velocity_error(sound[place], unit), hit).flatten())
+        ratio = float(torch.cat(after).mean() / torch.cat(before).mean())
         rows.append({"task": task, "fault": fault, **detection(runs), **alarms, "error_ratio": ratio})
     for fault in ALWAYS if task == "kitti-real" else ("box-all",):
-        readings = [failing(root, name, fault, cache) for name in drives]
-        plain = filtered(model, readings, draws)
-        if fault == "black-all":  # what the monitor does not believe is read again, over a longer span
-            for place, (monitor, _) in enumerate(tools):
+        plain = filtered(model, [failing(root, name, fault, cache) for name in drives], draws)
+        readings = [failing(root, name, fault, cache, repair=True) for name in drives]
+        if fault == "black-all":  # where the signs speak against a reading, it is read over a longer span
+            for place, each in enumerate(gates):
                 longer = [failing(root, drives[place], fault, cache, steps) for steps in (2, 3)]
-                doubt = partial(doubted, model, monitor)
-                readings[place] = believed_spans([readings[place], *longer], doubt)
-        rows.append({"task": task, "fault": fault, **compared(plain, answered_by(tools, readings, draws))})
+                readings[place] = believed_spans([readings[place], *longer], each.seen)
+            guarded = filtered(model, readings, draws)
+        else:
+            guarded = answered(readings)
+        rows.append({"task": task, "fault": fault, **compared(plain, guarded)})
     return rows
 
 
-def answered_by(
-    tools: Sequence[tuple[InnovationMonitor, Filter]], readings: Sequence[TensorDict], draws: int
-) -> list[TensorDict]:
-    """Beliefs of the gated filters, each on its drive."""
-    first = tools[0][1]
-    if all(gate is first for _, gate in tools):
-        return filtered(first, readings, draws)
-    return [filtered(gate, [each], draws)[0] for (_, gate), each in zip(tools, readings, strict=True)]
-
-
 def clean_rows(
-    task: str, root: Path, drives: Sequence[str], validation: Sequence[TensorDict], cache: Path, draws: int
+    task: str, root: Path, drives: Sequence[str], calibration: Sequence[TensorDict], cache: Path, draws: int
 ) -> list[dict]:
-    """Path scores of drives without faults, one row; thresholds from the validation drives alone."""
+    """Path scores of rendered drives without faults, one row."""
     _, model = car_filter()
-    gate = gate_of(model, filtered(Gated(model, 2, **{**GATE, "rate": 0.0}), validation))
-    readings = [failing(root, name, "clean", cache) for name in drives]
-    scores = compared(filtered(model, readings, draws), filtered(gate, readings, draws))
-    return [{"task": task, "fault": "none", **scores}]
+    gates = gates_of(calibration)
+    readings = [failing(root, name, "clean", cache, repair=True) for name in drives]
+    guarded = filtered(model, [gates.answered(each) for each in readings], draws)
+    return [{"task": task, "fault": "none", **compared(filtered(model, readings, draws), guarded)}]
 
 
 def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[str, float]:
@@ -136,7 +192,7 @@ def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[s
 
 
 def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
-    """What a monitor says of beliefs ``[K, N]``."""
+    """What the monitor says of beliefs ``[K, N]``."""
     said = monitor.replay(beliefs)["monitor"]
     parts = (said["camera", "evidence"], said["alarm"], beliefs["fault"])
     return [Run(*row) for row in zip(*(part.squeeze(-1) for part in parts), strict=True)]
@@ -145,10 +201,3 @@ def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
 def velocity_error(beliefs: TensorDict, unit: Tensor) -> Tensor:
     """Error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
     return ((beliefs["belief", "mean"] - beliefs["state"])[..., VELOCITIES].abs() / unit).mean(-1)
-
-
-@torch.no_grad()
-def doubted(model: Filter, monitor: InnovationMonitor, reading: TensorDict) -> Tensor:
-    """Whether the sensor claims more noise of a reading than it ever does on clean data, ``[N]``."""
-    noise = model["noise"](reading.copy())["sensor", "noise"]
-    return (monitor.claim_score("camera", noise) > monitor.claim_limit[0]).squeeze(-1)

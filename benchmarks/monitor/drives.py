@@ -21,10 +21,22 @@ from torch_denkf.odometry.scores import first_state
 from torch_denkf.odometry.streams import read_sensor, take_spans
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.transforms import BlackFrames, Brightness, OccludingBox
+from torch_denkf.vision import FLOW_SIGNS, KITTI_DT, PICTURE_SIGNS, flow_signs, picture_signs, plane_distance
 
-__all__ = ["ALWAYS", "FAULTS", "believed_spans", "car_filter", "failing", "filtered", "stretches"]
+__all__ = [
+    "ALWAYS",
+    "FAULTS",
+    "SIGNS",
+    "believed_spans",
+    "car_filter",
+    "failing",
+    "filtered",
+    "side_by_side",
+    "stretches",
+]
 
 LENGTH, PERIOD = 20, 60  # frames that a fault lasts, and between the beginnings of two
+SIGNS = (*PICTURE_SIGNS, *FLOW_SIGNS)
 _IMAGE = {"in_keys": ("image",)}
 #: What happens to the pictures of a stretch.
 FAULTS: dict[str, Callable] = {
@@ -45,9 +57,11 @@ def stretches(frames: int) -> Tensor:
     return (number % PERIOD >= PERIOD - LENGTH) & (number < frames // PERIOD * PERIOD)
 
 
-def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1) -> TensorDict:
-    """What the trained sensor reads of a whole drive ``[N]``; ``"fault"`` ``[N, 1]`` says which pairs of pictures are
-    of the fault.
+def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, repair: bool = False) -> TensorDict:
+    """What the trained sensor reads of a whole drive ``[N]``.
+
+    ``"fault"`` ``[N, 1]`` says which pairs of pictures are of the fault; ``"signs"`` ``[N, 6]`` are those of ``SIGNS``.
+    The last two, of the flow, are NaN where a plain reading is of the fault, and of pairs of more than one step.
 
     Args:
         root: folder in KITTI's layout.
@@ -55,14 +69,40 @@ def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1) -> T
         fault: ``"clean"``, or of ``FAULTS`` or ``ALWAYS``.
         cache: folder in which readings are kept.
         steps: between the two pictures of a pair.
+        repair: whether flow is continued over what stands still before the camera.
     """
     entry = f"{name}-{fault}" if steps == 1 else f"{name}-{fault}-{steps}"
-    return cached(cache / entry, lambda: _read(root, name, fault, steps))
+    # What a fault does not touch is that of the clean drive, and what is not repaired that of the plain reading.
+    clean = failing(root, name, "clean", cache) if fault != "clean" and steps == 1 else None
+    plain = cached(cache / entry, lambda: _read(root, name, fault, steps, clean, cache)).copy()
+    shown = cached(cache / f"{entry}-signs", lambda: _picture_signs(root, name, fault, steps))["signs"]
+    if steps > 1:
+        seen = torch.full((len(plain), 2), torch.nan)
+    elif clean is None:
+        seen = cached(cache / f"{entry}-plane", lambda: _by_flow(root, name, fault, None, cache))["by_flow"]
+    else:
+        seen = torch.where(plain["fault"], torch.nan, clean["by_flow"])
+    plain = _with_signs(plain, shown, seen)
+    if not repair or not shown[:, SIGNS.index("static")].any():
+        return plain
+    out = cached(cache / f"{entry}-repaired", lambda: _read(root, name, fault, steps, plain, cache, repair=True)).copy()
+    if steps == 1:
+        made = cached(cache / f"{entry}-repaired-plane", lambda: _by_flow(root, name, fault, plain, cache))["by_flow"]
+        seen = torch.where(made.isnan(), seen, made)
+    return _with_signs(out, shown, seen)
 
 
-def _read(root: Path, name: str, fault: str, steps: int) -> TensorDict:
-    car = from_pretrained("car-odometry")
-    drive = read_kitti_drive(root, name, size=car.settings.size, colour=False, cache=None).copy()
+def _with_signs(reading: TensorDict, shown: Tensor, seen: Tensor) -> TensorDict:
+    """The reading with all signs, with what the flow says ``[N, 2]``."""
+    distance = reading["sensor", "ensemble"][..., 0].mean(-1) * KITTI_DT
+    of_flow = flow_signs(seen[:, 0], seen[:, 1].reshape(-1, 1, 1), distance)
+    return reading.update({"signs": torch.cat([shown, of_flow], -1), "by_flow": seen, "plane": seen[:, :1]})
+
+
+def _drive(root: Path, name: str, fault: str, steps: int) -> TensorDict:
+    """The drive with its fault: ``"steps"`` ``[N, 1]`` of a pair, and ``"fault"`` ``[N, 1]``, whether it is in it."""
+    size = from_pretrained("car-odometry").settings.size
+    drive = read_kitti_drive(root, name, size=size, colour=False, cache=None).copy()
     image, hit = drive["image"].clone(), torch.zeros(len(drive), dtype=torch.bool)
     generator = torch.Generator().manual_seed(zlib.crc32(f"{name} {fault}".encode()))
     if fault in FAULTS:
@@ -76,17 +116,56 @@ def _read(root: Path, name: str, fault: str, steps: int) -> TensorDict:
     drive["image"] = image
     valid = drive["frame_valid"]
     drive["steps"] = steps * (valid & torch.cat([torch.zeros_like(valid[:steps]), valid[:-steps]])).long()
-    out = read_sensor(car.sensor, with_motion(drive, cache=None, keep_images=False), car.settings.longest)
     pair = hit | torch.cat([torch.zeros(steps, dtype=torch.bool), hit[:-steps]])
-    return out.set("fault", pair.unsqueeze(-1))
+    return drive.set("fault", pair.unsqueeze(-1))
 
 
-def believed_spans(spans: Sequence[TensorDict], doubt: Callable[[TensorDict], Tensor]) -> TensorDict:
-    """Of pairs of 1, 2, ... steps the shortest that is not doubted; none where all are: readings ``[N]``.
+def _picture_signs(root: Path, name: str, fault: str, steps: int) -> TensorDict:
+    """Signs of a failing camera ``[N, 4]``."""
+    drive = _drive(root, name, fault, steps)
+    images, out = drive["image"][:, 0].numpy(), torch.zeros(len(drive), len(PICTURE_SIGNS))
+    for row in drive["steps"].squeeze(-1).nonzero().flatten().tolist():
+        out[row] = torch.from_numpy(picture_signs(images[row - steps], images[row]))
+    return TensorDict({"signs": out}, [len(drive)])
+
+
+def _by_flow(root: Path, name: str, fault: str, known: TensorDict | None, cache: Path) -> TensorDict:
+    """Distance by the flow, and the road's correlation, ``[N, 2]``, of what is repaired if more is known."""
+    motion = _motion(root, name, fault, 1, known, cache, repair=known is not None)
+    values = torch.stack([plane_distance(motion["flow"].float()), motion["road"].float().amax((1, 2))], -1)
+    return TensorDict({"by_flow": torch.where(motion["steps"] > 0, values, torch.nan)}, [len(motion)])
+
+
+def _motion(
+    root: Path, name: str, fault: str, steps: int, known: TensorDict | None, cache: Path, *, repair: bool
+) -> TensorDict:
+    """Flow and road of the pairs that are not known."""
+    drive = _drive(root, name, fault, steps)
+    if known is not None:
+        static = known["signs"][:, [SIGNS.index("static")]] > 0
+        drive["steps"] = drive["steps"] * (static if repair else drive["fault"])
+    kept = cache / "flow" if repair or fault == "clean" else None  # which the signs read, too
+    return with_motion(drive, cache=kept, keep_images=False, repair=repair)
+
+
+def _read(
+    root: Path, name: str, fault: str, steps: int, known: TensorDict | None, cache: Path, *, repair: bool = False
+) -> TensorDict:
+    """What the sensor reads, of a drive of which some may be known ``[N]``."""
+    car, motion = from_pretrained("car-odometry"), _motion(root, name, fault, steps, known, cache, repair=repair)
+    out = read_sensor(car.sensor, motion, car.settings.longest).set("fault", motion["fault"])
+    if known is None:
+        return out
+    old = known.select(*out.keys(True, True)).set("fault", out["fault"])
+    return torch.where(motion["steps"].squeeze(-1) > 0, out, old)
+
+
+def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Tensor]) -> TensorDict:
+    """Of pairs of 1, 2, ... steps the shortest that is seen; none where none is: readings ``[N]``.
 
     Args:
         spans: what the sensor reads of them, ``[N]`` each.
-        doubt: of readings, ``[N]``: whether to take another pair.
+        seen: of readings, ``[N, 1]``: whether they are to be believed.
     """
     values = {
         name: torch.stack([each[key] for each in spans], 1)
@@ -98,7 +177,7 @@ def believed_spans(spans: Sequence[TensorDict], doubt: Callable[[TensorDict], Te
     }
     size = torch.Size([len(spans[0]), len(spans)])
     readings = TensorDict({"state": spans[0]["state"], "spans": TensorDict(values, size)}, size[:1])
-    good = torch.stack([each["observed"].squeeze(-1) & ~doubt(each) for each in spans], -1)
+    good = torch.stack([seen(each).squeeze(-1) for each in spans], -1)
     steps = torch.where(good.any(-1), good.float().argmax(-1) + 1, 0)
     return take_spans(readings, steps)
 
@@ -123,6 +202,17 @@ def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed
         beliefs = model.sequence(batch).unflatten(0, (len(places), draws))
         out.update(zip(places, beliefs, strict=True))
     return [out[place] for place in range(len(readings))]
+
+
+def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
+    """Beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
+    groups: dict[int, list[TensorDict]] = defaultdict(list)
+    for each in beliefs:
+        groups[each.shape[1]].append(each)
+    shared = [set.intersection(*(set(each.keys(True, True)) for each in group)) for group in groups.values()]
+    return [
+        torch.cat([each.select(*keys) for each in group]) for group, keys in zip(groups.values(), shared, strict=True)
+    ]
 
 
 def car_filter() -> tuple[CarFilter, Filter]:

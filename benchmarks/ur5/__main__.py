@@ -9,10 +9,14 @@ from pathlib import Path
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
+from benchmarks.ur5.frontier import draw
 from benchmarks.ur5.gallery import draw_all
+from benchmarks.ur5.limits import run
 from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget
+
+AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run}  # of a table's folder
 
 
 def smoke(study: Study) -> Study:
@@ -28,8 +32,8 @@ def smoke(study: Study) -> Study:
 def main() -> None:
     """Runs a command."""
     study, begun = parse(Study), time.time()
-    if study.command == "pictures" and not study.smoke:
-        print(*draw_all(study.out), sep="\n")
+    if study.command in AFTERWARDS and not study.smoke:
+        print(*AFTERWARDS[study.command](study), sep="\n")
         return
     study = smoke(study) if study.smoke else study
     try:
@@ -46,7 +50,8 @@ def main() -> None:
     header = f"`{command('ur5')}`: {(time.time() - begun) / 60:.0f} min"
     report(study.out, COLUMNS, rows, markdown(rows, header))
     if study.smoke:
-        print(*draw_all(study.out))
+        for after in AFTERWARDS.values():
+            print(*after(study))
 
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.common.scores import cost
+from benchmarks.common.scores import cost, processor_ms
 from benchmarks.common.training import read_filter
 from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all, with_missing
+from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all, with_hint, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import WRIST, Preset
 from benchmarks.ur5.tables import BLACKOUT
@@ -63,11 +63,12 @@ def conditions_of(clean: TensorDict, salted: TensorDict) -> dict[str, TensorDict
 
 
 def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) -> list[dict]:
-    """The sensor alone. The right one of the two J6 is granted to it; where it sees nothing, its last reading stays."""
+    """The sensor alone; where it sees nothing, its last reading stays."""
     rows = []
     for condition, reading in readings.items():
         truth, samples = reading["state"], reading["sensor", "ensemble"]
-        near = truth[..., WRIST]
+        near = preset.side_of(samples.mean(-2))
+        near = near + 2 * torch.pi * ((truth[..., WRIST] - near) / (2 * torch.pi)).round()  # whole turns do not count
         read = preset.state_of(samples.mean(-2), near)
         members = preset.state_of(samples, near.unsqueeze(-1).expand(samples.shape[:-1]))
         seen = reading["observed"][:, 1:]
@@ -105,11 +106,20 @@ def costs(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> dict[str, f
 
 
 def size_rows(
-    make, sensor: ImageSensor, codes: TensorDict, sizes: Sequence[int], saved: dict, names: dict, validation: TensorDict
+    make,
+    sensor: ImageSensor,
+    codes: TensorDict,
+    sizes: Sequence[int],
+    saved: dict,
+    names: dict,
+    validation: TensorDict,
+    *,
+    chunk: int | None = None,
 ) -> list[dict]:
-    """A trained ensemble filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
+    """A trained filter with other numbers of members, on clean demos; ``make(size)`` is its recipe.
 
-    Rows also have the CRPS on ``validation``, features of other demos, by which a size may be chosen.
+    Rows also have the CRPS on ``validation``, features of other demos, by which a size may be chosen. With ``chunk``
+    ``ms_per_step`` is processor time of compiled chunks of so many steps, and ``eager_ms_per_step`` of eager steps.
     """
     rows = []
     for size in sizes:
@@ -123,8 +133,19 @@ def size_rows(
         out = torch.cat(parts)
         row = {**names, "condition": "clean", "ensemble_size": size, "demos": len(out)}
         crps = validation_crps(recipe, model, read_all(sensor, validation, size))
-        rows.append({**row, **scores(out), **costs(recipe, model, first), "validation_crps": crps})
+        times = costs(recipe, model, first) if chunk is None else processor_times(recipe, model, first, chunk)
+        rows.append({**row, **scores(out), **times, "validation_crps": crps})
     return rows
+
+
+def processor_times(recipe: UR5Recipe, model: Filter, readings: TensorDict, chunk: int) -> dict[str, float]:
+    """Milliseconds of the processor a step of one demo, eager and compiled in chunks; 0 compiles nothing."""
+    row, behind, times = readings[:1, :TIMED], recipe.behind(model), {}
+    row = with_hint(row, row["state"][:, 0])
+    for column, steps in (("eager_ms_per_step", 0), ("ms_per_step", chunk)):
+        behind.compile(chunk=steps)
+        times[column] = processor_ms(lambda: behind.sequence(row.copy()), row.shape[1])
+    return times
 
 
 def validation_crps(recipe: UR5Recipe, model: Filter, readings: TensorDict) -> float:

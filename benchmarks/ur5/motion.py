@@ -1,12 +1,13 @@
-"""The motion that all filters learn: rates that last, and a place that follows from the joints. Nothing of it is known.
+"""The motion that all filters learn: accelerations that last, and a place that follows from the joints.
 
-The filters' state is the table's ten numbers and the change of each joint in the last step, [J1..J7, x, y, z, c1..c7].
-Both the joints' accelerations and the arm's kinematics are networks; they are trained on states of the training demos
-before any filter is, and further with each filter.
+Nothing of it is known. The filters' state is the table's ten numbers, each joint's change in the last step, and the
+change of that: [J1..J7, x, y, z, c1..c7, a1..a7]. What changes the accelerations and the arm's kinematics are networks;
+they are trained on states of the training demos before any filter is, and further with each filter.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -17,33 +18,39 @@ from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
 from torch_denkf.training import Stage, train_part
 
-SIZE = STATE + JOINTS  # of the filters' state
+SIZE = STATE + 2 * JOINTS  # of the filters' state
+AHEAD = 4  # steps that the motion is trained on: what errs little in one step may err much in ten
 FADING = 0.95  # of a bias in a step, before training
-RATES = list(range(STATE, SIZE))
+RATES = list(range(STATE, STATE + JOINTS))
+ACCELERATIONS = list(range(STATE + JOINTS, SIZE))
 ERRORS = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((3,), PLACE_UNIT)])  # units of a filter's loss
-NOISY = [*range(JOINTS, SIZE)]  # place and rates; the joints follow from their rates
+NOISY = [*range(JOINTS, STATE), *ACCELERATIONS]  # and the place; joints and rates follow from the accelerations
 
 
 def with_rates(states: Tensor) -> Tensor:
-    """The filters' states ``[*B, T, 17]`` of sequences ``[*B, T, 10]``; an episode begins at rest."""
-    joints = states[..., :JOINTS]
-    rates = torch.cat([torch.zeros_like(joints[..., :1, :]), joints.diff(dim=-2)], -2)
-    return torch.cat([states, rates], -1)
+    """The filters' states ``[*B, T, 24]`` of sequences ``[*B, T, 10]``; an episode begins at rest."""
+    rates = _changes(states[..., :JOINTS])
+    return torch.cat([states, rates, _changes(rates)], -1)
+
+
+def _changes(values: Tensor) -> Tensor:
+    """Differences along time, of the same shape; the first is zero."""
+    return torch.cat([torch.zeros_like(values[..., :1, :]), values.diff(dim=-2)], -2)
 
 
 class ArmMotion(nn.Module):
     r"""One step of the arm.
 
-    .. math:: c_t = d \circ c_{t-1} + a(q, c, u), \quad q_t = q_{t-1} + c_t, \quad
+    .. math:: a_t = e \circ a_{t-1} + j(q, c, a), \quad c_t = d \circ c_{t-1} + a_t, \quad q_t = q_{t-1} + c_t, \quad
               p_t = k(q_t) + \lambda \circ (p_{t-1} - k(q_{t-1}))
 
-    with the damping d, the acceleration a and the kinematics k learned. The place p keeps a share of what it differs
-    from the kinematics. Members whose place follows from their joints carry the correlation of both: what the sensor
-    says of the place corrects the joints, and the other way round.
+    with the dampings d and e, the jerk j and the kinematics k learned. The place p keeps a share of what it differs
+    from the kinematics. Members whose place follows from their joints carry the correlation of both: what the
+    sensor says of the place corrects the joints, and the other way round.
 
     Args:
         facts: statistics of the training demos.
-        actions: whether the joints' targets of the last step are read: features 17 to 23 of the input.
+        actions: whether the joints' targets of the last step are read: features 24 to 30 of the input.
     """
 
     size, read, fading = SIZE, STATE, FADING
@@ -56,14 +63,16 @@ class ArmMotion(nn.Module):
             "scale": facts.scale[:JOINTS],
             "rate": facts.rate,
             "acceleration": facts.acceleration,
+            "jerk": facts.jerk,
             "place_loc": facts.loc[JOINTS:],
             "place_scale": facts.scale[JOINTS:],
         }.items():
             self.register_buffer(name, value.clone())
-        self.damping = nn.Parameter(torch.full((JOINTS,), 4.0))  # of it the sigmoid
+        self.damping = nn.Parameter(torch.full((JOINTS,), 6.0))  # d, of it the sigmoid
+        self.lasting = nn.Parameter(torch.full((JOINTS,), 2.0))  # e, likewise
         self.keep = nn.Parameter(torch.zeros(3))  # likewise
         self.accelerate = nn.Sequential(
-            nn.Linear(2 * JOINTS + JOINTS * actions, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, JOINTS)
+            nn.Linear((3 + actions) * JOINTS, 48), nn.Tanh(), nn.Linear(48, 48), nn.Tanh(), nn.Linear(48, JOINTS)
         )
         self.pull = nn.Parameter(torch.full((JOINTS,), 0.5)) if actions else None  # share of the way to the target
         nn.init.zeros_(self.accelerate[-1].weight)
@@ -77,73 +86,104 @@ class ArmMotion(nn.Module):
         return self.place_loc + self.place_scale * self.kinematics(features)
 
     def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 17]`` of states ``[*, 17]``, or of states and actions ``[*, 24]``."""
-        joints, place, rates = features[..., :SIZE].split((JOINTS, 3, JOINTS), -1)
-        parts = [(joints - self.loc) / self.scale, rates / self.rate]
-        wanted = self.damping.sigmoid() * rates
+        """States ``[*, 24]`` of states ``[*, 24]``, or of states and actions ``[*, 31]``."""
+        joints, place, rates, accelerations = features[..., :SIZE].split((JOINTS, 3, JOINTS, JOINTS), -1)
+        parts = [(joints - self.loc) / self.scale, rates / self.rate, accelerations / self.acceleration]
+        wanted = self.damping.sigmoid() * rates + self.lasting.sigmoid() * accelerations
         if self.actions:
             way = features[..., SIZE:] - joints
             # The fingers are often told to shut on an object: a way that they do not go.
             parts.append((way / (3 * self.rate)).tanh())
             wanted = wanted + self.pull * (way.clamp(-1, 1) - wanted) * (way.abs() < 5 * self.rate)
-        rates = wanted + self.acceleration * self.accelerate(torch.cat(parts, -1))
-        moved = joints + rates
+        faster = wanted + self.jerk * self.accelerate(torch.cat(parts, -1))
+        moved = joints + faster
         place = self.place(moved) + self.keep.sigmoid() * (place - self.place(joints))
-        return torch.cat([moved, place, rates], -1)
+        return torch.cat([moved, place, faster, faster - rates], -1)
 
 
 class BiasedReading(nn.Module):
     """h: the table's ten numbers, and the sensor's errors of them where the state holds those."""
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 10]`` of states ``[*, 17]`` or ``[*, 27]``."""
+        """Readings ``[*, 10]`` of states ``[*, 24]`` or ``[*, 34]``."""
         read = state[..., :STATE]
         return read if state.shape[-1] == SIZE else read + state[..., SIZE:]
 
 
 class MotionLoss(nn.Module):
-    """Absolute errors of one step from true states, and of the kinematics."""
+    """Absolute errors of some steps from true states, the k-th counting 1 / k; and of the kinematics."""
 
     def __init__(self, motion: ArmMotion):
         super().__init__()
         self.motion = motion
 
     def forward(self, rows: TensorDict) -> dict[str, Tensor]:
-        """Scores pairs of rows ``[N]``."""
-        before, after = rows["before"], rows["after"]
-        moved = self.motion(torch.cat([before, rows["action"]], -1) if self.motion.actions else before)
-        rates = (moved - after)[..., STATE:] / self.motion.acceleration
-        # From random places around the demos', too: members are wrong.
-        place = self.motion.place(after[..., :JOINTS]) - after[..., JOINTS:STATE]
-        return {"loss_rates": rates.abs().mean(), "loss_place": place.abs().mean() / PLACE_UNIT}
+        """Scores paths ``[N]`` of some rows each."""
+        path, actions, errors = rows["path"], rows["action"], []
+        moved = path[:, 0]
+        for step, truth in enumerate(path.unbind(1)[1:], start=1):
+            moved = self.motion(torch.cat([moved, actions[:, step - 1]], -1) if self.motion.actions else moved)
+            rates = (moved - truth)[..., RATES] / self.motion.acceleration
+            errors.append(rates.abs().mean() / step)
+        place = self.motion.place(path[:, 1, :JOINTS]) - path[:, 1, JOINTS:STATE]
+        return {"loss_rates": torch.stack(errors).sum(), "loss_place": place.abs().mean() / PLACE_UNIT}
+
+
+@torch.no_grad()
+def open_loop(
+    motion: ArmMotion, states: Tensor, actions: Tensor, ahead: Sequence[int] = (1, 5, 10)
+) -> dict[str, float]:
+    """Mean absolute errors of the joints, degrees, so many steps after true states, without any reading.
+
+    Args:
+        motion: to be tested.
+        states: sequences ``[N, T, 10]``.
+        actions: ``[N, T, 7]``.
+        ahead: numbers of steps, rising.
+    """
+    full, last = with_rates(states), states.shape[-2] - max(ahead)
+    moved, errors = full[:, :last], {}
+    for step in range(max(ahead)):
+        moved = motion(torch.cat([moved, actions[:, step : step + last]], -1) if motion.actions else moved)
+        if step + 1 in ahead:
+            error = (moved - full[:, step + 1 : step + 1 + last])[..., :JOINTS].abs().mean()
+            errors[f"after_{step + 1}_deg"] = float(error.rad2deg())
+    return errors
 
 
 def train_motion(
     motion: ArmMotion, states: Tensor, actions: Tensor, *, out: Path, seed: int, updates: int
 ) -> ArmMotion:
     """Trains the motion on true sequences ``[N, T, 10]`` and actions ``[N, T, 7]``, or reads it where that was done."""
-    full = with_rates(states)
+    full, ahead = with_rates(states), min(AHEAD, states.shape[1] - 1)
+    starts = full.shape[1] - ahead  # of a demo
+    steps = torch.arange(ahead + 1)
 
-    def pairs(index: Tensor) -> TensorDict:
-        demo, step = index // (full.shape[1] - 1), index % (full.shape[1] - 1)
-        rows = {"before": full[demo, step], "after": full[demo, step + 1], "action": actions[demo, step]}
-        return TensorDict(rows, batch_size=index.shape)
+    def paths(index: Tensor) -> TensorDict:
+        demo, step = (index // starts).unsqueeze(-1), (index % starts).unsqueeze(-1) + steps
+        return TensorDict({"path": full[demo, step], "action": actions[demo, step]}, batch_size=index.shape)
 
-    count = full.shape[0] * (full.shape[1] - 1)
-    held = int(0.95 * full.shape[0]) * (full.shape[1] - 1)  # whole demos
+    count = full.shape[0] * starts
+    held = int(0.95 * full.shape[0]) * starts  # whole demos
 
     def sample(generator: torch.Generator, length: int | None) -> TensorDict:
-        return pairs(torch.randint(max(held, 1), (512,), generator=generator))
+        return paths(torch.randint(max(held, 1), (512,), generator=generator))
+
+    unseen = slice(held // starts, held // starts + 60)
+
+    def far() -> dict[str, float]:
+        return open_loop(motion, states[unseen], actions[unseen]) if states.shape[1] > 20 and held < count else {}
 
     loss = MotionLoss(motion)
     checked = (
-        pairs(torch.arange(held, count)[:: max((count - held) // 4000, 1)]) if held < count else pairs(torch.arange(1))
+        paths(torch.arange(held, count)[:: max((count - held) // 4000, 1)]) if held < count else paths(torch.arange(1))
     )
     return train_part(
         motion,
         Stage("motion", loss, sample, updates, lr=5e-3),
         out=out,
-        validate=lambda: {"error": float(sum(loss(checked).values()))},
+        validate=lambda: {"error": float(sum(loss(checked).values())), **far()},
+        monitor="error",
         validate_every=max(updates // 4, 1),
         save_every=max(updates // 2, 1),
         seed=seed,

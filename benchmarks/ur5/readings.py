@@ -35,7 +35,7 @@ def read_codes(
     ``code``         [N,T,F]       of the sensor's trunk
     ``observed``     [N,T,1]       False where the frame is black
     ``state``        [N,T,10]      the truth
-    ``motion``       [N,T,17]      with rates, see :func:`with_rates`
+    ``motion``       [N,T,24]      with rates and accelerations, see :func:`with_rates`
     ``action``       [N,T,7]
     ================ ============= ====================================================================================
     """
@@ -123,7 +123,7 @@ class Windows:
     Args:
         codes: of demos ``[N, T]``, clean; and the same or others otherwise disturbed.
         length: of the windows.
-        start_std: how wrong they begin, ``[17]``.
+        start_std: how wrong they begin, ``[24]``.
     """
 
     def __init__(self, codes: Sequence[TensorDict], length: int, start_std: Tensor):

@@ -21,30 +21,46 @@ from torch_denkf.transforms import Brightness, SaltAndPepper
 SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
 WRIST = 5  # J6, which turns the gripper
+UNDECIDED = 0.3  # length of (cos, sin) of J6 below which a reading leaves to the forecast which half turn it is
 NEAR = ("sensor", "near")  # readings as states, see NearForecast
 # What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.
 JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
 
 
 class TurnedWrist(nn.Module):
-    """What the better sensor reads: J6 by twice its angle, for a gripper looks the same after half a turn.
+    """What the better sensor reads: J6 by twice its angle, and by the angle itself.
 
-    A network that must name J6 itself hedges between two answers. Half of (cos, sin) of 2 J6 has one answer, and turns
-    by one radian a radian. Which of the two it is the belief knows from where the arm was.
+    The fingers look the same after half a turn: a network that must name J6 itself hedges between two answers until it
+    sees the label on one side of the hand. Half of (cos, sin) of 2 J6 has one answer, and turns by one radian a radian.
+    Which of the two J6 it is say (cos, sin) of J6: short where the picture leaves that open.
     """
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 11]`` of states ``[*, 10 or more]``: J1..J5, cos and sin, the opening, x, y, z."""
-        twice = 2 * state[..., WRIST : WRIST + 1]
-        parts = [state[..., :WRIST], 0.5 * twice.cos(), 0.5 * twice.sin(), state[..., WRIST + 1 : STATE]]
-        return torch.cat(parts, -1)
+        """Readings ``[*, 13]`` of states ``[*, 10 or more]``: J1..J5, cos and sin twice, the opening, x, y, z."""
+        once = state[..., WRIST : WRIST + 1]
+        wrist = [0.5 * (2 * once).cos(), 0.5 * (2 * once).sin(), once.cos(), once.sin()]
+        return torch.cat([state[..., :WRIST], *wrist, state[..., WRIST + 1 : STATE]], -1)
+
+
+def side_of(reading: Tensor, near: Tensor | None = None) -> Tensor:
+    """About where J6 is, ``[*]`` rad, to a quarter turn: what readings ``[*, 13]`` say.
+
+    Args:
+        reading: the mean of a sensor's samples.
+        near: where J6 is thought to be ``[*]``: decides where the picture does not; ``None`` for the picture alone.
+    """
+    cos, sin = reading[..., WRIST + 2], reading[..., WRIST + 3]
+    if near is None:
+        return torch.atan2(sin, cos)
+    cos, sin = cos + UNDECIDED * near.cos(), sin + UNDECIDED * near.sin()
+    return near + torch.atan2(sin * near.cos() - cos * near.sin(), cos * near.cos() + sin * near.sin())
 
 
 def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
-    """States ``[*, 10]`` of readings ``[*, 11]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
+    """States ``[*, 10]`` of readings ``[*, 13]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
     angle = torch.atan2(reading[..., WRIST + 1], reading[..., WRIST]) / 2
     angle = angle + torch.pi * ((near - angle) / torch.pi).round()
-    return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 2 :]], -1)
+    return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)
 
 
 @dataclass
@@ -55,6 +71,7 @@ class Statistics:
     scale: Tensor
     rate: Tensor  # root mean square of a joint's change in a step, [7] rad
     acceleration: Tensor  # of the change's change
+    jerk: Tensor  # of that one's change
     pixel_loc: Tensor
     pixel_scale: Tensor
     size: int
@@ -62,17 +79,22 @@ class Statistics:
     @classmethod
     def of(cls, states: Tensor, pool: FramePool) -> Statistics:
         """Of sequences ``[N, T, 10]`` and of pictures."""
-        flat, rate = states.flatten(0, -2), states[..., :7].diff(dim=-2)
+        flat = states.flatten(0, -2)
+        changes = (states[..., :7].diff(dim=-2, n=order) for order in (1, 2, 3))
         pixels = pool.pixels[:: max(len(pool) // 500, 1)].float() / 255
         return cls(
             flat.mean(0),
             flat.std(0),
-            rate.square().mean((0, 1)).sqrt(),
-            rate.diff(dim=-2).square().mean((0, 1)).sqrt(),
+            *(change.square().mean((0, 1)).sqrt() for change in changes),
             pixels.mean((0, 2, 3)),
             pixels.std((0, 2, 3)),
             pixels.shape[-1],
         )
+
+
+def _near(reading: Tensor, near: Tensor | None = None) -> Tensor:
+    """Of a sensor that reads J6 itself."""
+    return reading[..., WRIST] if near is None else near
 
 
 @dataclass(frozen=True)
@@ -84,6 +106,7 @@ class Preset:
     observe: Callable[[Tensor], Tensor]
     dim: int
     state_of: Callable[[Tensor, Tensor], Tensor]  # of a reading, and of a J6 that is near
+    side_of: Callable[..., Tensor] = _near  # which J6 is near, of a reading and of a J6 that is thought to be
     coarse: str | None = None  # a preset that is trained first, and whose trunk becomes this one's coarse part
 
 
@@ -95,9 +118,9 @@ def unit_of(dim: int) -> Tensor:
 def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of what :class:`TurnedWrist` reads."""
     loc, scale = facts.loc, facts.scale
-    middle = torch.tensor([0.0, 0.0]), torch.tensor([0.35, 0.35])
+    middle = torch.zeros(4), torch.tensor([0.35, 0.35, 0.7, 0.7])
     return tuple(
-        torch.cat([part[:WRIST], two, part[WRIST + 1 :]]) for part, two in zip((loc, scale), middle, strict=True)
+        torch.cat([part[:WRIST], four, part[WRIST + 1 :]]) for part, four in zip((loc, scale), middle, strict=True)
     )
 
 
@@ -134,8 +157,8 @@ def _sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scal
 
 
 _PRESETS = (
-    Preset("keypoints", keypoint_sensor, TurnedWrist(), 11, wrist_of),
-    Preset("glimpse", glimpse_sensor, TurnedWrist(), 11, wrist_of, coarse="keypoints"),
+    Preset("keypoints", keypoint_sensor, TurnedWrist(), 13, wrist_of, side_of),
+    Preset("glimpse", glimpse_sensor, TurnedWrist(), 13, wrist_of, side_of, coarse="keypoints"),
     Preset("paper", paper_sensor, lambda state: state[..., :STATE], STATE, lambda reading, near: reading),
 )
 SENSORS = {preset.name: preset for preset in _PRESETS}
@@ -151,11 +174,12 @@ def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, count: int 
 
 
 class NearForecast(SubModel):
-    """The sensor's samples as states; of the J6 half a turn apart those next to the forecast's mean.
+    """The sensor's samples as states; of the J6 half a turn apart those on the side that the picture shows.
 
-    What a turned gripper looks like says which two angles are possible, and the forecast which of them it is. All
-    members take the same, so that an ensemble does not split. (Members that compare cosines each for itself do split:
-    those a little more than a quarter of a turn off are drawn to the other side, and the mean lies between.)
+    What a turned gripper looks like says which two angles are possible. Which of them it is says the mean of the
+    samples, see :func:`side_of`, and where that is undecided the forecast's mean. All members take the same, so
+    that an ensemble does not split. (Members that compare cosines each for itself do split: those a little more
+    than a quarter of a turn off are drawn to the other side, and the mean lies between.)
 
     Args:
         preset: whose ``state_of`` turns readings into states.
@@ -177,7 +201,7 @@ class NearForecast(SubModel):
         angle = forecast[..., WRIST]
         if angle.ndim > len(batch_size):
             angle = angle.mean(-1) if log_weights is None else (log_weights.exp() * angle).sum(-1)
-        near = angle.detach().unsqueeze(-1).expand(samples.shape[:-1])
+        near = self.preset.side_of(samples.mean(-2), angle).detach().unsqueeze(-1).expand(samples.shape[:-1])
         states = self.preset.state_of(samples, near)
         if self.factor != 1.0:
             states = torch.lerp(states.mean(-2, keepdim=True), states, self.factor)

@@ -38,10 +38,11 @@ class Study(Collections):
     """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
-    left in --out. What was broken off goes on where it stopped. See benchmarks/ur5/README.md.
+    left in --out. frontier: error against milliseconds a step of the filters that a table left there. limits: how far
+    linear filters get on its sensors' readings. What was broken off goes on where it stopped. See the README beside.
     """
 
-    command: Positional[Literal["collect", "table", "pictures"]] = "table"
+    command: Positional[Literal["collect", "table", "pictures", "frontier", "limits"]] = "table"
     filters: some_of(sorted(FILTERS)) = tuple(sorted(FILTERS))
     sensors: some_of(sorted(SENSORS)) = ("glimpse", "paper")
     trainings: some_of(TRAININGS) = TRAININGS
@@ -199,11 +200,15 @@ def run_jobs(
         own = {**names, "domain": domain}
         once(folder / f"sensor-{base.name}-{domain}.json", partial(_sensor, base, own))
         for name in filters if domain == base.domain else set(filters) & {"denkf"}:
-            size = 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
-            rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": size})
+            rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": members_of(name)})
             once(folder / f"{name}-{base.name}-{domain}.json", rows)
-    if "denkf" in filters and changed and training == "sim":
+    if "denkf" in filters and training == "sim":
         once(folder / f"sizes-{base.name}.json", partial(_sizes, base, {**names, "domain": "sim", "filter": "denkf"}))
+
+
+def members_of(name: str) -> int:
+    """How many members or particles a filter has in the table."""
+    return 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
 
 
 def _sensor(base: Base, names: dict) -> list[dict]:

@@ -26,8 +26,7 @@ FAIRNESS = (
     "All filters of a sensor start from the same sensor's weights and the same learned motion, and learn from the same "
     "windows of its readings with as many updates; each then trains its own copy of the sensor's head. Each has one "
     "number (a factor on the noise, or tempering of weights) chosen from the same seven values for the coverage on the "
-    "same validation demos. 'sensor' is the mean of its samples, with J6 turned by half a turn where that is nearer to "
-    "the truth; where nothing is seen its last reading stays."
+    "same validation demos. 'sensor' is the mean of its samples; where nothing is seen its last reading stays."
 )
 
 
@@ -94,16 +93,17 @@ def _blackouts(rows: Sequence[dict]) -> list[str]:
 
 
 def _sizes(rows: Sequence[dict], resized: Sequence[dict]) -> list[str]:
-    if not resized:
-        return []
-    same = {key: resized[0][key] for key in ("filter", "sensor", "domain", "training")}
-    own = pick(rows, condition="clean", **same)
+    lines: list[str] = []
+    keys = ("filter", "sensor", "domain", "training")
     titles = ("members", "CRPS, validation demos", "joints deg", "end effector cm", "90 % hold", "ms")
-    lines = [f"Size of the ensemble, {same['filter']}, clean", "", *head(*titles)]
-    for size in sorted({row["ensemble_size"] for row in own}):
-        at = pick(own, ensemble_size=size)
-        covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
-        cells = [over_seeds(at, "validation_crps", "{:.3f}"), over_seeds(at, "joint_mae_deg")]
-        cells += [over_seeds(at, "ee_mae_cm", "{:.3f}"), covered, over_seeds(at, "ms_per_step")]
-        lines.append(line(size, *cells))
+    for same in dict.fromkeys(tuple(row[key] for key in keys) for row in resized):
+        own = pick(rows, condition="clean", **dict(zip(keys, same, strict=True)))
+        lines += [f"Size of the ensemble, {same[0]} on {same[1]}, clean", "", *head(*titles)]
+        for size in sorted({row["ensemble_size"] for row in own}):
+            at = pick(own, ensemble_size=size)
+            covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
+            cells = [over_seeds(at, "validation_crps", "{:.3f}"), over_seeds(at, "joint_mae_deg")]
+            cells += [over_seeds(at, "ee_mae_cm", "{:.3f}"), covered, over_seeds(at, "ms_per_step")]
+            lines.append(line(size, *cells))
+        lines.append("")
     return lines

@@ -35,8 +35,8 @@ class Budget:
     motion: int = 3000  # updates of the motion on true states
     filter: int = 250  # updates of a filter on readings
     end_to_end: int = 50  # updates of a filter with the sensor's head
-    length: int = 32  # steps of the filter's windows
-    batch: int = 32  # windows an update
+    length: int = 96  # steps of the filter's windows: over short ones slow errors do not show
+    batch: int = 12  # windows an update
 
 
 @torch.no_grad()

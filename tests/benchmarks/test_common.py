@@ -27,7 +27,7 @@ def test_options_of_the_kitti_study():
 def test_options_of_the_ur5_study(capsys):
     study = parse(UR5, ["collect", "--processes", "2", "--trainings", "sim", "--seeds", "0", "3", "--motion", "5"])
     assert (study.command, study.processes, study.trainings, study.seeds) == ("collect", 2, ("sim",), (0, 3))
-    assert (study.root, study.demos, study.budget.motion, study.budget.batch) == (Path("runs/ur5-demos"), 2000, 5, 32)
+    assert (study.root, study.demos, study.budget.motion, study.budget.batch) == (Path("runs/ur5-demos"), 2000, 5, 12)
     with pytest.raises(SystemExit):
         parse(UR5, ["--filters", "nonsense"])
     assert "nonsense" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from benchmarks.kitti.sensors import SENSORS, SensorOfFold
 from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from benchmarks.kitti.study import rows_of
 from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
-from benchmarks.kitti.training import gain_error, run_filter
+from benchmarks.kitti.training import calibration_error, gain_error, run_filter
 from torch_denkf.metrics import dead_reckoning
 from torch_denkf.odometry.batches import ReadingSampler
 from torch_denkf.odometry.streams import all_frames, lose_frames, take_spans
@@ -135,6 +136,16 @@ def test_gain_error_is_that_of_clean_unseen_drives():
         read = readings([[7.0 * math.exp(off), 0.0]] * 20)
         base.readings += [(read[:12], read[12:], 1.0)] * 2  # as they are, and mirrored
     assert gain_error(fold, base) == pytest.approx(((0.03**2 + 0.04**2) / 2) ** 0.5, rel=1e-4)
+
+
+def test_the_calibration_counts_the_path_and_the_crps_of_the_velocities(monkeypatch):
+    run = TensorDict({"state": torch.zeros(1, 9, 5), "belief": {"mean": torch.zeros(1, 9, 5)}}, [1, 9])
+    run["belief", "mean"][..., :2] = torch.tensor([3.0, -4.0])  # 5 m off
+    run["belief", "var"] = torch.full((1, 9, 5), 4.0)
+    monkeypatch.setattr("benchmarks.kitti.training.run_all", lambda *_: [run, run])
+    recipe = SimpleNamespace(unit=torch.tensor([1.0, 2.0]))
+    crps = 2.0 * (math.sqrt(2) - 1) / math.sqrt(math.pi)  # of a Gaussian whose mean is right
+    assert calibration_error(recipe, None, []) == pytest.approx(5.0 * (crps + crps / 2) / 2, rel=1e-6)
 
 
 def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():

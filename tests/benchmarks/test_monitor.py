@@ -1,12 +1,18 @@
 """The study's scores, against closed forms and scikit-free counts."""
 
+from dataclasses import asdict
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
 
+from benchmarks.monitor.arm import ArmGuard
+from benchmarks.monitor.car import CarGuard, gates_of
 from benchmarks.monitor.drives import believed_spans, stretches
 from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms, spans_of
 from benchmarks.monitor.study import COLUMNS, Study, page
+from torch_denkf.vision import KITTI_DT, PICTURE_SIGNS, flow_signs
 
 
 def test_spans_are_first_and_behind_the_last():
@@ -54,10 +60,41 @@ def test_the_shortest_pair_that_is_believed():
 
     doubts = {1: [False, True, True, True], 2: [False, False, True, True], 3: [False, False, False, True]}
     spans = [reading(steps) for steps in doubts]
-    chosen = believed_spans(spans, lambda each: torch.tensor(doubts[int(each["sensor", "ensemble"][0, 0, 0])]))
+
+    def seen(each):
+        return ~torch.tensor(doubts[int(each["sensor", "ensemble"][0, 0, 0])]).unsqueeze(-1)
+
+    chosen = believed_spans(spans, seen)
     assert chosen["steps"].flatten().tolist() == [1, 2, 3, 0]
     assert chosen["observed"].flatten().tolist() == [True, True, True, False]
     assert chosen["sensor", "ensemble"][:3, 0, 0].tolist() == [1, 2, 3]
+
+
+def test_the_flow_takes_the_road_s_place_where_the_two_contradict():
+    """Clean readings are off by up to 10 %, and the flow's distances are 20 % short; then a car hides the road."""
+    steps, generator = 400, torch.Generator().manual_seed(0)
+    speed = 10 + torch.rand(steps, 1, generator=generator)
+
+    def reading(read, plane, shown=0.0):
+        shown = torch.full((steps, len(PICTURE_SIGNS)), shown)
+        ensemble = torch.stack([read, torch.zeros_like(read)], -1).expand(steps, 4, 2)
+        of_flow = flow_signs(plane.squeeze(-1), torch.ones(steps, 13, 69), read.squeeze(-1) * KITTI_DT)
+        entries = {"signs": torch.cat([shown, of_flow], -1), "plane": plane, "sensor": {"ensemble": ensemble}}
+        return TensorDict({**entries, "observed": torch.ones(steps, 1, dtype=torch.bool)}, [steps])
+
+    plane = 0.8 * speed * KITTI_DT
+    clean = reading(speed * (0.9 + 0.2 * torch.rand(steps, 1, generator=generator)), plane)
+    gates = gates_of([clean], CarGuard(rate=0.01))
+    assert gates.scale == pytest.approx(1.25, rel=0.02)
+    slow = reading(0.2 * speed, plane)
+    hidden = gates.answered(slow)
+    assert torch.allclose(slow["sensor", "ensemble"][:, 0, :1], 0.2 * speed)  # what came is left as it was
+    assert torch.allclose(hidden["sensor", "ensemble"][..., 0].mean(-1, keepdim=True), gates.scale * 0.8 * speed)
+    assert hidden["observed"].all()
+    untouched = gates.answered(clean)
+    changed = (untouched["sensor", "ensemble"] != clean["sensor", "ensemble"]).flatten(1).any(-1)
+    assert changed.float().mean() <= 0.011
+    assert not gates.answered(reading(speed, plane, 0.9))["observed"].any()  # what the pictures show says no
 
 
 def test_a_page_of_every_kind_of_row(tmp_path):
@@ -70,3 +107,10 @@ def test_a_page_of_every_kind_of_row(tmp_path):
     assert sorted(COLUMNS.read(tmp_path / "monitor.csv"), key=COLUMNS.order) == sorted(rows, key=COLUMNS.order)
     text = page(rows, Study())
     assert "| kitti-real | black | 0.98 | 1 | 1 | 0.5 | 1.020 |" in text
+
+
+def test_the_settings_are_those_that_the_trials_chose():
+    page = (Path(__file__).parents[2] / "benchmarks/monitor/results/choice.md").read_text()
+    for task, guard in (("car", CarGuard()), ("arm", ArmGuard())):
+        chosen = ", ".join(f"{name} {value:g}" for name, value in asdict(guard).items())
+        assert f"| {task}: chosen | {chosen} |" in page

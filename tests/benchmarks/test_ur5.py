@@ -54,7 +54,7 @@ def test_windows_begin_wrong_as_they_are_told_and_are_true_otherwise():
     # 400 draws: the standard error of a standard deviation is 0.035.
     torch.testing.assert_close(wrong[:, 0].std(0), torch.ones(SIZE), atol=0.15, rtol=0)
     rates = windows["state"][:, 1:, :7] - windows["state"][:, :-1, :7]
-    torch.testing.assert_close(windows["motion"][:, 1:, 10:], rates)
+    torch.testing.assert_close(windows["motion"][:, 1:, 10:17], rates)
     assert 0.6 < float(windows["observed"].float().mean()) < 0.95
     torch.testing.assert_close(windows["hint"][:, 1, :10], windows["start"][:, 0, :10])
     assert float(windows["hint"][:, [0, *range(2, 8)]].abs().max()) == 0.0

@@ -10,11 +10,11 @@ from tensordict import TensorDict
 from benchmarks.common.arms import AtRest, WithBias
 from benchmarks.ur5.evaluation import errors
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
-from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, with_rates
+from benchmarks.ur5.motion import ERRORS, FADING, SIZE, ArmMotion, BiasedReading, open_loop, with_rates
 from benchmarks.ur5.readings import read_head
 from benchmarks.ur5.recipes import FILTERS
 from benchmarks.ur5.recipes.denkf import localisation
-from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, wrist_of
+from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
 from benchmarks.ur5.training import run_filter
 from tests.benchmarks.ur5_for_tests import FACTS, states
 
@@ -33,15 +33,33 @@ def test_a_reading_of_the_turned_wrist_gives_the_state_back_from_any_angle_withi
 def test_a_radian_of_the_wrist_is_a_unit_of_its_reading():
     state = states(3).double().requires_grad_()
     reading = TurnedWrist()(state)
-    slope = torch.stack([torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6)])
-    torch.testing.assert_close(slope.norm(dim=0), torch.ones(3, dtype=torch.double))
+    slope = torch.stack(
+        [torch.autograd.grad(reading[:, n].sum(), state, retain_graph=True)[0][:, 5] for n in (5, 6, 7, 8)]
+    )
+    torch.testing.assert_close(slope[:2].norm(dim=0), torch.ones(3, dtype=torch.double))
+    torch.testing.assert_close(slope[2:].norm(dim=0), torch.ones(3, dtype=torch.double))
+
+
+def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_forecast():
+    state = states(50)
+    state[:, 5] = torch.linspace(-3, 3, 50)
+    reading = TurnedWrist()(state)
+    for near in (state[:, 5] + 2.5, state[:, 5] - 2.5 + 2 * math.pi, state[:, 5] + 0.4):
+        turns = (wrist_of(reading, side_of(reading, near))[:, 5] - state[:, 5]) / (2 * math.pi)
+        torch.testing.assert_close(turns, turns.round(), atol=1e-5, rtol=0)  # the same angle, on the forecast's turn
+        assert ((side_of(reading, near) - near).abs() < math.pi).all()
+    torch.testing.assert_close(side_of(reading), state[:, 5])
+    reading[:, 7:9] *= 0.2
+    other = wrist_of(reading, side_of(reading, state[:, 5] + math.pi))[:, 5]
+    torch.testing.assert_close(other, state[:, 5] + math.pi, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_samples_turn_to_the_side_of_the_forecast(weighted):
+def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast(weighted):
     state = states(2)
     state[:, 5] = torch.tensor([1.0, 1.0])
     samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
+    samples[..., 7:9] = 0.0
     forecast = torch.zeros(2, 3, SIZE)
     forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
     td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
@@ -68,25 +86,53 @@ def test_a_factor_scales_the_samples_around_their_mean():
 def test_rates_are_the_joints_changes_and_an_episode_begins_at_rest():
     sequence = states(2, 5)
     full = with_rates(sequence)
-    torch.testing.assert_close(full[:, 1:, 10:], sequence[:, 1:, :7] - sequence[:, :-1, :7])
+    torch.testing.assert_close(full[:, 1:, 10:17], sequence[:, 1:, :7] - sequence[:, :-1, :7])
+    torch.testing.assert_close(full[:, 1:, 17:], full[:, 1:, 10:17] - full[:, :-1, 10:17])
     assert float(full[:, 0, 10:].abs().max()) == 0.0
 
 
 def test_the_place_follows_the_joints_and_keeps_a_share_of_its_difference():
     torch.manual_seed(0)
     motion = ArmMotion(FACTS)
-    state = torch.cat([states(6), 0.01 * torch.randn(6, 7)], -1)
+    state = torch.cat([states(6), 0.01 * torch.randn(6, 14)], -1)
     moved = motion(state)
-    torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:])
-    torch.testing.assert_close(moved[:, 10:], torch.sigmoid(torch.tensor(4.0)) * state[:, 10:])  # before training
+    torch.testing.assert_close(moved[:, :7], state[:, :7] + moved[:, 10:17])
+    damped, lasting = torch.tensor([6.0, 2.0]).sigmoid()
+    torch.testing.assert_close(moved[:, 10:17], damped * state[:, 10:17] + lasting * state[:, 17:])  # before training
+    torch.testing.assert_close(moved[:, 17:], moved[:, 10:17] - state[:, 10:17])
     expected = motion.place(moved[:, :7]) + 0.5 * (state[:, 7:10] - motion.place(state[:, :7]))
     torch.testing.assert_close(moved[:, 7:10], expected)
+
+
+def test_noise_of_an_acceleration_moves_its_joint_and_its_rate_in_the_same_step():
+    torch.manual_seed(0)
+    recipe = FILTERS["dekf"](
+        SENSORS["keypoints"].build(FACTS, 4), SENSORS["keypoints"], FACTS, ArmMotion(FACTS), ERRORS
+    )
+    matrix = recipe.modules()["transition"].process_noise.matrix
+    column = matrix[:, 3 + 2]  # the place comes first, then J1 to J7: a3
+    assert column.nonzero().flatten().tolist() == [2, 12, 19]
+    assert matrix[:, 0].nonzero().flatten().tolist() == [7]  # x
+
+
+def test_open_loop_errors_are_those_of_a_constant_acceleration():
+    motion = ArmMotion(FACTS).double()
+    motion.damping.data.fill_(30.0)
+    motion.lasting.data.fill_(30.0)  # what moves goes on for ever
+    time = torch.arange(30.0, dtype=torch.double)
+    states = torch.cat([1e-5 * time.pow(3).unsqueeze(-1).expand(30, 7), torch.zeros(30, 3)], -1).unsqueeze(0)
+    found = open_loop(motion, states, torch.zeros(1, 30, 7, dtype=torch.double), ahead=(1, 5))
+    start = with_rates(states)[0, :25, [0, 10, 17]]
+    for n in (1, 5):
+        expected = start[:, 0] + n * start[:, 1] + n * (n + 1) / 2 * start[:, 2]
+        error = (states[0, n : n + 25, 0] - expected).abs().mean().rad2deg()
+        assert found[f"after_{n}_deg"] == pytest.approx(float(error), rel=1e-6)
 
 
 def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_fingers_through_an_object():
     motion = ArmMotion(FACTS, actions=True)
     motion.pull.data.fill_(1.0)
-    state = torch.cat([states(1), torch.zeros(1, 7)], -1)
+    state = torch.cat([states(1), torch.zeros(1, 14)], -1)
     action = state[:, :7] + 0.02
     action[:, 6] = state[:, 6] - 0.5
     moved = motion(torch.cat([state, action], -1))
@@ -97,7 +143,7 @@ def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_finger
 def test_biases_fade_and_add_to_the_reading():
     motion = ArmMotion(FACTS)
     network = WithBias(motion)
-    state = torch.cat([states(3), torch.zeros(3, 7), torch.ones(3, 10)], -1)
+    state = torch.cat([states(3), torch.zeros(3, 14), torch.ones(3, 10)], -1)
     moved = network(state)
     torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
     torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
@@ -141,7 +187,7 @@ def readings():
     torch.manual_seed(0)
     motion = ArmMotion(FACTS)
     motion.damping.data.fill_(12.0)  # rates last
-    state = torch.cat([states(3), 0.01 * torch.randn(3, 7)], -1)
+    state = torch.cat([states(3), 0.01 * torch.randn(3, 7), torch.zeros(3, 7)], -1)
     path = [state]
     with torch.no_grad():
         state[:, 7:10] = motion.place(state[:, :7])
@@ -149,7 +195,7 @@ def readings():
             path.append(motion(path[-1]))
     path = torch.stack(path, 1)
     sensor = SENSORS["keypoints"].build(FACTS, 32)
-    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 11)
+    samples = TurnedWrist()(path[..., :10]).unsqueeze(-2) + 0.01 * torch.randn(3, 40, MEMBERS, 13)
     encoding = torch.zeros(3, 40, 64)
     td = TensorDict({"state": path[..., :10], "motion": path, "action": path[..., :7]}, [3, 40])
     td["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, [3, 40])
@@ -183,16 +229,17 @@ def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right
 
 
 def test_localisation_keeps_covariances_and_the_gripper_apart():
-    state, reading = localisation(27)
+    state, reading = localisation(34)
     assert torch.linalg.eigvalsh(reading).min() > -1e-6  # its product with a covariance is one (Schur)
-    assert torch.equal(state[17:], reading)  # biases
+    assert torch.equal(state[24:], reading)  # biases
     assert torch.equal(state[:7], state[10:17])  # rates go with their joints
-    gripper = [6, 16, 23]
-    arm = [index for index in range(27) if index not in gripper]
+    assert torch.equal(state[:7], state[17:24])  # and so do accelerations
+    gripper = [6, 16, 23, 30]
+    arm = [index for index in range(34) if index not in gripper]
     assert (state[arm, 6] == 0).all()
     assert (state[gripper][:, [0, 1, 2, 3, 4, 5, 7, 8, 9]] == 0).all()
     assert (state[gripper, 6] == 1).all()
-    assert torch.equal(localisation(17)[0], state[:17])
+    assert torch.equal(localisation(24)[0], state[:24])
 
 
 def test_a_head_on_features_is_the_sensor_on_pictures():
@@ -205,7 +252,7 @@ def test_a_head_on_features_is_the_sensor_on_pictures():
     head = sensor.module["head"].forward(codes["code"], sample=False)
     torch.testing.assert_close(whole["sensor", "ensemble"][:, 0], sensor.loc + sensor.scale * head)
     sensor.module["head"].sample = True
-    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 11)
+    assert read_head(sensor, codes, 7)["sensor", "ensemble"].shape == (2, 7, 13)
 
 
 def test_a_belief_at_rest_is_padded():

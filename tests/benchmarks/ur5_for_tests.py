@@ -9,6 +9,7 @@ FACTS = Statistics(
     scale=torch.linspace(0.1, 1, 10),
     rate=torch.full((7,), 0.01),
     acceleration=torch.full((7,), 0.001),
+    jerk=torch.full((7,), 0.001),
     pixel_loc=torch.full((3,), 0.5),
     pixel_scale=torch.full((3,), 0.2),
     size=32,

@@ -113,6 +113,21 @@ def test_errors():
         EnsembleAnalysis("sakov", rotate=True)
 
 
+def test_inflation_multiplies_the_components_that_it_is_told(float64):
+    td = TensorDict(
+        {
+            "forecast": {"ensemble": torch.randn(8, 4), "observation": torch.randn(8, 2)},
+            "sensor": {"ensemble": torch.randn(8, 2), "noise": torch.ones(2)},
+        }
+    )
+    plain = EnsembleAnalysis("sensor")(td.clone())["belief"]
+    some = EnsembleAnalysis("sensor", inflation=1.5, inflated=[1, 2])(td.clone())["belief"]
+    torch.testing.assert_close(some["mean"], plain["mean"])
+    factors = torch.tensor([1.0, 1.5, 1.5, 1.0])
+    torch.testing.assert_close(some["var"], plain["var"] * factors**2)
+    torch.testing.assert_close(some["ensemble"] - some["mean"], (plain["ensemble"] - plain["mean"]) * factors)
+
+
 def test_inflation_leaves_an_ensemble_without_observation_as_it_is():
     torch.manual_seed(0)
     td = TensorDict(

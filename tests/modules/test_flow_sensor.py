@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.vision.drives_for_tests import rendered_motion
+from torch_denkf.data import mirror_drive
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import FlowSensor, deterministic
 from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
@@ -321,3 +322,30 @@ def test_a_few_updates_beat_the_untrained_sensor():
     # Rows: seen and unseen drives; columns: v in m/s and the turn rate in rad/s.
     assert (after < 0.95 * before).all(), (before, after)
     assert after[0, 0] < 0.5 * before[0, 0]
+
+
+def test_corners_tell_turn_and_pitch_where_there_are_any(float64):
+    sensor = only_the_road(make(two_view_key="two_view"))
+    trunk = sensor.module["trunk"]
+    silence(trunk.corner_gate)
+    with torch.no_grad():
+        trunk.corner_gate.bias.fill_(40.0)
+        trunk.log_sharpness.fill_(-20.0)  # the road says nothing, so the pitch is that of the corners
+        trunk.log_corner_pitch_std.fill_(-2.0)
+    frame = known_frame(0.0, 1.0, 0.03)
+    frame["two_view"] = torch.tensor([0.05, 0.0, 0.0, 0.0, -0.02, 1e-3, 1e-3, 0.9])
+    out = sensor(frame)
+    torch.testing.assert_close(out["sensor", "ensemble"][:, 1], torch.full((5,), 0.05 / DT))
+    encoding = out["sensor", "encoding"][-12:].tolist()  # seven cues of the flow and the road, five of the corners
+    assert encoding[1] == pytest.approx(-0.02 / 0.005, abs=1e-6)
+    assert encoding[-1] == pytest.approx(0.9)
+    frame["two_view"] = torch.zeros(8)
+    out = sensor(frame)
+    torch.testing.assert_close(out["sensor", "ensemble"][:, 1], torch.full((5,), 0.03 / DT))
+    assert not out["sensor", "encoding"][-5:].any()
+
+
+def test_corners_of_a_mirrored_world_turn_the_other_way(float64):
+    frame = TensorDict({"two_view": torch.tensor([0.05, 0.01, 0.02, 0.03, -0.02, 1e-3, 1e-3, 0.9])})
+    mirrored = mirror_drive(frame)["two_view"]
+    torch.testing.assert_close(mirrored, torch.tensor([-0.05, 0.01, -0.02, -0.03, -0.02, 1e-3, 1e-3, 0.9]))

@@ -18,7 +18,7 @@ from torch_denkf.odometry import (
     usual_failures,
 )
 from torch_denkf.transforms import OccludingBox
-from torch_denkf.vision import image_motion
+from torch_denkf.vision import image_motion, two_view_motion
 
 
 def test_black_frames_are_missing_frames(checkpoint, drive):
@@ -49,7 +49,8 @@ def test_readings_are_velocities(checkpoint, drive):
     with torch.no_grad():  # the sensor's mean of the pair over the gap, whatever its noise
         pair = [drive["image"][n][0].numpy() for n in (4, 6)]
         flow, road = (torch.from_numpy(part).half().float() for part in image_motion(*pair, calibration))
-        whole = car.sensor(TensorDict({"flow": flow, "road": road}))["sensor", "ensemble"].mean(0)
+        frame = {"flow": flow, "road": road, "two_view": torch.from_numpy(two_view_motion(*pair, calibration))}
+        whole = car.sensor(TensorDict(frame))["sensor", "ensemble"].mean(0)
     spread = torch.stack([belief.reading for belief in plain[1:]]).std(0)
     assert ((gap[6].reading - whole / 2).abs() < spread + 0.5).all()
 

@@ -50,15 +50,12 @@ def test_tracking_equals_filtering_the_whole_drive(lost, checkpoint, drive):
     assert [belief.observed for belief in beliefs] == [n > 0 and n not in lost for n in range(16)]
 
     # The same readings, noise and start, as one sequence. The noises: first reading, start, then a step each.
-    motion = with_motion(bridge_gaps(drive), cache=None)
-    steps = motion["steps"]
-    sequence = TensorDict(
-        {"flow": motion["flow"].float(), "road": motion["road"].float(), "observed": steps > 0, "steps": steps}, [16]
-    )
+    motion = with_motion(bridge_gaps(drive), cache=None, two_view=True)
+    steps, read = motion["steps"], ("flow", "road", "two_view")
+    sequence = TensorDict({key: motion[key].float() for key in read}, [16])
+    sequence["observed"], sequence["steps"] = steps > 0, steps
     sequence["noise"] = torch.stack([noises[1], *noises[2:]])
-    first = TensorDict(
-        {"flow": sequence["flow"][1], "road": sequence["road"][1], "noise": {"self": noises[0]["sensor"]}}
-    )
+    first = TensorDict({**{key: sequence[key][1] for key in read}, "noise": {"self": noises[0]["sensor"]}})
     sequence["start"] = torch.zeros(16, 5)
     sequence["start"][:, 3:] = car.sensor(first)["sensor", "ensemble"].mean(0).detach()
     with torch.no_grad():

@@ -20,6 +20,7 @@ from torch_denkf.odometry import (
     write_rows,
 )
 from torch_denkf.odometry.batches import ReadingSampler
+from torch_denkf.odometry.scores import calibrate
 from torch_denkf.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
 from torch_denkf.training import FilterTrainer
 
@@ -47,6 +48,24 @@ def test_the_record_says_how_it_was_trained(trained):
     states = Drive(trained[0], "c", (25, 75), True)
     assert states.disturbed()[0] == states
     assert sum(each.weight for each in states.disturbed()) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(("apart", "best"), [({1.0: 1.0, 1.05: 3.0}, 1.0), ({1.0: 3.0, 1.05: 1.0}, 1.05)])
+def test_the_inflation_is_chosen_by_the_path_too(monkeypatch, apart, best):
+    """A spread that suits the velocities less is taken where the path is so much nearer to the truth."""
+    car = car_filter(ensemble_size=4)
+    car.inflation = 1.2
+
+    def run(filtered, _):
+        out = TensorDict({"state": torch.zeros(1, 5, 5), "belief": {"mean": torch.zeros(1, 5, 5)}}, [1, 5])
+        out["belief", "mean"][..., 0] = apart.get(filtered.inflation, 9.0)
+        # The CRPS of a Gaussian whose mean is right grows with its standard deviation.
+        out["belief", "var"] = torch.full((1, 5, 5), filtered.inflation**2)
+        return [out]
+
+    monkeypatch.setattr("torch_denkf.odometry.scores._all", run)
+    assert calibrate(car, []) == best
+    assert car.inflation == 1.2  # as it was
 
 
 class Killed(Exception):
@@ -115,7 +134,7 @@ def test_evaluation_beside_the_floor(trained, root, tmp_path):
     again, _ = evaluate_car_filter(car, root, ["b", "c"], **options)
     assert again == rows
     # Dead reckoning is the readings' mean, integrated.
-    data = [Drive(root, "b", (25, 75), trained[0] / "cache").read()]
+    data = [Drive(root, "b", (25, 75), trained[0] / "cache", two_view=True).read()]
     readings = all_frames(read_spans(car.sensor, data, 3))
     velocity = readings["sensor", "ensemble"].mean(1)
     assert beliefs["b"]["sensor", "ensemble"].mean(1) == pytest.approx(velocity)
@@ -136,7 +155,7 @@ def test_evaluation_beside_the_floor(trained, root, tmp_path):
 
 def test_readings_over_gaps_are_those_of_pairs(trained, root):
     """take_spans picks, for each frame, the reading of as many steps as are missing before it."""
-    data = [each.read() for each in Drive(root, "b", (25, 75), trained[0] / "cache").spans(3)]
+    data = [each.read() for each in Drive(root, "b", (25, 75), trained[0] / "cache", two_view=True).spans(3)]
     spans = read_spans(trained[1].sensor, data, 3)
     steps = torch.tensor([0, 1, 0, 2, 3, 1, 5, *[1] * 9])
     taken = take_spans(spans, steps)

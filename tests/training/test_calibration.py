@@ -1,5 +1,7 @@
 """Oracles: the minimum of a parabola, the standard deviation behind Gaussian errors, readings held by hand."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -13,7 +15,8 @@ from torch_denkf.training import choose, choose_for_coverage, hold_last
 @pytest.mark.parametrize(("lowest", "best"), [(0.3, 0.5), (1.2, 1.0), (9.0, 2.0)])
 def test_the_best_candidate_is_returned_and_left_set(lowest, best):
     tried = []
-    found = choose([0.5, 1.0, 2.0], tried.append, lambda: (tried[-1] - lowest) ** 2)
+    with pytest.warns(UserWarning, match="is the last") if best == 2.0 else nullcontext():
+        found = choose([0.5, 1.0, 2.0], tried.append, lambda: (tried[-1] - lowest) ** 2)
     assert found == best
     assert tried == [0.5, 1.0, 2.0, best]
 
@@ -37,7 +40,7 @@ def test_errors_are_taken_without_gradients():
     assert torch.is_grad_enabled()
 
 
-@pytest.mark.parametrize("spread", [0.5, 1.0, 1.5])
+@pytest.mark.parametrize("spread", [0.5, 1.0, 1.25])
 def test_the_factor_that_a_gaussian_was_made_with_is_found(spread):
     truth = spread * torch.randn(20_000, 2)
     analysis = EnsembleAnalysis("sensor")

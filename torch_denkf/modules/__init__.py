@@ -8,6 +8,7 @@ from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
+from torch_denkf.modules.bias import BiasedNoise, BiasedObservation, BiasedTransition, FadingBias
 from torch_denkf.modules.black import BlackIsMissing
 from torch_denkf.modules.carried import WithState
 from torch_denkf.modules.check import check_analysis
@@ -35,6 +36,7 @@ from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePo
 from torch_denkf.modules.sensor import ImageSensor, VectorSensor, convolutional_trunk
 from torch_denkf.modules.sensor_weights import SensorAttention, SensorWeights, WeightedNoise
 from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
+from torch_denkf.modules.signs import SignGate
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
@@ -67,6 +69,7 @@ __all__ = [
     "ScaledNoise",
     "ImageSensor",
     "BlackIsMissing",
+    "SignGate",
     "VectorSensor",
     "FlowSensor",
     "MemberGain",
@@ -85,6 +88,10 @@ __all__ = [
     "GaussianAround",
     "CholeskyNoise",
     "MappedNoise",
+    "FadingBias",
+    "BiasedTransition",
+    "BiasedNoise",
+    "BiasedObservation",
     "UnicycleNoise",
     "as_process_noise",
     "EKFTransition",

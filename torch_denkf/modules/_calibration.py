@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_denkf.functional import chi_square_quantile
 
-__all__ = ["IDENTITY", "check_observation_dim", "chi_square_table", "empirical_quantile", "score_table"]
+__all__ = ["IDENTITY", "check_observation_dim", "chi_square_table", "empirical_quantile", "score_table", "sign_limits"]
 
 _LEVELS = (0.01, *(0.05 * n for n in range(1, 20)), 0.975, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9999)
 #: Knots and heights ``[2, N]`` of the map that changes nothing.
@@ -51,6 +51,19 @@ def score_table(values: Tensor) -> Tensor:
     scores = torch.special.ndtri(levels)
     knots = torch.cat([measured[:1] - spread, measured, measured[-1:] + spread])
     return torch.stack([knots, torch.cat([scores[:1] - 1, scores, scores[-1:] + 1])]).float()
+
+
+def sign_limits(values: Tensor, rate: float, floor: Tensor, margin: float) -> Tensor:
+    """Limits ``[K]`` that signs ``[M, K]`` of clean data exceed in a share ``rate`` of the rows at most, all together.
+
+    Each is ``margin`` times a quantile, and ``floor`` ``[K]`` at least. NaN is left out.
+    """
+    level = torch.tensor([1 - rate / values.shape[-1]], dtype=torch.float64)
+    limits = []
+    for column in values.unbind(-1):
+        known = column[~column.isnan()].double()
+        limits.append(empirical_quantile(known, level).squeeze(0) if len(known) else known.new_tensor(torch.inf))
+    return torch.maximum(margin * torch.stack(limits), floor.double()).to(floor.dtype)
 
 
 def _levels(count: int) -> Tensor:

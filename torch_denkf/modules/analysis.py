@@ -21,6 +21,7 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["EnsembleAnalysis"]
 
@@ -32,6 +33,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         scheme: ``"sensor"`` (the paper: innovations from the sensor's samples), ``"perturbed"`` (the sensor's mean
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
         inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
+        inflated: components of the state that the inflation multiplies; ``None`` for all. Where nothing observes a
+            component, or where it is the past, which is not forecast anew, factors pile up in it.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
@@ -61,6 +64,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         scheme: Literal["sensor", "perturbed", "etkf", "sakov"] = "sensor",
         *,
         inflation: float = 1.0,
+        inflated: Sequence[int] | None = None,
         relaxation: float = 0.0,
         rotate: bool = False,
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
@@ -78,6 +82,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         super().__init__(
             inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, covariance=covariance, **keys
         )
+        check_dims("inflated", inflated or [])
+        self.inflated = None if inflated is None else list(inflated)
         self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
@@ -126,13 +132,21 @@ class EnsembleAnalysis(EnsembleUpdate):
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
-            inflated = inflate(ensemble, self.inflation)
+            inflated = inflate(ensemble, self._factor(ensemble))
             if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
                 inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean = ensemble_mean(ensemble)
         cov = (ensemble_cov(ensemble),) if self.covariance else ()
         return ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood, *cov
+
+    def _factor(self, ensemble) -> float | torch.Tensor:
+        """Of the inflation: one for all components, or ``[*B, 1, S]``."""
+        if self.inflated is None:
+            return self.inflation
+        factor = torch.ones_like(ensemble[..., :1, :])
+        factor[..., self.inflated] = self.inflation
+        return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
         """What the reading says of earlier states of the same members; neither inflation nor relaxation touches them.

@@ -12,13 +12,22 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules.sensor import StochasticSensor
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.vision import FLOW_SHAPE, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS, focus_of_expansion
+from torch_denkf.vision import (
+    FLOW_SHAPE,
+    ROAD_PITCHES,
+    ROAD_SHAPE,
+    ROAD_SHIFTS,
+    TWO_VIEW_SHAPE,
+    focus_of_expansion,
+)
 
 __all__ = ["FlowSensor"]
 
 _FLOW_UNIT, _TURN_UNIT = 0.1, 0.02  # tangents and rad a frame: about a standard deviation on KITTI
 _ROAD_LOC, _ROAD_SCALE = 0.9, 0.2  # where correlations of the road lie
 _PITCH_UNIT = 0.005  # rad: about the error of the direction of travel
+_CORNER_CUES = 5  # see _MotionTrunk._corner_cues
+_CORNER_TRUST = 2.0  # log odds of the corners' turn against the flow's, before training
 
 
 class _MotionTrunk(nn.Module):
@@ -27,7 +36,7 @@ class _MotionTrunk(nn.Module):
     The road's correlations become a distribution over pitch and distance, by a small convolutional network that may
     look at the neighbours of each, and by the direction of travel: the road lies along it, so it tells the camera's
     pitch, which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a
-    network trusts that more, as on an empty motorway.
+    network trusts that more, as on an empty motorway; or that of tracked corners, where they are read.
     """
 
     distances: torch.Tensor
@@ -35,7 +44,7 @@ class _MotionTrunk(nn.Module):
     flow_grid: torch.Tensor
     road_grid: torch.Tensor
 
-    def __init__(self, features: int, dropout: float):
+    def __init__(self, features: int, dropout: float, two_view: bool = False):
         super().__init__()
         channels, height, width = FLOW_SHAPE
         pitches, shifts = ROAD_SHAPE
@@ -64,8 +73,14 @@ class _MotionTrunk(nn.Module):
         self.register_buffer("flow_grid", _grid(height, width))
         self.register_buffer("road_grid", _grid(pitches, shifts))
         self.out_features = features + 7
+        if two_view:
+            self.corner_gate = nn.Linear(features + 2 + _CORNER_CUES, 1)
+            nn.init.constant_(self.corner_gate.bias, _CORNER_TRUST)
+            self.corner_pitch_offset = nn.Parameter(torch.tensor(0.0))
+            self.log_corner_pitch_std = nn.Parameter(torch.tensor(0.0))
+            self.out_features += _CORNER_CUES
 
-    def forward(self, flow: torch.Tensor, road: torch.Tensor):
+    def forward(self, flow: torch.Tensor, road: torch.Tensor, two_view: torch.Tensor | None = None):
         count, expansion = len(flow), focus_of_expansion(flow)
         pitch, pitch_std = expansion.focus[:, 1] / _PITCH_UNIT, expansion.focus_std[:, 1] / _PITCH_UNIT
         scaled = torch.cat([flow[:, :2] / _FLOW_UNIT, flow[:, 2:]], 1)
@@ -74,6 +89,11 @@ class _MotionTrunk(nn.Module):
         score = self.road(torch.cat([table, self.road_grid.expand(count, -1, -1, -1)], 1)).squeeze(1)
         off = (self.pitches - (pitch + self.pitch_offset).unsqueeze(-1)) / self.log_pitch_std.exp()
         score = score + self.log_sharpness.exp() * road - (off**2 / 2).unsqueeze(-1)
+        if two_view is not None:
+            seen = two_view[:, -1:] > 0
+            down = two_view[:, 4:5] / _PITCH_UNIT
+            off = (self.pitches - (down + self.corner_pitch_offset)) / self.log_corner_pitch_std.exp()
+            score = score - torch.where(seen, off**2 / 2, 0.0).unsqueeze(-1)
         belief = score.flatten(1).softmax(1).view_as(score)
         of_distance, of_pitch = belief.sum(1), belief.sum(2) @ self.pitches
         moved = of_distance @ self.distances
@@ -81,10 +101,24 @@ class _MotionTrunk(nn.Module):
         ahead, fitted, turn_std = _median_turn(flow), expansion.turn[:, 0], expansion.turn_std[:, 0]
         doubt = [(turn_std / _TURN_UNIT).log(), pitch_std.log()]
         trust = self.gate(torch.cat([code, torch.stack(doubt, 1)], 1)).squeeze(-1).sigmoid()
-        turned = torch.lerp(ahead, fitted, trust)
+        turned, corners = torch.lerp(ahead, fitted, trust), []
+        if two_view is not None:
+            corners = self._corner_cues(two_view, turned, pitch)
+            trust = self.corner_gate(torch.cat([code, torch.stack(doubt + corners, 1)], 1)).squeeze(-1).sigmoid()
+            turned = torch.where(seen.squeeze(-1), torch.lerp(turned, two_view[:, 0], trust), turned)
         cues = [spread / 0.2, of_pitch, (road.amax((1, 2)) - _ROAD_LOC) / _ROAD_SCALE, turned / _TURN_UNIT]
-        cues += [of_pitch - pitch, *doubt]
+        cues += [of_pitch - pitch, *doubt, *corners]
         return moved, turned, torch.cat([code, torch.stack(cues, 1)], 1)
+
+    @staticmethod
+    def _corner_cues(two_view: torch.Tensor, turned: torch.Tensor, pitch: torch.Tensor) -> list[torch.Tensor]:
+        """How sure corners are of the turn and the pitch, and how far they agree with the flow; zeros without any."""
+        left, *_, down, turn_std, pitch_std, inliers = two_view.unbind(1)
+        seen = inliers > 0
+        doubts = [(turn_std / _TURN_UNIT).clamp_min(1e-4).log() + 4, (pitch_std / _PITCH_UNIT).clamp_min(1e-4).log()]
+        # A fit that went wrong may be far off: what is compared is bounded.
+        apart = [((left - turned) / _TURN_UNIT).tanh(), (down / _PITCH_UNIT - pitch).div(4).tanh()]
+        return [torch.where(seen, cue, 0.0) for cue in (*doubts, *apart)] + [inliers]
 
 
 class FlowSensor(StochasticSensor):
@@ -107,6 +141,8 @@ class FlowSensor(StochasticSensor):
         in_keys: the flow ``[*B, 3, 25, 79]`` and the road's correlation ``[*B, 13, 69]``, any floating type, as
             written by :class:`torch_denkf.transforms.OpticalFlow` or :func:`torch_denkf.data.with_motion`.
         out_key: learned observations (v m/s, θ_dot rad/s) ``[*B, E, 2]``.
+        two_view_key: the motion of tracked corners ``[*B, 8]`` (:func:`torch_denkf.vision.two_view_motion`), if the
+            sensor is to read it as a third input: it tells the turn two to three times better than the flow does.
         encoding_key: where to write what the head reads, ``[*B, encoding_features]``; the noise model can tell a
             blurred frame from a sharp one by it. None for nowhere.
         observed_key: optional mask ``[*B, 1]``; frames that are not observed are not read.
@@ -139,6 +175,7 @@ class FlowSensor(StochasticSensor):
         rate: float = 0.1,
         trunk_dropout: float = 0.2,
         in_keys: tuple[NestedKey, NestedKey] = ("flow", "road"),
+        two_view_key: NestedKey | None = None,
         out_key: NestedKey = ("sensor", "ensemble"),
         encoding_key: NestedKey | None = ("sensor", "encoding"),
         observed_key: NestedKey = "observed",
@@ -147,20 +184,21 @@ class FlowSensor(StochasticSensor):
         check_count("ensemble_size", ensemble_size)
         check_count("features", features)
         check_number("trunk_dropout", trunk_dropout, least=0, below=1)
-        trunk = _MotionTrunk(features, trunk_dropout)
+        trunk = _MotionTrunk(features, trunk_dropout, two_view_key is not None)
         head = StochasticMLP(trunk.out_features, 2, num_cells, layer=layer, rate=rate, output_gain=0.1)
         super().__init__(
             nn.ModuleDict({"trunk": trunk, "head": head}),
-            in_keys,
+            [*in_keys, *([] if two_view_key is None else [two_view_key])],
             [out_key] if encoding_key is None else [out_key, encoding_key],
             optional_keys=[observed_key],
         )
         self.dt, self.ensemble_size, self.encoding_features = float(dt), ensemble_size, trunk.out_features
 
-    def compute(self, flow, road, observed=None, *, noise, batch_size):
+    def compute(self, *values, noise, batch_size):
         """The learned observations of every member, and the encoding if it is asked for."""
-        flow, road = self._frames(flow, 0, observed, batch_size), self._frames(road, 1, observed, batch_size)
-        moved, turned, encoding = self.module["trunk"](flow, road)
+        *inputs, observed = values
+        inputs = [self._frames(value, index, observed, batch_size) for index, value in enumerate(inputs)]
+        moved, turned, encoding = self.module["trunk"](*inputs)
         encoding = encoding.reshape(*batch_size, encoding.shape[-1])
         correction = self.module["head"](encoding.unsqueeze(-2), noise, sample=noise is not None)
         moved, turned = (value.reshape(*batch_size, 1) for value in (moved, turned))
@@ -171,7 +209,7 @@ class FlowSensor(StochasticSensor):
 
     def _frames(self, value: torch.Tensor, index: int, observed: torch.Tensor | None, batch_size) -> torch.Tensor:
         """An input as ``[N, *event]``; zeros where nothing was observed."""
-        expected = (FLOW_SHAPE, ROAD_SHAPE)[index]
+        expected = (FLOW_SHAPE, ROAD_SHAPE, TWO_VIEW_SHAPE)[index]
         if tuple(value.shape) != (*batch_size, *expected):
             raise ValueError(
                 f"FlowSensor reads {self.in_keys[index]!r} of shape [*B, {', '.join(map(str, expected))}], got "

@@ -29,7 +29,9 @@ from torch_denkf.modules._calibration import (
     chi_square_table,
     empirical_quantile,
     score_table,
+    sign_limits,
 )
+from torch_denkf.modules.signs import floors
 
 __all__ = ["InnovationMonitor", "MonitoredSensor"]
 
@@ -46,12 +48,19 @@ class MonitoredSensor(NamedTuple):
         observation_dim: O.
         observed_key: the analysis' mask ``[*B, 1]`` or ``[*B, O]``, read where it is there.
         noise_key: variances that the sensor claims ``[*B, O]``, to be watched, too; ``None`` for none.
+        sign_key: further signs of a fault ``[*B, K]``, see :class:`SignGate`, read where they are there, also in steps
+            at which the sensor is not observed; ``None`` for none.
+        signs: K.
+        floor: values up to which a sign is never large, one for all or one for each.
     """
 
     info_key: NestedKey
     observation_dim: int
     observed_key: NestedKey = "observed"
     noise_key: NestedKey | None = None
+    sign_key: NestedKey | None = None
+    signs: int = 0
+    floor: float | Sequence[float] = 0.0
 
 
 class InnovationMonitor(SubModel):
@@ -63,6 +72,8 @@ class InnovationMonitor(SubModel):
     * *Whiteness*: the correlation of successive normalised innovations over the window.
     * The *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations are then smaller
       than usual, not larger. The mean of three steps' scores; it begins to count with :meth:`calibrate`.
+    * *Signs* of any kind, such as the share of a picture that is black: the largest of one step. They, too, begin to
+      count with :meth:`calibrate`.
 
     Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
     members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
@@ -142,14 +153,15 @@ class InnovationMonitor(SubModel):
             read += [] if sensor.noise_key is None else [sensor.noise_key]
             state += [(monitor_key, name, entry) for entry in _STATE]
             optional.append(sensor.observed_key)
+            optional += [] if sensor.sign_key is None else [sensor.sign_key]
         state += [(monitor_key, "alarm"), (monitor_key, "sensor")]
         super().__init__(nn.Identity(), [*read, *state], state, optional_keys=optional)
         self.sensors, self.state_keys, self.window = dict(sensors), list(self.out_keys), window
         self.false_alarm_rate, self.reference, self.largest = false_alarm_rate, reference, largest
         self.ceiling, self.whiteness, self.monitor_key = ceiling, whiteness, monitor_key
-        claims = sum(sensor.noise_key is not None for sensor in sensors.values())
+        further = sum((sensor.noise_key is not None) + (sensor.sign_key is not None) for sensor in sensors.values())
         count = len(sensors)
-        self.share = false_alarm_rate / (count * (3 if whiteness else 2) + claims)
+        self.share = false_alarm_rate / (count * (3 if whiteness else 2) + further)
         self.register_buffer("p_limit", torch.full((count,), self.share))
         self.register_buffer("whiteness_limit", torch.full((count,), self.share))
         self.register_buffer("cusum_limit", torch.full((count,), cusum_threshold(1 / self.share, reference)))
@@ -158,6 +170,10 @@ class InnovationMonitor(SubModel):
         self.register_buffer("claims", IDENTITY.repeat(count, 1, 1))
         for name, sensor in sensors.items():
             self.register_buffer(f"scale_{name}", torch.ones(sensor.observation_dim))
+            if sensor.sign_key is not None:
+                check_count(f"signs of {name!r}", sensor.signs)
+                self.register_buffer(f"floor_{name}", floors(sensor.floor, sensor.signs))
+                self.register_buffer(f"sign_limit_{name}", torch.full((sensor.signs,), torch.inf))
 
     # ------------------------------------------------------------------------------------------------------ one step
 
@@ -195,6 +211,7 @@ class InnovationMonitor(SubModel):
             evidence.append(claim.mean(-1, keepdim=True) / self.claim_limit[place])
         if self.whiteness:
             evidence.append(_logarithms(tests.whiteness, limits[1]))
+        evidence += self._signs(name, sensor, entries)
         size = torch.cat(evidence, -1).amax(-1, keepdim=True).to(dtype)
         values = (*window, cusum, claim, tests.p_value, tests.whiteness, size)
         return dict(zip(keys, values, strict=True))
@@ -206,6 +223,13 @@ class InnovationMonitor(SubModel):
         """
         place = list(self.sensors).index(name)
         return interpolate(_claimed(noise), *self.claims[place].to(noise.dtype))
+
+    def _signs(self, name: str, sensor: MonitoredSensor, entries) -> list[Tensor]:
+        """The signs as multiples of their limits, if there are any."""
+        signs = None if sensor.sign_key is None else entries.get(unravel_key(sensor.sign_key))
+        if signs is None:
+            return []
+        return [(signs / getattr(self, f"sign_limit_{name}").to(signs.dtype)).nan_to_num(0.0, posinf=0.0)]
 
     def _read(self, sensor: MonitoredSensor, entries) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         """Normalised innovation squared, innovation, claimed noise, and how many components were observed."""
@@ -274,6 +298,12 @@ class InnovationMonitor(SubModel):
             self.tables[place] = chi_square_table(nis, sensor.observation_dim)
             if claims:
                 self.claims[place] = score_table(torch.cat(claims).double())
+            if sensor.sign_key is not None:
+                signs = [entries.get(unravel_key(sensor.sign_key)) for entries in recordings]
+                known = [each.flatten(0, -2) for each in signs if each is not None]
+                if known:
+                    limits = sign_limits(torch.cat(known), self.share, getattr(self, f"floor_{name}"), margin)
+                    getattr(self, f"sign_limit_{name}").copy_(limits)
         self._set_limits([self.replay(each) for each in clean], margin)
         return self
 

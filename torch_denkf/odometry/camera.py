@@ -12,7 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_denkf.vision import ROAD_PITCHES, ROAD_SHIFTS, CanonicalCamera, focus_of_expansion, image_motion
+from torch_denkf.vision import (
+    ROAD_PITCHES,
+    ROAD_SHIFTS,
+    CanonicalCamera,
+    focus_of_expansion,
+    image_motion,
+    two_view_motion,
+)
 
 __all__ = ["CarCamera", "check_frame"]
 
@@ -45,12 +52,21 @@ class CarCamera:
         height: over the road, in m.
         pitch: how far the camera looks up from the road, in rad.
         focal: focal length of the training images in pixels; ``None`` leaves images as they are.
+        two_view: whether corners are tracked, too.
 
     Raises:
         ValueError: if the principal point does not belong to images of this size.
     """
 
-    def __init__(self, frame: np.ndarray, calibration: list[float], height: float, pitch: float, focal: float | None):
+    def __init__(
+        self,
+        frame: np.ndarray,
+        calibration: list[float],
+        height: float,
+        pitch: float,
+        focal: float | None,
+        two_view: bool = False,
+    ):
         fx, fy, cx, cy = calibration
         rows, columns = frame.shape[:2]
         if not (0.2 * columns <= cx <= 0.8 * columns and -0.2 * rows <= cy <= 1.2 * rows):
@@ -64,7 +80,7 @@ class CarCamera:
         # Pixel centres are at whole numbers.
         self.calibration = [fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5]
         self.calibration[3] += pitch * self.calibration[1]
-        self.height, self.watch = height, _Watch(pitch)
+        self.height, self.two_view, self.watch = height, two_view, _Watch(pitch)
         # What the sensor looks at, against what the camera shows: to the sides and down to the near road.
         canonical = CanonicalCamera(240.0)
         wanted = [side / 2 / canonical.focal for side in (canonical.width, canonical.height)]
@@ -85,11 +101,14 @@ class CarCamera:
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
     def motion(self, previous: np.ndarray, current: np.ndarray) -> dict[str, Tensor]:
-        """Flow and road of a pair, rounded as for the training."""
+        """Flow and road of a pair, rounded as for the training; and how corners moved, if asked for."""
         arrays = image_motion(previous, current, self.calibration, height=self.height)
         flow, road = (torch.from_numpy(array).half().float() for array in arrays)
         self.watch(flow, road)
-        return {"flow": flow, "road": road}
+        reading = {"flow": flow, "road": road}
+        if self.two_view:
+            reading["two_view"] = torch.from_numpy(two_view_motion(previous, current, self.calibration))
+        return reading
 
 
 class _Watch:

@@ -48,6 +48,8 @@ class CarSettings:
         reach: largest distance between the two frames of a pair that the sensor can read, in m.
         features: of the sensor's code of the flow.
         num_cells: hidden layers of the sensor's head.
+        two_view: whether the sensor reads tracked corners, too (``"two_view"``, see
+            :func:`torch_denkf.vision.two_view_motion`).
         size: (H, W) that drives are scaled to.
         focal: focal length of the training images, in pixels; larger images are reduced to it. ``None`` for any.
         inflation: factor on the belief's spread in each step, chosen on validation drives.
@@ -62,6 +64,7 @@ class CarSettings:
     reach: float = 3.1
     features: int = 32
     num_cells: tuple[int, ...] = (32, 32)
+    two_view: bool = False
     size: tuple[int, int] = (100, 300)
     focal: float | None = None
     inflation: float = 1.0
@@ -96,12 +99,14 @@ class CarSettings:
 def velocity_analysis(lags: int) -> EnsembleAnalysis:
     """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
 
-    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations.
+    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
+    multiplies the present velocities alone: those of past steps would be multiplied again in each step.
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
         "sensor",
         taper=(own, torch.eye(2)),
+        inflated=VELOCITIES,
         forecast_key=("forecast", "clone"),
         observed_key=("forecast", "observed"),
         belief_key="analysis",
@@ -111,7 +116,8 @@ def velocity_analysis(lags: int) -> EnsembleAnalysis:
 class CarFilter(Filter):
     """A DEnKF for a car with one camera, built by :func:`car_filter`.
 
-    It reads ``"flow"`` and ``"road"`` (see :func:`torch_denkf.data.with_motion`), ``"observed"`` and ``"steps"``, and
+    It reads ``"flow"`` and ``"road"``, with the setting ``two_view`` also ``"two_view"`` (see
+    :func:`torch_denkf.data.with_motion`), ``"observed"`` and ``"steps"``, and
     where an episode begins ``"start"`` ``[*B, 5]``: the first state. The state is [x m forward, y m to the left,
     theta rad to the left, v m/s, theta_dot rad/s].
 
@@ -127,7 +133,13 @@ class CarFilter(Filter):
     def __init__(self, settings: CarSettings):
         s = settings
         mean, std = torch.tensor(s.velocity_mean), torch.tensor(s.velocity_std)
-        sensor = FlowSensor(dt=s.dt, ensemble_size=s.ensemble_size, features=s.features, num_cells=s.num_cells)
+        sensor = FlowSensor(
+            dt=s.dt,
+            ensemble_size=s.ensemble_size,
+            features=s.features,
+            num_cells=s.num_cells,
+            two_view_key="two_view" if s.two_view else None,
+        )
         analysis = velocity_analysis(s.lags)
         analysis.inflation = s.inflation
         modules = OrderedDict(

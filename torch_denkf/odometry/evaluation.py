@@ -112,6 +112,7 @@ def evaluate_car_filter(
                 camera=camera,
                 height=height,
                 pitch=pitch,
+                two_view=car.settings.two_view,
             )
             data = [each.read() for each in drive.spans(longest if missing else 1)]
             dt = float(data[0]["dt"][0, 0])

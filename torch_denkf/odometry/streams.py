@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.data import frames_at, mirror_drive, read_kitti_drive, steps_between, with_motion
+from torch_denkf.data.kitti.frames import MOTION_KEYS
 from torch_denkf.modules import FlowSensor
 from torch_denkf.odometry.car import VELOCITIES
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
@@ -56,6 +57,7 @@ class Drive:
         height: of the camera over the road, in m.
         weight: share of the batches.
         camera: folder of the images; by default the first that has any.
+        two_view: whether corners are tracked, too.
     """
 
     root: Path
@@ -68,6 +70,7 @@ class Drive:
     height: float = KITTI_HEIGHT
     weight: float = 1.0
     camera: str | None = None
+    two_view: bool = False
 
     def disturbed(self) -> list[Drive]:
         """This drive clean, and with half as much weight in all disturbances together."""
@@ -99,7 +102,7 @@ class Drive:
         valid = drive["frame_valid"]
         paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
         drive["steps"] = self.steps * paired.long()
-        return with_motion(drive, height=self.height, cache=self.cache, keep_images=False)
+        return with_motion(drive, height=self.height, cache=self.cache, keep_images=False, two_view=self.two_view)
 
 
 def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
@@ -129,7 +132,7 @@ def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored:
         for index in torch.arange(len(data)).split(256):
             frames = rows(data, index, longest)
             frames = (mirror(frames) if mirrored else frames).to(device)
-            readings.append(sensor(frames).exclude("flow", "road").cpu())
+            readings.append(sensor(frames).exclude(*MOTION_KEYS).cpu())
     sensor.train(was_training)
     return TensorDict.cat(readings)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_denkf._checks import check_number
 from torch_denkf.odometry.camera import CarCamera, check_frame
 from torch_denkf.odometry.car import VELOCITIES, CarFilter
-from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
+from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, TWO_VIEW_SHAPE
 
 __all__ = ["TrackedBelief", "track"]
 
@@ -144,7 +144,7 @@ def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterato
             continue
         image, reading, between = None, None, 0
         if frame is not None:
-            camera = camera or CarCamera(frame, calibration, height, pitch, settings.focal)
+            camera = camera or CarCamera(frame, calibration, height, pitch, settings.focal, settings.two_view)
             image = camera.image(frame, number)
             if last is not None and step - last.step <= settings.longest:
                 reading, between = camera.motion(last.image, image), step - last.step
@@ -256,6 +256,8 @@ class _Run:
     def step(self, reading: dict[str, Tensor] | None, between: int) -> None:
         """One step of the filter; without a reading the belief is the forecast."""
         blank = {"flow": torch.zeros(FLOW_SHAPE), "road": torch.zeros(ROAD_SHAPE)}
+        if self.car.settings.two_view:
+            blank["two_view"] = torch.zeros(TWO_VIEW_SHAPE)
         frame = TensorDict(blank if reading is None else reading)
         frame["observed"], frame["steps"] = torch.tensor([reading is not None]), torch.tensor([between])
         frame.update(self.carry.select(*self.car.carry_keys))

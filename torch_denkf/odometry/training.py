@@ -83,7 +83,7 @@ def train_car_filter(
     2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are lost on purpose, and
        windows begin at a wrong velocity, or the filter would learn to ignore its sensor;
     3. both end to end, but for the noise model, which knows by now how wrong the sensor is on new drives;
-    4. one number, the inflation, so that the 90 % intervals hold 90 % of the true velocities of the validation drives.
+    4. one number, the inflation, by the CRPS of the velocities times the path's error on the validation drives.
 
     A call that is repeated goes on where the last one ended, also after a kill, and leaves the same weights.
 
@@ -125,7 +125,7 @@ def train_car_filter(
     if root is None and named:
         raise ValueError(f"{named} name recorded drives, but there is no folder of them; pass root (--root), too")
     out, updates, longest = Path(out).expanduser(), updates or Updates(), CarSettings.longest
-    common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache"}
+    common: dict[str, Any] = {"size": (int(size[0]), int(size[1])), "cache": out / "cache", "two_view": True}
     recorded = recorded_drives(root, drives, leave_out, height=height, **common) if root is not None else []
     options: dict[str, Any] = {"frames": frames, "seed": seed, "processes": processes, "progress": progress}
     roles = drives_by_role(recorded, rendered_drives(out / "rendered", rendered, **options, **common))
@@ -184,6 +184,7 @@ def _settings(drives: Sequence[Drive], data: dict[Drive, TensorDict]) -> CarSett
         dt=round(float(clean[0]["dt"][0, 0]), 6),
         velocity_mean=(float(v.mean()), 0.0),
         velocity_std=(float(v.std()), float(theta_dot.square().mean().sqrt())),
+        two_view=drives[0].two_view,
         size=drives[0].size,
         focal=focal,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 
 import torch
@@ -20,7 +21,8 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
             each time, so that candidates differ in nothing else.
 
     Returns:
-        the best candidate, which is set; of equally good ones the first. An error of NaN never wins.
+        the best candidate, which is set; of equally good ones the first. An error of NaN never wins. A warning says
+        where the best one is the last, as a grid that ends too early has it.
 
     Raises:
         ValueError: if there are no candidates, or none has a finite error.
@@ -28,7 +30,7 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
     Example:
         >>> settings = {}
         >>> apply = lambda value: settings.update(inflation=value)
-        >>> choose([0.5, 1.0, 2.0], apply, error=lambda: (settings["inflation"] - 1.8) ** 2)
+        >>> choose([0.5, 1.0, 2.0, 4.0], apply, error=lambda: (settings["inflation"] - 1.8) ** 2)
         2.0
         >>> settings
         {'inflation': 2.0}
@@ -41,6 +43,8 @@ def choose(candidates: Sequence[float], apply: Callable[[float], object], error:
     if not finite:
         raise ValueError(f"none of the candidates has a finite error: {errors}; look for NaN in the held-out data.")
     best = min(finite, key=lambda value: finite[value])
+    if len(candidates) > 2 and best == candidates[-1]:
+        warnings.warn(f"the best of {list(candidates)} is the last; candidates beyond it may be better", stacklevel=3)
     apply(best)
     return best
 

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from torch_denkf.vision.camera import CanonicalCamera
-from torch_denkf.vision.shapes import FLOW_SHAPE
+from torch_denkf.vision.shapes import FLOW_SHAPE, FOCUS_PRIOR, FOCUS_STD
 
-__all__ = ["Expansion", "focus_of_expansion"]
+__all__ = ["Expansion", "coarse_cells", "focus_of_expansion"]
 
-_FOCUS, _FOCUS_STD = (0.0, -0.01), (0.06, 0.05)  # before anything is seen: a camera looks where the car goes
 _TURN_STD = 0.3  # rad, of each angle: no prior, but a car that stands still needs one
 _ITERATIONS = 7
 _EVERY = 2  # of the columns: neighbours say nearly the same
@@ -78,11 +77,13 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
     if tuple(flow.shape[1:]) != FLOW_SHAPE:
         raise ValueError(f"a coarse flow has the shape [N, {', '.join(map(str, FLOW_SHAPE))}]; got {list(flow.shape)}")
     dtype = torch.promote_types(flow.dtype, torch.float32)
+    height, width = FLOW_SHAPE[1:]
     right, down, mismatch = flow[..., _EVERY // 2 :: _EVERY].to(dtype).flatten(2).unbind(1)
-    x, y = _cells().to(flow.device, dtype)
+    cells = coarse_cells().to(flow.device, dtype).view(2, height, width)
+    x, y = cells[..., _EVERY // 2 :: _EVERY].flatten(1)
     trust = (1 - mismatch).clamp_min(0).square()
-    prior = torch.tensor([0.0, 0.0, 0.0, *_FOCUS], dtype=dtype, device=flow.device)
-    precision = torch.tensor([_TURN_STD] * 3 + list(_FOCUS_STD), dtype=dtype, device=flow.device) ** -2
+    prior = torch.tensor([0.0, 0.0, 0.0, *FOCUS_PRIOR], dtype=dtype, device=flow.device)
+    precision = torch.tensor([_TURN_STD] * 3 + list(FOCUS_STD), dtype=dtype, device=flow.device) ** -2
     estimate = prior.expand(len(flow), 5)
     for _ in range(_ITERATIONS):
         residual, jacobian, far = _across(right, down, x, y, estimate)
@@ -118,11 +119,11 @@ def _across(right: Tensor, down: Tensor, x: Tensor, y: Tensor, estimate: Tensor)
     return residual, torch.stack([*of_turn, -lever * along_y, lever * along_x], 1), distance > _NEAR
 
 
-def _cells() -> Tensor:
-    """Middles of the cells that are read, to the right and down, ``[2, K]``, in tangents."""
+def coarse_cells() -> Tensor:
+    """Middles of the cells of a coarse flow, to the right and down, ``[2, 25 * 79]``, in tangents."""
     camera, (_, height, width) = CanonicalCamera(240.0), FLOW_SHAPE
     across, along = (size / 2 / camera.focal for size in (camera.width, camera.height))
     columns = ((torch.arange(width) + 0.5) / width * 2 - 1) * across
     rows = ((torch.arange(height) + 0.5) / height * 2 - 1) * along
-    y, x = torch.meshgrid(rows, columns[_EVERY // 2 :: _EVERY], indexing="ij")
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack([x.flatten(), y.flatten()])

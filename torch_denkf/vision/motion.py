@@ -6,16 +6,21 @@ import cv2
 import numpy as np
 
 from torch_denkf.vision.camera import KITTI_HEIGHT, CanonicalCamera
+from torch_denkf.vision.exposure import same_exposure
 from torch_denkf.vision.flow import coarse_flow, dense_flow, median_turn
+from torch_denkf.vision.hidden import continue_flow, continue_picture
 from torch_denkf.vision.road import road_correlation
 
 __all__ = ["image_motion"]
 
-_LEAST_CONTRAST = 8.0  # grey levels between the quartiles: darker or flatter images are no exposure of a street
-
 
 def image_motion(
-    previous: np.ndarray, current: np.ndarray, calibration, *, height: float = KITTI_HEIGHT
+    previous: np.ndarray,
+    current: np.ndarray,
+    calibration,
+    *,
+    height: float = KITTI_HEIGHT,
+    hidden: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarse optical flow and road correlation between two images of one calibrated camera.
 
@@ -28,6 +33,9 @@ def image_motion(
         current: grey image ``[H, W]``, uint8.
         calibration: (fx, fy, cx, cy) in pixels of the images.
         height: of the camera over the road, in m.
+        hidden: where something hides the street in both images, ``[H, W]``, bool, see
+            :func:`torch_denkf.vision.static_region`: pictures and flow are continued over it from around it. ``None``
+            for nowhere.
 
     Returns:
         The flow, ``FLOW_SHAPE`` (see :func:`coarse_flow`), and the correlation of the road, ``ROAD_SHAPE`` (see
@@ -43,19 +51,15 @@ def image_motion(
     """
     camera = CanonicalCamera.near(calibration)
     previous, current = (camera.view(cv2.medianBlur(image, 3), calibration) for image in (previous, current))
-    previous, current = _same_exposure(previous, current)
+    previous, current = same_exposure(previous, current)
+    hole = None if hidden is None or not hidden.any() else camera.view(hidden.astype(np.uint8), calibration) > 0
+    if hole is not None:
+        previous, current = (continue_picture(image, hole) for image in (previous, current))
     flow = dense_flow(previous, current, camera)
+    if hole is not None:
+        flow, mismatch = continue_flow(flow, coarse_flow(flow, previous, current, camera), hole, camera)
     road = road_correlation(previous, current, camera, median_turn(flow), height)
-    return coarse_flow(flow, previous, current, camera), road
-
-
-def _same_exposure(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both images with the quartiles of the one with more contrast; images without any stay as they are."""
-    (low, high), (other_low, other_high) = (np.percentile(image, (25, 75)) for image in (first, second))
-    if high - low > other_high - other_low:
-        return _same_exposure(second, first)[::-1]
-    if high - low < _LEAST_CONTRAST:
-        return first, second
-    gain = (other_high - other_low) / (high - low)
-    matched = cv2.convertScaleAbs(np.maximum(gain * (first.astype(np.float32) - low) + other_low, 0))
-    return matched, second
+    coarse = coarse_flow(flow, previous, current, camera)
+    if hole is not None:
+        coarse[2] = mismatch
+    return coarse, road

@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.common.arms import ArmRecipe, AtRest
 from benchmarks.common.recipes import Registry
 from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.motion import ERRORS, FADING, NOISY, RATES, SIZE, ArmMotion, BiasedReading
+from benchmarks.ur5.motion import ACCELERATIONS, ERRORS, FADING, NOISY, RATES, SIZE, ArmMotion, BiasedReading
 from benchmarks.ur5.sensors import MEMBERS, NearForecast, Preset, Statistics
 from torch_denkf.filters import Filter
 from torch_denkf.modules import BlackIsMissing, DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
@@ -44,7 +44,7 @@ class UR5Recipe(ArmRecipe):
     """
 
     dims, unit, scaled = range(STATE), ERRORS, (ScaledNoise, NearForecast)
-    rates = RATES
+    rates, moved = ACCELERATIONS, (range(JOINTS), RATES)
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class UR5Recipe(ArmRecipe):
 
     @property
     def process_std(self) -> Tensor:
-        """What motion and bias do not know before training: 0.5 mm, usual accelerations; biases stay as large."""
+        """What motion and bias do not know before training: 0.5 mm, usual jerks; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
-        return torch.cat([torch.full((3,), 0.0005), self.facts.acceleration, slow])[: len(self.noisy)]
+        return torch.cat([torch.full((3,), 0.0005), self.facts.jerk, slow])[: len(self.noisy)]
 
     def _process_noise(self) -> SubModel:
         facts, blind = self.facts, self.size - SIZE
@@ -88,25 +88,25 @@ class UR5Recipe(ArmRecipe):
             len(self.noisy),
             r=self.process_std,
             in_features=self.size,
-            loc=torch.cat([facts.loc, torch.zeros(JOINTS + blind)]),
-            scale=torch.cat([facts.scale, facts.rate, torch.full((blind,), torch.inf)]),
+            loc=torch.cat([facts.loc, torch.zeros(2 * JOINTS + blind)]),
+            scale=torch.cat([facts.scale, facts.rate, facts.acceleration, torch.full((blind,), torch.inf)]),
             in_key=("belief", "mean"),
             out_key=("forecast", "noise"),
         )
 
     @property
     def start_std(self) -> Tensor:
-        """How wrong training windows begin, ``[17]``."""
+        """How wrong training windows begin, ``[24]``."""
         # As far as a filter is off in the long run, or it learns to hold on to where it began.
         wrong = torch.maximum(2 * INITIAL * self.facts.scale, self.error)
-        return torch.cat([wrong, 0.3 * self.facts.rate])
+        return torch.cat([wrong, 0.3 * self.facts.rate, 0.5 * self.facts.acceleration])
 
     def _with_bias(self, std: Tensor) -> Tensor:
         return torch.cat([std, WHITE * self.error])[: self.size]
 
     def initial(self) -> TensorDictModuleBase:
         """The belief at the start of an episode: near the true state, at rest."""
-        std = torch.cat([INITIAL * self.facts.scale, torch.zeros(JOINTS)])
+        std = torch.cat([INITIAL * self.facts.scale, torch.zeros(SIZE - STATE)])
         return AtRest(self.belief(self._with_bias(std), "state"), self.size, STATE)
 
     def build(self) -> Filter:

@@ -21,19 +21,25 @@ def localisation(size: int) -> tuple[Tensor, Tensor]:
 
     128 members show correlations of 0.09 where there are none. What one joint's reading says of another, and all of
     them of the place, goes through the kinematics alone; the gripper's opening has nothing to do with the others.
-    Rates and biases go with their joint.
+    Rates, accelerations and biases go with their joint.
     """
     readings = torch.eye(STATE)
     for row in ARM:
         for column in ARM:
             places = (row >= JOINTS) + (column >= JOINTS)
             readings[row, column] = 1.0 if row == column or places == 2 else PLACE_TAPER if places else ARM_TAPER
-    return torch.cat([readings, readings[:JOINTS], readings])[:size], readings
+    return torch.cat([readings, readings[:JOINTS], readings[:JOINTS], readings])[:size], readings
 
 
 @register
 class DEnKF(UR5Recipe):
-    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples."""
+    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples.
+
+    Attributes:
+        scheme: of the update: trained with ``"sensor"``, it may be run with another one on the samples' mean.
+    """
+
+    scheme = "sensor"
 
     def modules(self):
         return OrderedDict(
@@ -41,7 +47,7 @@ class DEnKF(UR5Recipe):
             transition=NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True),
             near=NearForecast(self.preset),
             observation=self.observation(),
-            analysis=EnsembleAnalysis("sensor", taper=localisation(self.size), sensor_key=NEAR),
+            analysis=EnsembleAnalysis(self.scheme, taper=localisation(self.size), sensor_key=NEAR),
         )
 
     def belief(self, std, state_key):

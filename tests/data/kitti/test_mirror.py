@@ -106,3 +106,15 @@ def test_errors_say_what_to_do(town):
     torch.testing.assert_close(mirror_drive(light, width=150)["calibration"], expected)
     with pytest.raises(ValueError, match=r"'state' is \(x, y, θ, v, θ_dot\), got 4 columns"):
         mirror_drive(TensorDict({"state": torch.zeros(2, 4)}, [2]))
+
+
+def test_corners_of_mirrored_images_move_as_the_mirrored_motion_says(town):
+    drive = mirror_drive(town)
+    seen = with_motion(drive, cache=None, two_view=True)["two_view"]
+    told = mirror_drive(with_motion(town, cache=None, two_view=True))["two_view"]
+    there = (seen[:, -1] > 0) & (told[:, -1] > 0)
+    assert there.sum() > 15
+    # Another choice of corners: the error of the turn, a tenth of a pixel.
+    assert (seen - told)[there, 0].abs().median() < 6e-4
+    assert (seen - told)[there, 4].abs().median() < 6e-3
+    assert told[there, 0].abs().max() > 3e-3  # it turns

@@ -15,7 +15,7 @@ from torch_denkf.data.kitti.gaps import steps_at
 
 __all__ = ["drive_frames", "frames_at", "sample_windows"]
 
-MOTION_KEYS = ("flow", "road")  # what with_motion adds
+MOTION_KEYS = ("flow", "road", "two_view")  # what with_motion adds
 
 
 def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
@@ -28,6 +28,7 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
                                   where the drive has ``image``
     ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.data.with_motion`
     ``road``     ``[*B,p,s]``     float32, likewise
+    ``two_view`` ``[*B,8]``       float32, likewise
     ``state``    ``[*B,5]``       float32, see :func:`torch_denkf.data.read_kitti_drive`
     ``observed`` ``[*B,1]``       bool: both frames are there, so that the difference means something
     ``steps``    ``[*B,1]``       int64, where the drive has it: steps between the two frames, which then need not be

@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 __all__ = ["mirror_drive"]
 
 _STATE_SIGNS = (1.0, -1.0, -1.0, 1.0, -1.0)  # x, y, θ, v, θ_dot
+_TWO_VIEW_SIGNS = (-1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0)  # left, up, around; right, down; what has no side
 
 
 def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDict:
@@ -20,6 +21,7 @@ def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDi
     ==================== ==========================================================================================
     ``image, pixels``    flipped from left to right
     ``flow``             flipped, and the sign of its first channel, the motion to the right
+    ``two_view``         signs of the turns to the left and around, and of the focus to the right
     ``state``            signs of y, θ and θ_dot
     ``calibration``      cx becomes ``width - 1 - cx``, as pixel centres are at whole numbers
     ==================== ==========================================================================================
@@ -55,6 +57,8 @@ def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDi
         flow = drive["flow"].flip(-1)
         flow[..., 0, :, :].neg_()
         mirrored["flow"] = flow
+    if "two_view" in drive:
+        mirrored["two_view"] = drive["two_view"] * drive["two_view"].new_tensor(_TWO_VIEW_SIGNS)
     if "state" in drive:
         state = drive["state"]
         if state.shape[-1] != len(_STATE_SIGNS):

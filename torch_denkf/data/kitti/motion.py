@@ -12,7 +12,17 @@ from tensordict import TensorDict, TensorDictBase
 from torch_denkf._checks import check_number
 from torch_denkf.data.cache import cache_folder, cached
 from torch_denkf.data.kitti.gaps import after_gap, steps_at
-from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE, image_motion
+from torch_denkf.vision import (
+    FLOW_SHAPE,
+    KITTI_HEIGHT,
+    PICTURE_SIGNS,
+    ROAD_SHAPE,
+    TWO_VIEW_SHAPE,
+    image_motion,
+    picture_signs,
+    static_region,
+    two_view_motion,
+)
 
 __all__ = ["with_motion"]
 
@@ -25,17 +35,23 @@ def with_motion(
     height: float = KITTI_HEIGHT,
     cache: str | Path | bool | None = True,
     keep_images: bool = True,
+    two_view: bool = False,
+    signs: bool = False,
+    repair: bool = False,
 ) -> TensorDict:
     """Adds what the flow sensor reads to a drive: the motion of each image since the one before.
 
-    ======== =============== ==========================================================================================
-    key      shape           content
-    ======== =============== ==========================================================================================
-    ``flow`` [N, 3, 25, 79]  float16: coarse optical flow and its mismatch, see :func:`torch_denkf.vision.coarse_flow`
-    ``road`` [N, 13, 69]     float16: see :func:`torch_denkf.vision.road_correlation`
-    ======== =============== ==========================================================================================
+    ========= =============== =========================================================================================
+    key       shape           content
+    ========= =============== =========================================================================================
+    ``flow``  [N, 3, 25, 79]  float16: coarse optical flow and its mismatch, see :func:`torch_denkf.vision.coarse_flow`
+    ``road``  [N, 13, 69]     float16: see :func:`torch_denkf.vision.road_correlation`
+    ``signs`` [N, 4]          with ``signs=True``, float32: see :func:`torch_denkf.vision.picture_signs`
+    ========= =============== =========================================================================================
 
-    Both are zero in rows whose image, or the one before, is missing; after :func:`torch_denkf.data.bridge_gaps` the one
+    With ``two_view`` also ``"two_view"`` ``[N, 8]``, float32: see :func:`torch_denkf.vision.two_view_motion`.
+
+    All are zero in rows whose image, or the one before, is missing; after :func:`torch_denkf.data.bridge_gaps` the one
     before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
     25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
 
@@ -45,9 +61,13 @@ def with_motion(
         height: of the camera over the road, in m.
         cache: as in :func:`torch_denkf.data.read_kitti_drive`.
         keep_images: False leaves the images out of the result, which makes it light.
+        two_view: also track corners, for a sensor that reads them; 12 ms a frame at 125 x 414 pixels.
+        signs: whether the images' signs of a failing camera are added.
+        repair: whether the flow is continued over what stands still before the moving camera, see
+            :func:`torch_denkf.vision.static_region`: dirt, or a box.
 
     Returns:
-        A shallow copy of the drive, with both entries.
+        A shallow copy of the drive, with these entries.
 
     Raises:
         KeyError: if the drive lacks images, their mask or the calibration.
@@ -67,13 +87,16 @@ def with_motion(
         raise KeyError(f"the drive lacks {sorted(missing)}; pass what torch_denkf.data.read_kitti_drive returns")
 
     def compute() -> TensorDict:
-        return _compute(drive, height)
+        return _compute(drive, height, signs, repair, two_view)
 
     directory = cache_folder(cache)
     if directory is None:
         motion = compute()
     else:
-        digest = hashlib.blake2b(f"{_FORMAT} {height} {tuple(drive['image'].shape)}".encode(), digest_size=10)
+        options = f" {signs} {repair}" if signs or repair else ""
+        options += " two_view" * two_view
+        key = f"{_FORMAT} {height} {tuple(drive['image'].shape)}{options}"
+        digest = hashlib.blake2b(key.encode(), digest_size=10)
         for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
             digest.update(drive[key].contiguous().numpy().data)
         after = after_gap(drive)
@@ -81,20 +104,30 @@ def with_motion(
             digest.update(after.contiguous().numpy().data)
         motion = cached(directory / f"motion-{digest.hexdigest()}", compute)
     drive = drive.copy() if keep_images else drive.exclude("image")
-    return drive.update({"flow": motion["flow"], "road": motion["road"]})
+    return drive.update({key: motion[key] for key in ("flow", "road", "signs", "two_view") if key in motion})
 
 
-def _compute(drive: TensorDictBase, height: float) -> TensorDict:
+def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool, two_view: bool) -> TensorDict:
     rows = drive.batch_size[0]
     flow = torch.zeros(rows, *FLOW_SHAPE, dtype=torch.float16)
     road = torch.zeros(rows, *ROAD_SHAPE, dtype=torch.float16)
+    motion = {"flow": flow, "road": road}
+    if signs:
+        motion["signs"] = torch.zeros(rows, len(PICTURE_SIGNS))
+    if two_view:
+        motion["two_view"] = torch.zeros(rows, *TWO_VIEW_SHAPE)
     steps, calibration = steps_at(drive, torch.arange(rows)).squeeze(-1).tolist(), drive["calibration"].tolist()
     for row in range(rows):
         if steps[row]:
             previous, current = (_grey(drive["image"][at]) for at in (row - steps[row], row))
-            arrays = image_motion(previous, current, calibration[row], height=height)
+            hidden = {"hidden": static_region(previous, current)} if repair else {}
+            arrays = image_motion(previous, current, calibration[row], height=height, **hidden)
             flow[row], road[row] = (torch.from_numpy(array).half() for array in arrays)
-    return TensorDict({"flow": flow, "road": road}, batch_size=[rows])
+            if signs:
+                motion["signs"][row] = torch.from_numpy(picture_signs(previous, current))
+            if two_view:
+                motion["two_view"][row] = torch.from_numpy(two_view_motion(previous, current, calibration[row]))
+    return TensorDict(motion, batch_size=[rows])
 
 
 def _grey(image: torch.Tensor):

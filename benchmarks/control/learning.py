@@ -1,0 +1,94 @@
+"""A filter that learns from what a policy collects: from readings and actions alone, or with the simulator's states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from torch_denkf.filters import DEnKF
+from torch_denkf.modules import ConstantNoise, GaussianPrior
+from torch_denkf.objectives import DEnKFLoss
+
+PARTS = ("transition", "observation", "noise", "analysis")
+LEAST = 0.01  # of the noises, in the readings' and the states' units: without any, an ensemble collapses
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Of a filter.
+
+    Attributes:
+        window: steps of a window that is learned from.
+        windows: in an update.
+        first: updates before the policy moves, on one batch of random actions.
+        further: updates after each of the policy's batches.
+        noise_lr: learning rate of the noises' logarithms; that of the rest is 1e-2.
+    """
+
+    window: int = 16
+    windows: int = 32
+    first: int = 150
+    further: int = 10
+    noise_lr: float = 3e-2
+
+
+class Learner:
+    """Trains a filter on random windows of a replay buffer of episodes.
+
+    A window begins anywhere in an episode, where little is known: its filter has the same parts, and a wide prior.
+
+    Args:
+        filter: trained in place.
+        prior: mean and standard deviations of a state anywhere in an episode, ``[S]``.
+        episodes: that will come.
+        settings: the task's.
+        taught: whether the true states are scored (fair CRPS), and not the likelihood of the readings.
+    """
+
+    def __init__(
+        self,
+        filter: DEnKF,
+        prior: tuple[Sequence[float], Sequence[float]],
+        episodes: int,
+        settings: Learning,
+        taught: bool = False,
+    ):
+        self.filter, self.length = filter, settings.window
+        start = GaussianPrior(*prior, ensemble_size=filter.initial.ensemble_size)
+        parts = {name: filter[name] for name in PARTS}
+        within = DEnKF(sensor=None, **parts, initial=start, update_at_reset=True)
+        scale = torch.tensor(prior[1])
+        self.loss = DEnKFLoss(within, sensor=0.0, state_scale=scale) if taught else DEnKFLoss.ad_enkf(within)
+        noises = [module.log_variance for module in filter.modules() if isinstance(module, ConstantNoise)]
+        others = [p for p in filter.parameters() if all(p is not noise for noise in noises)]
+        self.optimiser = torch.optim.Adam([{"params": others}, {"params": noises, "lr": settings.noise_lr}], lr=1e-2)
+        self.noises = noises
+        self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimiser, 0.997)
+        self.episodes = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=settings.windows)
+
+    def add(self, data: TensorDict) -> None:
+        """Keeps episodes ``[B, T]``."""
+        self.episodes.extend(data.select("observation", "observed", "action", "state"))
+
+    def update(self, updates: int) -> float:
+        """Makes some updates; the last one's loss."""
+        value = torch.zeros(())
+        for _ in range(updates):
+            episodes = self.episodes.sample()
+            start = torch.randint(episodes.shape[1] - self.length + 1, ())
+            value = sum(self.loss(episodes[:, start : start + self.length]).values())
+            self.optimiser.zero_grad()
+            value.backward()
+            nn.utils.clip_grad_norm_(self.filter.parameters(), 1.0)
+            self.optimiser.step()
+            self.schedule.step()
+            with torch.no_grad():
+                for log_variance in self.noises:
+                    log_variance.clamp_(min=2 * math.log(LEAST))
+        return value.item()

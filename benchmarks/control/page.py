@@ -1,0 +1,150 @@
+"""Tables and picture of the study: interquartile means over seeds, with bootstrap intervals."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import bootstrap, trim_mean
+
+from benchmarks.common.arguments import processor
+from benchmarks.common.plots import plt, save
+from benchmarks.common.tables import Columns, head, line, pick
+from benchmarks.control.arms import ARMS
+
+TITLES = {"hike": "Mountain hike", "pendulum": "Pendulum without velocity"}
+COLUMNS = Columns(
+    names=("task", "cell", "arm", "seed", "env_steps", "return", "wall_s"),
+    text=("task", "cell", "arm"),
+    whole=("seed", "env_steps"),
+    order=lambda row: (
+        list(TITLES).index(row["task"]),
+        row["cell"],
+        list(ARMS).index(row["arm"]),
+        row["seed"],
+        row["env_steps"],
+    ),
+)
+
+
+def interquartile_mean(values: Sequence[float], axis: int = -1):
+    """The mean of the middle half."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def summary(values: Sequence[float]) -> tuple[float, float, float]:
+    """The interquartile mean, and the bounds of its 95 % percentile bootstrap interval over seeds."""
+    center = float(interquartile_mean(values))
+    if len(values) < 2 or np.ptp(values) == 0:
+        return center, np.nan, np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        interval = bootstrap((np.asarray(values),), interquartile_mean, method="percentile", rng=0)
+    return center, *map(float, interval.confidence_interval)
+
+
+def last(rows: Sequence[dict]) -> list[dict]:
+    """The rows at the end of their runs."""
+    most = max((row["env_steps"] for row in rows), default=0)
+    return [row for row in rows if row["env_steps"] == most]
+
+
+def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]:
+    """The final returns, by seed; of what reads the truth those of the cell without noise."""
+    chosen = pick(rows, task=task, arm=arm) if arm == "truth" else pick(rows, task=task, cell=cell, arm=arm)
+    return [row["return"] for row in last(chosen)]
+
+
+def cells(rows: Sequence[dict], task: str) -> list[str]:
+    """Names of a task's cells, in order."""
+    return list(dict.fromkeys(row["cell"] for row in pick(rows, task=task)))
+
+
+def arms(rows: Sequence[dict], task: str) -> list[str]:
+    """Names of a task's arms, in order."""
+    present = {row["arm"] for row in pick(rows, task=task)}
+    return [arm for arm in ARMS if arm in present]
+
+
+def reached(rows: Sequence[dict], task: str, cell: str, arm: str) -> str:
+    """Environment steps after which the interquartile mean first is the LSTM's final one, in thousands."""
+    goal = float(interquartile_mean(returns(rows, task, cell, "LSTM")))
+    chosen = pick(rows, task=task, cell=cell, arm=arm)
+    for steps in sorted({row["env_steps"] for row in chosen}):
+        if interquartile_mean([row["return"] for row in chosen if row["env_steps"] == steps]) >= goal:
+            return f"{steps / 1000:.0f}"
+    return "never"
+
+
+def page(rows: Sequence[dict]) -> str:
+    """The tables."""
+    drawn = any(len(noises(rows, task)) > 1 for task in TITLES)
+    lines = ["# Policies that read a belief, against policies that remember", ""]
+    for task, title in TITLES.items():
+        names = arms(rows, task)
+        if not names:
+            continue
+        lines += [f"## {title}", "", "Return of a test episode: interquartile mean over seeds, 95 % interval.", ""]
+        lines += head("cell", "seeds", *names)
+        for cell in cells(rows, task):
+            found = [returns(rows, task, cell, arm) for arm in names]
+            lines.append(line(cell, len(found[0]), *map(_text, found)))
+        others = [arm for arm in ("LSTM", "GRU", "Kalman") if arm in names]
+        lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
+        lines += head("cell", *others)
+        for cell in cells(rows, task):
+            belief = np.array(returns(rows, task, cell, "belief mean"))
+            lines.append(line(cell, *(_text(belief - returns(rows, task, cell, other)) for other in others)))
+        lines += [
+            "",
+            "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
+            "",
+        ]
+        learning = [arm for arm in names if arm != "truth"]
+        lines += head("cell", *learning)
+        for cell in cells(rows, task):
+            lines.append(line(cell, *(reached(rows, task, cell, arm) for arm in learning)))
+        lines += ["", "Seconds of one core for a run, median over cells and seeds.", "", *head(*names)]
+        ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
+        lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
+    lines += [
+        "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth is the",
+        "same in all cells, and runs in the one without noise.",
+        "",
+        *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
+        "* Command: `python -m benchmarks.control`. A seed counts where all arms of a cell have run with it.",
+        f"* Hardware: {processor()}; torch {torch.__version__}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _text(values: Sequence[float]) -> str:
+    center, low, high = summary(values)
+    return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
+    """Noises of a task's cells in which all readings come."""
+    return {cell: float(cell.split()[1]) for cell in cells(rows, task) if "missing" not in cell}
+
+
+def draw(rows: Sequence[dict], file: Path) -> None:
+    """Return against the noise of the readings, where all come: a line for each arm of tasks that have two noises."""
+    tasks = [task for task in TITLES if len(noises(rows, task)) > 1]
+    if not tasks:
+        return
+    figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
+    for axis, task in zip(axes[0], tasks, strict=True):
+        for number, arm in enumerate(arms(rows, task)):
+            chosen = noises(rows, task).items()
+            points = sorted((noise, *summary(returns(rows, task, cell, arm))) for cell, noise in chosen)
+            noise, center, low, high = np.array(points).T
+            style = "--" if arm in ("truth", "Kalman") else "-"
+            axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{number}", label=arm)
+            axis.fill_between(noise, low, high, color=f"C{number}", alpha=0.12, linewidth=0)
+        axis.set(title=TITLES[task], xlabel="standard deviation of a reading", ylabel="return of an episode")
+        axis.legend(fontsize=8)
+    save(figure, file)

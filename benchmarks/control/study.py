@@ -1,0 +1,86 @@
+"""The study: its options, its cells, its jobs."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from benchmarks.common.arguments import parse, some_of
+from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.tables import write_page
+from benchmarks.control.page import COLUMNS, draw, page
+from benchmarks.control.run import Budget, run
+
+BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
+MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
+CELLS = {  # noise of readings, and missing share; those that say most come first
+    "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
+    "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
+}
+READERS = {
+    "hike": ("Kalman", *BELIEFS, *MEMORIES),
+    "pendulum": (*BELIEFS, "belief mean, taught", *MEMORIES),
+}  # of each cell; what reads the truth is the same in all cells, and runs in the one without noise
+
+
+@dataclass(frozen=True)
+class Study:
+    """Policies that read a belief, against policies that remember. See benchmarks/control/README.md."""
+
+    out: Path = Path("runs/control")  # a run that was broken off goes on from here
+    tasks: some_of(CELLS) = tuple(CELLS)
+    cells: int = 6  # the first so many of each task
+    seeds: int = 5  # 0 only makes the tables of what is there
+    processes: int = 1
+    smoke: bool = False  # a tiny run of two cells: does it run?
+
+
+def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
+    """The arms that run in a cell."""
+    return (*READERS[task], "truth") if cell == (0.0, 0.0) else READERS[task]
+
+
+def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int) -> Path:
+    """Where a run leaves its rows."""
+    name = arm.replace(", ", "-").replace(" ", "-")
+    return study.out / "parts" / task / f"{cell[0]:g}-{cell[1]:g}" / f"{name}-{seed}.json"
+
+
+def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
+    """All runs with a seed."""
+    for task in study.tasks:
+        for cell in CELLS[task][: study.cells]:
+            for arm in arms_of(task, cell):
+                yield partial(once, part(study, task, cell, arm, seed), partial(run, task, cell, arm, seed, budget))
+
+
+def complete(study: Study) -> list[dict]:
+    """The rows of seeds with which all arms of a cell have run."""
+    files = []
+    for task in study.tasks:
+        for cell in CELLS[task]:
+            for seed in range(100):
+                found = [part(study, task, cell, arm, seed) for arm in arms_of(task, cell)]
+                files += found if all(file.exists() for file in found) else []
+    return sorted(read_rows(files), key=COLUMNS.order)
+
+
+def main() -> None:
+    """Runs the study; one that was broken off goes on."""
+    study, budget = parse(Study), Budget()
+    if study.smoke:
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
+        budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, updates=0.02)
+        for task in CELLS:
+            CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
+    for seed in range(study.seeds):
+        side_by_side(list(jobs(study, seed, budget)), study.processes, f"seed {seed}")
+    rows = complete(study)
+    if not rows:
+        raise SystemExit(f"{study.out} holds no cell of which all arms have run.")
+    COLUMNS.write(rows, study.out / "control.csv")
+    draw(rows, study.out / "control.png")
+    write_page(page(rows), study.out / "control.md")

@@ -1,0 +1,210 @@
+"""The study's environments, inputs, filters and statistics, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import ExplorationType, check_env_specs
+from torchrl.modules import get_primers_from_module, set_recurrent_mode
+
+from benchmarks.control import hike, pendulum
+from benchmarks.control.arms import ARMS, ActorHead, Head, clamp, networks
+from benchmarks.control.learning import Learner, Learning
+from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
+from benchmarks.control.ppo import PPO
+from benchmarks.control.run import TASKS, make_env, rollout
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss
+
+
+def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
+    task, arm = TASKS[task], ARMS[arm]
+    filter = task.exact(cell[0]) if arm.filter == "exact" else task.unlearned(8) if arm.filter else None
+    return make_env(task, arm, count, cell, seed, filter)
+
+
+def test_the_ground_is_a_maximum_of_three_ridges():
+    # On the crest of the first: density 1 / (2 pi 0.4 0.1).
+    assert hike.altitude(torch.tensor([-0.4, -0.8])).item() == pytest.approx(
+        -math.exp(-1 / (2 * math.pi * 0.4 * 0.1)) + 0.2 * -1.2 - 0.02, abs=1e-6
+    )
+    # Far from all of them it is a slope.
+    assert hike.altitude(torch.tensor([-3.0, 3.0])).item() == pytest.approx(-1.02, abs=1e-4)
+
+
+def test_a_hike_is_its_strides_and_its_noise():
+    env = hike.MountainHike(2000, 0.1)
+    data = env.rollout(hike.STEPS)
+    moved = data["next", "state"] - data["state"] - hike.STRIDE * data["action"]
+    count = moved.numel()
+    assert moved.std().item() == pytest.approx(hike.PROCESS, rel=5 / (2 * count) ** 0.5)
+    torch.testing.assert_close(
+        data["next", "reward"].squeeze(-1), hike.altitude(data["next", "state"] + hike.START), atol=1e-6, rtol=1e-6
+    )
+    assert data["next", "truncated"][:, -1].all()
+    assert data["action"].abs().max() <= 1
+
+
+def test_the_exact_filter_holds_the_truth():
+    """Its errors have the variances that it believes: chi-square of all of them, two a step."""
+    env = make_env(TASKS["hike"], ARMS["Kalman"], 500, (0.4, 0.0), 0, hike.exact_filter(0.4))
+    data = env.rollout(hike.STEPS)["next"]
+    errors = (data["belief", "mean"] - data["state"]).square() / data["belief", "var"]
+    assert errors[:, -1].mean().item() == pytest.approx(1, abs=5 * (2 / 1000) ** 0.5)
+
+
+@pytest.mark.parametrize("arm", list(ARMS))
+@pytest.mark.parametrize("task", list(TASKS))
+def test_specs(task, arm):
+    if arm == "Kalman" and TASKS[task].exact is None:
+        pytest.skip("no exact filter of a pendulum")
+    check_env_specs(env_of(task, arm))
+
+
+def test_all_arms_walk_through_the_same_worlds():
+    truths = []
+    for arm in ("last reading", "LSTM", "belief mean", "truth"):
+        torch.manual_seed(0)
+        env = env_of("hike", arm)
+        with torch.no_grad():
+            data = env.rollout(10, lambda td: td.set("action", torch.ones(4, 2)))
+        truths.append((data["state"], data["observation"].nan_to_num(7.0)))
+    for state, reading in truths[1:]:
+        assert state.equal(truths[0][0])
+        assert reading.equal(truths[0][1])
+
+
+def test_what_is_seen_is_the_last_reading_and_the_last_action():
+    env = env_of("pendulum", "last reading", count=50)
+    data = env.rollout(20)
+    seen, reading, observed, action = (data[key] for key in ("seen", "observation", "observed", "action"))
+    assert not seen.isnan().any()
+    now = observed.expand_as(reading)
+    torch.testing.assert_close(seen[..., :2][now], reading[now])
+    late = ~observed[:, 1:].expand_as(reading[:, 1:])
+    torch.testing.assert_close(seen[:, 1:, :2][late], seen[:, :-1, :2][late])
+    assert seen[..., 2].equal(observed.squeeze(-1).float())
+    assert seen[:, 1:, 3:].equal(action[:, :-1])
+    assert seen[:, 0, 3].eq(0).all()
+
+
+def test_a_set_encoder_knows_no_order():
+    head = Head(3, 2, torch.ones(3), "ensemble")
+    ensemble = torch.randn(5, 8, 3)
+    torch.testing.assert_close(head(ensemble), head(ensemble[:, torch.randperm(8)]))
+    plain = Head(3, 2, torch.ones(3))
+    plain.load_state_dict(head.state_dict())
+    same = ensemble[:, :1].expand(5, 8, 3)
+    torch.testing.assert_close(head(same), plain(same[:, 0]))
+
+
+def test_actors_begin_alike():
+    head = ActorHead(3, 1, torch.tensor([1.0, 1.0, 8.0]))
+    mean, std = head(torch.randn(7, 3))
+    assert mean.abs().max() < 0.02
+    assert std.eq(1).all()
+
+
+@pytest.mark.parametrize("arm", ["LSTM", "GRU"])
+def test_a_memory_is_the_same_in_steps_and_in_slices(arm):
+    """The probabilities of actions that a batch's slices give are those of the steps that collected it."""
+    torch.manual_seed(0)
+    task = TASKS["pendulum"]
+    env = env_of("pendulum", arm)
+    actor, critic = networks(ARMS[arm], 4, 1, torch.tensor(task.scale))
+    with torch.no_grad():
+        for network in (actor, critic):  # the last layer begins near zero
+            for parameter in network.parameters():
+                parameter.add_(0.2 * torch.randn_like(parameter))
+    policy = TensorDictSequential(actor, critic, clamp(task.limit))
+    env.append_transform(get_primers_from_module(policy))
+    data = rollout(env, policy, 80, ExplorationType.RANDOM)
+    collected, values = data["raw_log_prob"].clone(), data["state_value"].clone()
+    slices = data.exclude("next", "state_value", "actor_memory", "critic_memory").reshape(-1, 40)
+    with torch.no_grad(), set_recurrent_mode(True):
+        log_prob = actor.get_dist(slices).log_prob(slices["raw"])
+        critic(slices)
+    torch.testing.assert_close(log_prob.reshape(4, 80), collected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(slices["state_value"].reshape(4, 80, 1), values, atol=1e-4, rtol=1e-4)
+    assert values.std() > 1e-3
+    ppo = PPO(actor, critic, task.settings, 1, recurrent=True)
+    before = [parameter.clone() for parameter in actor.parameters()]
+    ppo.update(data)
+    assert all((a - b).abs().max() > 0 for a, b in zip(before, actor.parameters(), strict=True))
+
+
+def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter():
+    """On the hike: the innovations' likelihood within 0.04 nats a reading of the exact one's, from over 0.1."""
+    torch.manual_seed(0)
+    learned, exact = hike.unlearned_filter(32), hike.exact_filter(0.2)
+    learner = Learner(learned, TASKS["hike"].prior, 64, Learning())
+    learner.add(hike.MountainHike(64, 0.2, seed=0).rollout(hike.STEPS))
+    test = hike.MountainHike(200, 0.2, seed=1).rollout(hike.STEPS).exclude("next")
+
+    def score(filter, Loss):
+        zeros = {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0}
+        with torch.no_grad():
+            return Loss(filter, **zeros)(test)["loss_nll"].item()
+
+    best, before = score(exact, GaussianLoss), score(learned, DEnKFLoss)
+    learner.update(300)
+    after = score(learned, DEnKFLoss)
+    assert best < after < best + 0.04
+    assert before > best + 0.1
+    strides = learned["transition"].module["transition"].module.weight[:, 2:]
+    torch.testing.assert_close(strides, hike.STRIDE * torch.eye(2), atol=0.02, rtol=0)
+
+
+def test_a_taught_filter_learns_the_pendulum():
+    """Half of the error of the velocity that the untaught filter has."""
+    torch.manual_seed(0)
+    filter = pendulum.unlearned_filter(16)
+    learner = Learner(filter, TASKS["pendulum"].prior, 16, Learning(), taught=True)
+    learner.add(pendulum.world(16, 0.1, 0.0, 0).rollout(100))
+    test = pendulum.world(16, 0.1, 0.0, 1).rollout(100).exclude("next")
+
+    def error():
+        with torch.no_grad():
+            out = filter.sequence(test.copy())
+        return (out["belief", "mean"] - out["state"])[:, 10:, 2].square().mean().sqrt().item()
+
+    before = error()
+    learner.update(60)
+    assert error() < 0.5 * before
+
+
+def test_statistics():
+    assert interquartile_mean([1.0, 2.0, 3.0, 100.0]) == 2.5
+    center, low, high = summary([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert center == 3
+    assert 1 < low < 3 < high < 5
+    assert summary([2.0])[0] == 2.0
+    assert np.isnan(summary([2.0])[1])
+
+
+def rows():
+    for arm, final in (("LSTM", -20.0), ("belief mean", -10.0), ("truth", -5.0)):
+        for seed in range(2):
+            for number, value in enumerate((-40.0, final - 5, final)):
+                steps = 1000 * (number + 1)
+                entries = {"arm": arm, "seed": seed, "env_steps": steps, "return": value - seed, "wall_s": 1.0}
+                yield {"task": "hike", "cell": "noise 0", **entries}
+
+
+def test_tables():
+    table = list(rows())
+    assert reached(table, "hike", "noise 0", "belief mean") == "2"
+    assert reached(table, "hike", "noise 0", "LSTM") == "3"
+    text = page(table)
+    assert "control.png" not in text  # one noise makes no line
+    assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
+    assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
+
+
+def test_the_picture_is_of_tasks_with_two_noises(tmp_path):
+    table = list(rows())
+    draw(table, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+    draw([*table, *({**row, "cell": "noise 0.2"} for row in table if row["arm"] != "truth")], tmp_path / "two.png")
+    assert (tmp_path / "two.png").exists()

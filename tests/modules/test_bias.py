@@ -1,0 +1,171 @@
+"""Oracle: the Kalman filter of the augmented state, by hand, for a linear system with coloured reading errors."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.filters import EKF, UKF, DEnKF
+from torch_denkf.modules import (
+    BiasedNoise,
+    BiasedObservation,
+    BiasedTransition,
+    CholeskyNoise,
+    ConstantNoise,
+    EnsembleAnalysis,
+    FadingBias,
+    GaussianAround,
+    GaussianPrior,
+    LearnedTransition,
+    MomentPrior,
+    NoisyTransition,
+    Select,
+)
+
+Q, R, STEPS = 0.02, 0.3, 40  # standard deviations: of the rate in a step, of the reading's white error
+STD, TIME = [0.8, 0.5], [3.0, 20.0]  # of a fast bias and a slow one, of the same reading
+
+
+def motion():
+    """A place and its rate."""
+    network = torch.nn.Linear(2, 2, bias=False).double()
+    network.weight.data = torch.tensor([[1.0, 1.0], [0.0, 1.0]], dtype=torch.double)
+    return LearnedTransition(network.requires_grad_(False), residual=False)
+
+
+def parts():
+    bias = FadingBias(torch.tensor(STD, dtype=torch.double), TIME, trainable=False)
+    q = ConstantNoise(
+        torch.tensor([0.0, Q], dtype=torch.double), in_key=("belief", "mean"), out_key=("forecast", "noise")
+    )
+    r = ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading")
+    return bias, BiasedTransition(motion(), bias), BiasedNoise(q, bias), BiasedObservation(Select([0]), bias), r
+
+
+def simulate(seed=0):
+    """True places ``[T]`` and readings ``[T]`` with coloured errors."""
+    rng = np.random.default_rng(seed)
+    decay = np.exp(-1 / np.array(TIME))
+    place, rate, bias, places, readings = 0.0, 0.0, np.array(STD) * rng.normal(size=2), [], []
+    for _ in range(STEPS):
+        place, rate = place + rate, rate + Q * rng.normal()
+        bias = decay * bias + np.array(STD) * np.sqrt(1 - decay**2) * rng.normal(size=2)
+        places.append(place)
+        readings.append(place + bias.sum() + R * rng.normal())
+    return np.array(places), np.array(readings)
+
+
+def augmented_kalman_filter(readings, start):
+    """Means ``[T, 4]`` and covariances ``[T, 4, 4]``; the first is the start."""
+    decay = np.exp(-1 / np.array(TIME))
+    f = np.zeros((4, 4))
+    f[:2, :2], f[2:, 2:] = [[1, 1], [0, 1]], np.diag(decay)
+    q = np.diag([0, Q**2, *(np.array(STD) ** 2 * (1 - decay**2))])
+    h = np.array([[1.0, 0.0, 1.0, 1.0]])
+    mean, cov = np.zeros(4), np.diag(np.array(start) ** 2)
+    out = [(mean, cov)]
+    for reading in readings[1:]:
+        mean, cov = f @ mean, f @ cov @ f.T + q
+        gain = cov @ h.T / (h @ cov @ h.T + R**2)
+        mean, cov = mean + gain[:, 0] * (reading - h @ mean), cov - gain @ h @ cov
+        out.append((mean, cov))
+    return tuple(map(np.stack, zip(*out, strict=True)))
+
+
+START = [0.1, 0.1, *STD]
+
+
+@pytest.mark.parametrize("kind", [EKF, UKF])
+def test_gaussian_filters_are_the_augmented_kalman_filter(kind):
+    _, transition, q, observation, r = parts()
+    initial = MomentPrior(torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double).square().diag())
+    filter = kind(transition, q, None, observation, r, initial=initial, observation_key="reading")
+    readings = simulate()[1]
+    out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
+    mean, cov = augmented_kalman_filter(readings, START)
+    torch.testing.assert_close(out["belief", "mean"], torch.tensor(mean), atol=1e-9, rtol=1e-7)
+    torch.testing.assert_close(out["belief", "cov"], torch.tensor(cov), atol=1e-9, rtol=1e-7)
+
+
+def test_an_ensemble_comes_close_to_it():
+    _, transition, q, observation, r = parts()
+    torch.manual_seed(0)
+    initial = GaussianPrior(
+        torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double), ensemble_size=20000
+    )
+    analysis = EnsembleAnalysis("etkf", sensor_key="reading")
+    filter = DEnKF(NoisyTransition(transition, q), None, observation, r, analysis, initial=initial)
+    readings = simulate()[1]
+    out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
+    mean, cov = augmented_kalman_filter(readings, START)
+    std = torch.tensor(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
+    assert ((out["belief", "mean"] - torch.tensor(mean)).abs() / std).max() < 0.08  # members say it to 0.7 % a step
+    assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
+
+
+def test_biases_stay_as_large_and_are_correlated_as_said():
+    bias = FadingBias(torch.tensor([2.0, 0.5]), [4.0, 30.0])
+    torch.testing.assert_close(bias.decay**2 * bias.std**2 + bias.variance, bias.std**2)
+    torch.testing.assert_close(bias.decay**10, torch.exp(-10 / torch.tensor([4.0, 30.0])))
+    very_slow = FadingBias(torch.tensor([1.0]), 1e9)
+    torch.testing.assert_close(very_slow.variance, torch.tensor([2e-9]))  # no digits are lost
+
+
+def test_a_likelihood_learns_size_and_time():
+    """At the true values the slope of the readings' likelihood is zero but for chance: on many runs it is small."""
+    _, transition, q, observation, r = parts()
+    bias = FadingBias(torch.tensor(STD, dtype=torch.double), TIME)
+    for part in (transition, q, observation):
+        part.bias = bias
+    initial = GaussianAround([*START[:2], *STD], state_key="state").double()
+    filter = EKF(transition, q, None, observation, r, initial=initial, observation_key="reading")
+    runs = 64
+    readings = torch.tensor(np.stack([simulate(seed)[1] for seed in range(runs)])).unsqueeze(-1)
+    frames = TensorDict({"reading": readings, "state": torch.zeros(runs, STEPS, 4, dtype=torch.double)}, [runs, STEPS])
+    out = filter.sequence(frames)
+    innovation, covs = out["info", "innovation"], out["info", "nis"]
+    likelihood = -0.5 * (covs + (innovation.square() / covs).clamp_min(1e-12).log())[:, 1:].sum((1, 2))
+    slopes = torch.stack(
+        [
+            torch.cat(torch.autograd.grad(value, [bias.log_std, bias.log_time], retain_graph=True))
+            for value in likelihood
+        ]
+    )
+    assert (slopes.mean(0).abs() < 4 * slopes.std(0) / runs**0.5).all()
+    with torch.no_grad():
+        bias.log_std += 0.7
+    wrong = filter.sequence(frames)
+    innovation, covs = wrong["info", "innovation"], wrong["info", "nis"]
+    worse = -0.5 * (covs + (innovation.square() / covs).clamp_min(1e-12).log())[:, 1:].sum((1, 2))
+    assert worse.mean() < likelihood.mean()
+
+
+def test_a_covariance_of_the_state_gets_the_biases_in_its_corner():
+    bias = FadingBias([2.0], time=5.0, trainable=False)
+    inner = CholeskyNoise(2, r=[0.1, 1.0], in_features=3, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    q = BiasedNoise(inner, bias)(TensorDict({("belief", "mean"): torch.zeros(4, 3)}, [4]))["forecast", "noise"]
+    expected = torch.diag(torch.tensor([0.01, 1.0, 4 * (1 - np.exp(-0.4))], dtype=torch.float))
+    torch.testing.assert_close(q, expected.expand(4, 3, 3), atol=1e-6, rtol=1e-5)
+
+
+def test_each_component_gets_its_biases():
+    state = torch.tensor([[1.0, 2.0, 0.1, 0.2, 0.01, 0.02]])
+    td = TensorDict({("forecast", "ensemble"): state}, [])
+    read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 4, time=2.0))(td)["forecast", "observation"]
+    torch.testing.assert_close(read, torch.tensor([[1.11, 2.22]]))
+    read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 4, time=2.0), dims=[1, 1, 1, 0])(td)
+    torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[1.02, 2.31]]))
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="time, in steps"):
+        FadingBias([1.0], time=0.0)
+    with pytest.raises(ValueError, match="2 components of the reading, and there are 1"):
+        BiasedObservation(Select([0]), FadingBias([1.0], time=1.0), dims=[0, 0])
+    td = TensorDict({("forecast", "ensemble"): torch.zeros(3, 5)}, [])
+    with pytest.raises(ValueError, match="not as many for each of the 2"):
+        BiasedObservation(Select([0, 1]), FadingBias([1.0] * 3, time=1.0))(td)
+    with pytest.raises(ValueError, match="splits a state of 1"):
+        BiasedObservation(Select([0]), FadingBias([1.0], time=1.0))(
+            TensorDict({("forecast", "ensemble"): torch.zeros(3, 1)}, [])
+        )
