@@ -101,7 +101,7 @@ class CarCamera:
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
     def motion(self, previous: np.ndarray, current: np.ndarray) -> dict[str, Tensor]:
-        """Flow and road of a pair, rounded as for the training; and how corners moved, if asked for."""
+        """Flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked."""
         arrays = image_motion(previous, current, self.calibration, height=self.height)
         flow, road = (torch.from_numpy(array).half().float() for array in arrays)
         self.watch(flow, road)
