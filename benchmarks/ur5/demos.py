@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.envs import collect_ur5_demos
@@ -79,6 +80,13 @@ class FramePool:
 
     def __len__(self) -> int:
         return len(self.state)
+
+    def shrunk(self, times: int) -> FramePool:
+        """The same frames with so many times fewer rows and columns, averaged."""
+        pool = object.__new__(FramePool)
+        parts = [avg_pool2d(part.float(), times).round().to(torch.uint8) for part in self.pixels.split(512)]
+        pool.pixels, pool.state = torch.cat(parts), self.state
+        return pool
 
     def rows(self, index: Tensor) -> TensorDict:
         """Frames with float pixels, ``[n]``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,7 @@ from benchmarks.common.arguments import some_of
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.ur5.demos import Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
 from benchmarks.ur5.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
+from benchmarks.ur5.glimpse import COARSE
 from benchmarks.ur5.motion import ArmMotion, train_motion
 from benchmarks.ur5.readings import read_all, read_codes
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
@@ -112,8 +113,10 @@ class Base:
             sensor = self.preset.build(facts, SAMPLES)
         if self.parent is None and self.preset.coarse is not None:
             coarse = SENSORS[self.preset.coarse]
-            first, folder = coarse.build(facts, SAMPLES), out.with_name(out.name.replace(self.kind, coarse.name))
-            train_sensor(first, coarse, pool, checked, out=folder, seed=self.seed, updates=updates, lr=lr)
+            folder, times = out.with_name(out.name.replace(self.kind, coarse.name)), max(facts.size // COARSE, 1)
+            first = coarse.build(replace(facts, size=facts.size // times), SAMPLES)
+            settings = {"out": folder, "seed": self.seed, "updates": updates, "lr": lr, "times": times}
+            train_sensor(first, coarse, pool.shrunk(times), checked.shrunk(times), **settings)
             adopt(sensor, first, pool)
             updates, lr = max(updates // 2, 1), 1.5e-3
         train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
