@@ -37,6 +37,7 @@ class Collections:
     validation: int = 16  # and at most so many decide
     real: int = 130  # demos of real_like, whole
     real_train: int = 20  # of these, on the train side
+    pasted: int = 8000  # pictures of the simulator's states as the other camera sees them, to fine-tune with
     steps: int = 350  # of a sequence
 
     def collect(self, processes: int = 1, *, real: bool = True) -> None:
@@ -92,6 +93,12 @@ class FramePool:
         """Frames with float pixels, ``[n]``."""
         pixels = self.pixels[index].float() / 255
         return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
+
+    def joined(self, pixels: Tensor, state: Tensor) -> FramePool:
+        """These frames and others, uint8 ``[n, 3, H, W]``, of states ``[n, 10]``."""
+        pool = object.__new__(FramePool)
+        pool.pixels, pool.state = torch.cat([self.pixels, pixels]), torch.cat([self.state, state])
+        return pool
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
         """Random frames ``[batch]``."""

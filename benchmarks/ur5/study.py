@@ -19,6 +19,7 @@ from benchmarks.common.jobs import once, read_rows
 from benchmarks.ur5.demos import Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
 from benchmarks.ur5.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
 from benchmarks.ur5.glimpse import COARSE
+from benchmarks.ur5.laboratory import Pasted
 from benchmarks.ur5.motion import ArmMotion, train_motion
 from benchmarks.ur5.readings import read_all, read_codes
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
@@ -108,6 +109,7 @@ class Base:
         if self.parent is not None:
             facts, sensor, lr = self.parent.facts, deepcopy(self.parent.sensor), 1e-3
             sensor.requires_grad_(True)  # the coarse part of a second look, too: the camera stands elsewhere
+            pool = pool.joined(*self._pasted(pool))
         else:
             facts = Statistics.of(self.states, pool)
             sensor = self.preset.build(facts, SAMPLES)
@@ -121,6 +123,17 @@ class Base:
             updates, lr = max(updates // 2, 1), 1.5e-3
         train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
         return sensor, facts
+
+    def _pasted(self, pool: FramePool) -> tuple[Tensor, Tensor]:
+        """Pictures of states of the simulator's demos, as the other domain's camera would have taken them."""
+        assert self.parent is not None
+        states = self.parent.states.flatten(0, 1)
+        generator = torch.Generator().manual_seed(self.seed)
+        states = states[torch.randint(len(states), (self.study.pasted,), generator=generator)]
+        paste = Pasted(pool.pixels, pool.state)
+        pixels = paste(states, self.seed)
+        paste.close()
+        return pixels, states
 
     def motion(self, actions: bool) -> ArmMotion:
         """The motion, trained on true states."""
