@@ -8,6 +8,8 @@ picture, in the arm's colours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -23,7 +25,8 @@ SIDE = 112  # pixels, of the silhouettes
 DIFFERENT = 18  # grey levels by which the arm differs from what is behind it
 SHOTS = 100  # frames that the camera is found from
 # So many of them, silhouettes blurred by so many pixels, Gauss-Newton's steps; one after the other.
-LEVELS = ((40, 8.0, 8), (40, 4.0, 8), (60, 2.0, 8), (SHOTS, 1.0, 6))
+Levels = Sequence[tuple[int, float, int]]
+LEVELS: Levels = ((40, 8.0, 8), (40, 4.0, 8), (60, 2.0, 8), (SHOTS, 1.0, 6))
 OFTEN = 0.35  # share of the frames in which a pixel shows the arm: where it is more, the median does, too
 UNITS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 2.0, 0.1])  # by which each number may be off
 HELD = 0.3  # share of the pictures with the object between the fingers
@@ -88,7 +91,7 @@ def look_of(numbers: np.ndarray) -> Domain:
     return Domain(camera=(x, y, z), target=(to_x, to_y, to_z), roll=roll, field=field, distortion=(bend, 0.0))
 
 
-def find_camera(pixels: np.ndarray, joints: np.ndarray) -> tuple[Domain, float]:
+def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS) -> tuple[Domain, float]:
     """The camera that saw frames ``[N, S, S, 3]`` of the arm at joints ``[N, 7]``; and the share that does not fit.
 
     Gauss-Newton steps on silhouettes that are blurred less and less, from the simulator's camera on.
@@ -104,7 +107,7 @@ def find_camera(pixels: np.ndarray, joints: np.ndarray) -> tuple[Domain, float]:
         drawn.look(look_of(numbers))
         return np.stack([drawn.arm(joints[row])[1] for row in rows])
 
-    for count, width, steps in LEVELS:
+    for count, width, steps in levels:
         rows = order[:count]
         # Where the arm mostly is, the frames' median shows it, too.
         often = (silhouettes(found, order).mean(0) > OFTEN).astype(np.float32)
@@ -145,13 +148,14 @@ class Pasted:
     Args:
         pixels: uint8 frames ``[N, 3, H, W]`` of demos in the other domain.
         states: theirs ``[N, 10]``.
+        levels: of the search for the camera.
     """
 
-    def __init__(self, pixels: Tensor, states: Tensor):
+    def __init__(self, pixels: Tensor, states: Tensor, levels: Levels = LEVELS):
         frames, joints = pixels.permute(0, 2, 3, 1).numpy(), states[:, :7].numpy()
         chosen = np.random.default_rng(0).permutation(len(frames))[: 2 * SHOTS]
         frames, joints = frames[chosen], joints[chosen]
-        self.look, self.misfit = find_camera(frames, joints)
+        self.look, self.misfit = find_camera(frames, joints, levels)
         self.drawn, frames = Drawn(frames.shape[1], self.look), frames.astype(np.float32)
         self.behind = without_arm(frames)
         self.paint = colours(self.drawn, frames, joints)

@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
-from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk
+from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.simulation.ur5.domains import SIM, Domain
 from torch_denkf.training import Stage, train_part
 from torch_denkf.transforms import Brightness, SaltAndPepper
 
@@ -165,13 +166,21 @@ _PRESETS = (
 SENSORS = {preset.name: preset for preset in _PRESETS}
 
 
-def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, count: int = 1500) -> None:
-    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper."""
+def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domain = SIM, count: int = 1500) -> None:
+    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper.
+
+    Args:
+        sensor: with a second look.
+        coarse: trained.
+        pool: frames to aim by, some of them.
+        look: the camera that took these.
+        count: how many.
+    """
     trunk = sensor.module["trunk"]
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
     trunk.coarse.requires_grad_(False)
     rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
-    trunk.aim(sensor._prepare(rows["pixels"]), rows["state"][:, 7:])
+    trunk.aim(sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
 
 
 class NearForecast(SubModel):
