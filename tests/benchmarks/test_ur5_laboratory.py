@@ -55,7 +55,8 @@ def test_colours_are_those_that_the_frames_were_painted_with(seen):
     drawn = Drawn(SIDE, look_of(TRUE))
     gain, offset = colours(drawn, frames.astype(np.float32), joints)
     drawn.close()
-    assert np.abs(gain - GAIN).max() < 0.02 and np.abs(offset - OFFSET).max() < 2
+    assert np.abs(gain - GAIN).max() < 0.02
+    assert np.abs(offset - OFFSET).max() < 2
 
 
 def test_a_brighter_frame_without_an_arm_has_no_foreground(seen):
