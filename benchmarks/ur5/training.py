@@ -30,7 +30,7 @@ KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), ("belief"
 class Budget:
     """Updates of each stage; the filter's windows."""
 
-    sensor: int = 5000  # updates of the sensor
+    sensor: int = 6000  # updates of the sensor's coarse part; half as many of its second look
     fine_tuning: int = 800  # updates of the simulator's sensor, on the other domain
     motion: int = 3000  # updates of the motion on true states
     filter: int = 250  # updates of a filter on readings
