@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,6 +46,7 @@ class Study:
     checkpoint: Path | None = None  # of evaluate: a folder below --out/folds
     seeds: int = 1
     rendered: int = 0  # drives to render for a first training of the sensor
+    first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
     processes: int = 1  # folds side by side
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
@@ -55,6 +57,11 @@ class Study:
         """Streams."""
         return self.out / "streams"
 
+    @property
+    def begun(self) -> Path:
+        """Where the rendered drives and the first training of the sensor are."""
+        return self.first or self.out
+
     def rendered_parts(self) -> tuple[list[Part], list[Part]]:
         """Rendered drives along invented paths, with traffic, to train the sensor on; and others that it does not see.
 
@@ -62,15 +69,24 @@ class Study:
         """
         if not self.rendered:
             return [], []
-        root, names = self.out / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
-        render_drives(root, names=names, frames=RENDERED_FRAMES, size=self.size, processes=self.processes)
+        root, names = self.begun / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
+        size = self.size if self.first is None else tuple(_settings(self.first)["size"])
+        render_drives(root, names=names, frames=RENDERED_FRAMES, size=size, processes=self.processes)
         pitches = (torch.rand(self.rendered, generator=torch.Generator().manual_seed(0)) * 2 - 1) * 0.03
         parts = [
-            Part(Stream(str(root), name, "image_2", size=self.size, pitch=round(float(pitch), 4)))
+            Part(Stream(str(root), name, "image_2", size=size, pitch=round(float(pitch), 4)))
             for name, pitch in zip(names, pitches, strict=True)
         ]
         held_out = max(self.rendered // 6, 1)
         return parts[held_out:], parts[:held_out]
+
+
+def _settings(out: Path) -> dict:
+    """Options of a table that was made in a folder."""
+    file = out / "settings.json"
+    if not file.exists():
+        raise FileNotFoundError(f"--first {out} has no settings.json; pass the --out of a table")
+    return json.loads(file.read_text())
 
 
 @dataclass(frozen=True)
@@ -129,7 +145,7 @@ class Job:
         torch.manual_seed(self.seed)
         facts = statistics(parts, study.cache)
         training = SensorTraining(self.sensor, facts, study.cache, self.seed)
-        out, held_out = study.out / "pretrained" / f"{self.sensor}-{self.seed}", with_disturbances(self.rendered[1])
+        out, held_out = study.begun / "pretrained" / f"{self.sensor}-{self.seed}", with_disturbances(self.rendered[1])
         return training.train(SENSORS[self.sensor](facts), parts, held_out, out, study.budget.sensor)
 
     def prepare_sensor(self) -> None:
