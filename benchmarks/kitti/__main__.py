@@ -25,16 +25,9 @@ def smoke(study: Study) -> Study:
     folder = Path(tempfile.mkdtemp(prefix="kitti-"))
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=53, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
-    settings = {
-        "size": (25, 75),
-        "seeds": 1,
-        "processes": 1,
-        "drives": names,
-        "test": names[:1],
-        "sizes": (4, 8),
-        "budget": budget,
-    }
-    return replace(study, root=folder / "kitti", out=folder / "out", sensors=("flow", "image"), **settings)
+    settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
+    folders = {"root": folder / "kitti", "out": folder / "out"}
+    return replace(study, sensors=("flow", "image"), sizes=(4, 8), **settings, **folders)
 
 
 def write_table(study: Study, rows: list[dict], begun: float) -> None:

@@ -58,9 +58,8 @@ def draw(study: Study) -> list[Path]:
                 timed.add((name, job.sensor))
                 files.append(file)
     if not files:
-        raise FileNotFoundError(
-            f"no trained filter of {study.filters} in {study.out / 'folds'}; run the table first, with --out {study.out}"
-        )
+        folder = study.out / "folds"
+        raise FileNotFoundError(f"no trained {', '.join(study.filters)} in {folder}; run table with this --out first")
     rows = means(read_rows(files))
     table = study.out / "frontier.csv"
     COLUMNS.write(rows, table)
@@ -119,7 +118,7 @@ def scores(recipe: KITTIRecipe, model: Filter, reading: TensorDict) -> dict[str,
 
 
 def processor_times(recipe: KITTIRecipe, model: Filter, reading: TensorDict, smoke: bool) -> dict[str, float]:
-    """Milliseconds of the processor a step behind the sensor, eager and compiled step by step; eager both in a smoke."""
+    """Milliseconds of the processor a step behind the sensor, eager and compiled; in a smoke both are eager."""
     row, behind, times = mark_start(reading[None, :TIMED]), recipe.part(model, sensor=False), {}
     for column, chunk in (("eager_ms_per_step", 0), ("ms_per_step", 0 if smoke else 1)):
         behind.compile(chunk=chunk)

@@ -33,7 +33,8 @@ class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
     table: leave one drive out after the other, in all conditions. train: some folds, without testing. evaluate: one
-    trained filter on any drives. frontier: error against milliseconds a step of the filters that a table left. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
+    trained filter on any drives. frontier: error against milliseconds a step of the filters that a table left. What
+    was broken off goes on where it stopped. See benchmarks/kitti/README.md.
     """
 
     command: Positional[Literal["train", "evaluate", "table", "frontier"]] = "table"
@@ -48,7 +49,7 @@ class Study:
     rendered: int = 0  # drives to render for a first training of the sensor
     first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
-    sizes: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)  # of the ensemble, in the frontier
+    sizes: tuple[int, ...] = (8, 32, 128, 512)  # of the ensemble, in the frontier
     processes: int = 1  # folds side by side
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything, on rendered drives
