@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +20,7 @@ from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, SensorTraining, sensor_of_fold
 from benchmarks.kitti.streams import Stream, find_streams, prepare, spans
 from benchmarks.kitti.tables import IDENTITY
-from benchmarks.kitti.training import Budget, train_filter
+from benchmarks.kitti.training import Budget, load_filter, train_filter
 from torch_denkf.data import render_drives
 from torch_denkf.modules import SubModel
 
@@ -120,10 +120,20 @@ class Job:
         )
 
     def train(self, name: str, base: SensorOfFold):
-        """Trains one filter, or goes on where it was broken off."""
+        """Trains one filter, or goes on where it was broken off; or takes the weights of another."""
+        if whose := FILTERS[name].weights_of:
+            if not self.borrows(name):
+                self.train(whose, base)
+            recipe, model, *_ = load_filter(self.out(whose))
+            return FILTERS[name](model["sensor"], recipe.facts), model
         loggers = ("csv", "tensorboard")
         settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
         return train_filter(self.fold, name, base, out=self.out(name), **settings)
+
+    def borrows(self, name: str) -> bool:
+        """Whether it takes another's weights, which are there."""
+        whose = FILTERS[name].weights_of
+        return whose is not None and (self.out(whose) / "filter.pt").exists()
 
     def run(self) -> None:
         """Trains, evaluates and draws what is not done already; leaves the rows in each filter's folder."""
@@ -131,7 +141,7 @@ class Job:
         for name in self.study.filters:
             if (self.out(name) / "rows.json").exists():
                 continue
-            base = self.base() if base is None else base
+            base = self.base() if base is None and not self.borrows(name) else base
             once(self.out(name) / "rows.json", lambda name=name, base=base: self.test(name, base))
 
     def test(self, name: str, base: SensorOfFold) -> list[dict]:
@@ -190,7 +200,14 @@ def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
         streams += [part.stream for part in job.fold.train if part.stream.steps == 1 or job.sensor == "flow"]
         read = [*job.fold.tune, *job.fold.validation, *with_disturbances([Part(stream) for stream in job.fold.test])]
         streams += [stream for part in read for stream in spans(part.stream, job.sensor)]
-    prepare(list(dict.fromkeys(streams)), jobs[0].study.cache, processes)
+    study = jobs[0].study
+    prepare(list(dict.fromkeys(streams)), study.cache, processes)
+    if any(FILTERS[name].repair for name in study.filters):  # of what is there by then
+        tested = [replace(stream, repair=True) for job in jobs for stream in job.fold.test]
+        repaired = [
+            each for part in with_disturbances([Part(s) for s in tested]) for each in spans(part.stream, "flow")
+        ]
+        prepare(list(dict.fromkeys(repaired)), study.cache, processes)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> None:

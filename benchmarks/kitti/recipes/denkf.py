@@ -48,6 +48,16 @@ class DEnKF(KITTIRecipe):
 
 
 @register
+class DEnKF_Gated(DEnKF):
+    """The DEnKF as it was trained, on pictures that are checked.
+
+    Those that are black or white are left out, and the flow is continued behind what stands still before the camera.
+    """
+
+    repair, weights_of = True, "denkf"
+
+
+@register
 class ADEnKF(DEnKF):
     """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
 
