@@ -6,7 +6,7 @@ folds' validation drives, column ``validation_score``: what the inflation is cho
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 
@@ -52,11 +52,12 @@ def draw(study: Study) -> list[Path]:
     for job in make_jobs(study):
         for name in study.filters:
             if (job.out(name) / "filter.pt").exists():
-                file = study.out / "frontier" / f"{job.out(name).name}.json"
                 times = (name, job.sensor) not in timed  # which weights it has takes no time
-                once(file, lambda job=job, name=name, times=times: list(_rows(job, name, times)))
                 timed.add((name, job.sensor))
-                files.append(file)
+                for size in study.sizes if name == "denkf" else (None,):
+                    file = study.out / "frontier" / f"{job.out(name).name}-{size or 'as-trained'}.json"
+                    once(file, partial(_rows, job, name, size, times))
+                    files.append(file)
     if not files:
         folder = study.out / "folds"
         raise FileNotFoundError(f"no trained {', '.join(study.filters)} in {folder}; run table with this --out first")
@@ -81,23 +82,23 @@ def means(rows: list[dict]) -> list[dict]:
     return found
 
 
-def _rows(job: Job, name: str, times: bool) -> Iterator[dict]:
-    """Of one trained filter a row for each camera of its test drive, each size and each update."""
+def _rows(job: Job, name: str, size: int | None, times: bool) -> list[dict]:
+    """Of one trained filter, with so many members, a row for each camera of its test drive and each update."""
     torch.set_num_threads(1)
-    ensemble = name == "denkf"
-    for size in job.study.sizes if ensemble else (None,):
-        _, model, _, kind = load_filter(job.out(name), size)
-        validation = [_read(job, model, part) for part in job.fold.validation]
-        tested = {stream.name: all_frames(_read(job, model, Part(stream))) for stream in job.fold.test}
-        for scheme in SCHEMES if ensemble else (None,):
-            options = {"size": size, "scheme": scheme} if ensemble else {}
-            recipe, model, *_ = load_filter(job.out(name), **options)
-            names = {"filter": f"DEnKF, {scheme}" if ensemble else name, "sensor": kind, "seed": job.seed}
-            names["members"] = size if ensemble else getattr(recipe, "particles", 1)
-            names["validation_score"] = calibration_error(recipe, model, validation)
-            for drive, reading in tested.items():
-                row = {**names, "drive": drive, **scores(recipe, model, reading)}
-                yield row | (processor_times(recipe, model, reading, job.study.smoke) if times else {})
+    _, model, _, kind = load_filter(job.out(name), size)
+    validation = [_read(job, model, part) for part in job.fold.validation]
+    tested = {stream.name: all_frames(_read(job, model, Part(stream))) for stream in job.fold.test}
+    rows = []
+    for scheme in SCHEMES if size else (None,):
+        options = {"size": size, "scheme": scheme} if size else {}
+        recipe, model, *_ = load_filter(job.out(name), **options)
+        names = {"filter": f"DEnKF, {scheme}" if size else name, "sensor": kind, "seed": job.seed}
+        names["members"] = size or getattr(recipe, "particles", 1)
+        names["validation_score"] = calibration_error(recipe, model, validation)
+        for drive, reading in tested.items():
+            row = {**names, "drive": drive, **scores(recipe, model, reading)}
+            rows.append(row | (processor_times(recipe, model, reading, job.study.smoke) if times else {}))
+    return rows
 
 
 def _read(job: Job, model: Filter, part: Part) -> TensorDict:
