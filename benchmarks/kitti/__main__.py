@@ -26,8 +26,8 @@ def smoke(study: Study) -> Study:
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=53, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
     settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
-    folders = {"root": folder / "kitti", "out": folder / "out"}
-    return replace(study, sensors=("flow", "image"), sizes=(4, 8), **settings, **folders)
+    kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4, 8)}
+    return replace(study, root=folder / "kitti", out=folder / "out", **kinds, **settings)
 
 
 def write_table(study: Study, rows: list[dict], begun: float) -> None:
@@ -84,7 +84,7 @@ def main() -> None:
     {"table": table, "train": train, "evaluate": evaluate}.get(study.command, table)(study)
     if study.smoke:
         print(*draw(study), sep="\n")
-        evaluate(replace(study, checkpoint=next((study.out / "folds").iterdir())))
+        evaluate(replace(study, checkpoint=next(study.out.glob("folds/*/filter.pt")).parent))
 
 
 if __name__ == "__main__":

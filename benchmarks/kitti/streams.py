@@ -107,18 +107,22 @@ class Stream:
         else:
             anew = paired = paired & (steps_between(shown.squeeze(-1), LONGEST) == self.steps).unsqueeze(-1)
         drive = drive.copy().set("steps", self.steps * anew.long())
-        drive = with_motion(drive, cache=None, keep_images=False, two_view=True, repair=True)
+        drive = with_motion(drive, cache=None, two_view=True, repair=True)
         for key in MOTION_KEYS if plain is not None else ():
             mask = anew.reshape(-1, *[1] * (plain[key].ndim - 1))
             drive[key] = torch.where(mask, drive[key], plain[key])
-        return drive.set("steps", self.steps * paired.long())
+        return _reduced(drive.set("steps", self.steps * paired.long()))
 
     def _compute(self) -> TensorDict:
         drive = self._drive()
         paired = self._paired(drive["frame_valid"])
-        drive = with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None, two_view=True)
-        small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
-        return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
+        return _reduced(with_motion(drive.copy().set("steps", self.steps * paired.long()), cache=None, two_view=True))
+
+
+def _reduced(drive: TensorDict) -> TensorDict:
+    """A drive with small images."""
+    small = [cv2.resize(image[0].numpy(), SMALL[::-1], interpolation=cv2.INTER_AREA) for image in drive["image"]]
+    return drive.set("image", torch.stack([torch.from_numpy(image) for image in small]).unsqueeze(1))
 
 
 def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:

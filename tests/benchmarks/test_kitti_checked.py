@@ -30,7 +30,7 @@ def drive(tmp_path_factory):
 def test_a_clean_drive_stays_as_it_is(drive):
     stream, cache = drive
     plain, checked = (replace(stream, repair=each).read(cache) for each in (False, True))
-    assert all(torch.equal(plain[key], checked[key]) for key in ("steps", *MOTION_KEYS))
+    assert all(torch.equal(plain[key], checked[key]) for key in ("steps", "image", *MOTION_KEYS))
 
 
 def test_black_pictures_are_left_out_and_seen_past(drive):
