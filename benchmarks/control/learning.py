@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.modules import ConstantNoise, GaussianPrior
 from torch_denkf.objectives import DEnKFLoss
 
@@ -92,3 +92,14 @@ class Learner:
                 for log_variance in self.noises:
                     log_variance.clamp_(min=2 * math.log(LEAST))
         return value.item()
+
+
+def refiltered(filter: Filter, data: TensorDict) -> TensorDict:
+    """Whole episodes ``[B, T]`` with what a filter believes of them: means and variances."""
+    after = data["next"][:, -1:]
+    frames = {key: torch.cat([data[key], after[key]], 1) for key in ("observation", "observed")}
+    frames["action"] = torch.cat([data["action"], torch.zeros_like(data["action"][:, :1])], 1)
+    with torch.no_grad():
+        belief = filter.sequence(TensorDict(frames, [*data.shape[:-1], data.shape[-1] + 1]))["belief"]
+    belief = belief.select("mean", "var")
+    return data.clone(False).set("belief", belief[:, :-1]).set("next", data["next"].clone(False).set("belief", belief[:, 1:]))
