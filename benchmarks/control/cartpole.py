@@ -21,6 +21,7 @@ DT = 0.01 * REPEAT  # s
 ACTION_NOISE, START_STD = 0.3, 0.01
 START = (0.0, -1.0, 0.0, 0.0, 0.0)  # the cart in the middle, the pole hanging
 SCALE = (1.0, 1.0, 1.0, 2.0, 5.0)  # of a state
+TRACK = 1.8  # m from the middle
 
 
 class NoisyCartpole(LinearGaussianEnv):
@@ -89,26 +90,34 @@ def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.
 
 
 class Push(m.SubModel):
-    """The filter's motion: a network says how the velocities change, the velocities move cart and pole."""
+    """The filter's motion: a network says how the velocities change, the velocities move cart and pole.
+
+    The network gives the change of both velocities without a motor, what the motor adds to the cart's, and how much of
+    a push on the cart the pole gets. The track ends where it ends: there the cart stops, which is such a push, too.
+    """
 
     MOST = 20.0  # m/s, rad/s: more is not believed
 
     def __init__(self):
-        network = nn.Sequential(nn.Linear(6, 32), nn.Tanh(), nn.Linear(32, 2))
+        network = nn.Sequential(nn.Linear(5, 32), nn.Tanh(), nn.Linear(32, 4))
         super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
+        self.register_buffer("scale", torch.tensor(SCALE))
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
         """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
         position, cos, sin, velocity, turn = ensemble.split(1, -1)
         angle = torch.atan2(sin, cos)
-        motor = action.unsqueeze(-2).expand_as(angle)
-        features = [position, angle.cos(), angle.sin(), velocity / SCALE[3], turn / SCALE[4], motor]
-        faster = self.module(torch.cat(features, -1))
-        velocity, turn = (torch.cat([velocity, turn], -1) + faster).clamp(-self.MOST, self.MOST).split(1, -1)
-        # A velocity changes evenly during a step: position and angle move with its mean.
-        position = position + DT * (velocity - faster[..., :1] / 2)
-        angle = angle + DT * (turn - faster[..., 1:] / 2)
-        return torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1)
+        features = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1) / self.scale
+        drift, spin, motor, share = self.module(features).split(1, -1)
+        push = motor * action.unsqueeze(-2)
+        faster = velocity + drift + push
+        # Velocities change evenly during a step: position and angle move with their means.
+        ahead = position + DT * (velocity + faster) / 2
+        stop = torch.where((ahead.abs() > TRACK) & (ahead * faster > 0), -faster, 0.0)
+        faster, turning = faster + stop, turn + spin + share * (push + stop)
+        angle = angle + DT * (turn + turning) / 2
+        velocities = torch.cat([faster, turning], -1).clamp(-self.MOST, self.MOST)
+        return torch.cat([ahead, angle.cos(), angle.sin(), velocities], -1)
 
 
 def unlearned_filter(members: int) -> DEnKF:

@@ -10,8 +10,9 @@ import torch
 
 from torch_denkf.filters import Filter
 
-SHIFTED = "noise {:g}, not trained"
-LEFT = SHIFTED + ", R as learned"
+NOT_TRAINED = "not trained"
+SHIFTED = f"noise {{:g}}, {NOT_TRAINED}"
+LEFT = f"{SHIFTED}, R as learned"
 
 
 @contextmanager

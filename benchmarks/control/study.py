@@ -19,11 +19,13 @@ MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
 CELLS = {  # noise of readings, and missing share; those that say most come first
     "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
+    "cartpole": [(0.1, 0.0)],
 }
 READERS = {
     "hike": ("Kalman", *BELIEFS, *MEMORIES),
     "pendulum": (*BELIEFS, "belief mean, taught", *MEMORIES),
-}  # of each cell; what reads the truth is the same in all cells, and runs in the one without noise
+    "cartpole": ("belief mean", "LSTM", "truth", "belief mean, spread", "four readings", "last reading"),
+}  # of each cell; what reads the truth is the same in all cells of a task, and runs in the one without noise
 
 
 @dataclass(frozen=True)

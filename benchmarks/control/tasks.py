@@ -81,7 +81,7 @@ TASKS = {
         scale=cartpole.SCALE,
         prior=((0.0,) * 5, (0.7, 0.7, 0.7, 1.5, 4.0)),
         settings=sac.Settings(),
-        learning=Learning(window=64, windows=16, first=75, further=6, noise_lr=9e-2),
+        learning=Learning(window=25, windows=64, first=120, further=6, pieces=10, within=1.5),
         agent=sac.SAC,
         shift=0.3,
     ),
