@@ -111,4 +111,8 @@ def refiltered(filter: Filter, data: TensorDict) -> TensorDict:
     with torch.no_grad():
         belief = filter.sequence(TensorDict(frames, [*data.shape[:-1], data.shape[-1] + 1]))["belief"]
     belief = belief.select("mean", "var")
-    return data.clone(False).set("belief", belief[:, :-1]).set("next", data["next"].clone(False).set("belief", belief[:, 1:]))
+    return (
+        data.clone(False)
+        .set("belief", belief[:, :-1])
+        .set("next", data["next"].clone(False).set("belief", belief[:, 1:]))
+    )

@@ -139,7 +139,9 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     lines = ["", f"Percent of the return with {home} that is lost, with the same seeds.", "", *head("cell", *names)]
     for cell in away:
         before, after = ([np.array(returns(rows, task, one, arm)) for arm in names] for one in (home, cell))
-        lines.append(line(cell, *(_text(100 * (1 - b / a)) if len(b) else "" for a, b in zip(before, after, strict=True))))
+        lines.append(
+            line(cell, *(_text(100 * (1 - b / a)) if len(b) else "" for a, b in zip(before, after, strict=True)))
+        )
     return lines
 
 

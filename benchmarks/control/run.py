@@ -25,14 +25,14 @@ class Budget:
     """What all arms of all tasks may use.
 
     Attributes:
-        env_steps: with those that a filter learns from before the policy moves.
+        env_steps: in the place of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
         members: of an ensemble.
         updates: of a filter, as a share of the task's.
     """
 
-    env_steps: int = 100_000
+    env_steps: int | None = None
     tests: int = 5
     episodes: int = 100
     members: int = 32
@@ -74,7 +74,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     begun = time.process_time()
     filter, learner = None, None
     batch = task.count * task.steps
-    batches = max(1, budget.env_steps // batch)
+    batches = max(1, (budget.env_steps or task.env_steps) // batch)
     if arm.filter == "exact":
         filter = task.exact(cell[0])
     elif arm.filter:

@@ -24,8 +24,8 @@ class Settings:
     gamma: float = 0.99
     every: int = 5  # environment steps for each update
     batch: int = 256  # steps, in any order
-    recurrent_batch: int = 512  # steps of a recurrent network, in slices
-    slice: int = 32  # steps that a recurrent network is trained through
+    recurrent_batch: int = 500  # steps of a recurrent network, in slices
+    slice: int = 50  # steps that a recurrent network is trained through
     units: int = 128  # of a hidden layer
     lr: float = 1e-3
     target: float = 0.995  # that stays of the target networks in an update

@@ -29,6 +29,7 @@ class Task:
         settings: of PPO, or of SAC.
         learning: of the filter.
         agent: PPO or SAC.
+        env_steps: of a run, with those of random actions.
         shift: noise of the readings in a second test, after all training; ``None`` for none.
     """
 
@@ -43,6 +44,7 @@ class Task:
     settings: ppo.Settings | sac.Settings
     learning: Learning
     agent: type[ppo.PPO] | type[sac.SAC] = ppo.PPO
+    env_steps: int = 100_000
     shift: float | None = None
 
 
@@ -83,6 +85,7 @@ TASKS = {
         settings=sac.Settings(),
         learning=Learning(window=25, windows=64, first=120, further=6, pieces=10, within=1.5),
         agent=sac.SAC,
+        env_steps=60_000,
         shift=0.3,
     ),
 }

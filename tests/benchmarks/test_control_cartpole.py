@@ -10,7 +10,7 @@ from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from benchmarks.control import cartpole
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.learning import Learner, Learning, refiltered
+from benchmarks.control.learning import Learner, refiltered
 from benchmarks.control.page import page
 from benchmarks.control.run import Budget, make_env, rollout, run
 from benchmarks.control.sac import SAC, Settings
@@ -89,7 +89,7 @@ def test_what_is_filtered_once_more_is_what_was_filtered_in_the_environment():
 
 
 def test_what_the_filter_is_told_is_what_the_analysis_uses():
-    """The first belief is the Kalman update of the prior's members with R = 0.3^2; before and after with what it had."""
+    """The first belief is the Kalman update of the prior's members, with R = 0.3^2 while it is told so."""
     filter = still_filter()
     reading = torch.tensor([[0.5, -0.5, 0.5]])
     frame = TensorDict({"observation": reading, "observed": torch.ones(1, 1, dtype=torch.bool)}, [1])
@@ -128,7 +128,6 @@ def test_a_filter_learns_the_cartpole_from_readings_alone():
     with torch.no_grad():
         belief = filter.sequence(test.copy())["belief"]
     error = (belief["mean"] - test["state"])[inside].square().mean(0).sqrt()
-    print(error, belief["var"][inside].mean(0).sqrt(), filter["transition"].module["noise"].log_variance.div(2).exp())
     assert error[3] < 0.3
     assert error[4] < 0.4
 
@@ -141,7 +140,18 @@ def test_sac_learns_to_do_what_it_reads():
     over = torch.ones(400, 10, 1, dtype=torch.bool)
     after = {"state": state, "done": over, "terminated": over, "is_init": ~over}
     after["reward"] = -10 * (action - state[..., :1]).square()
-    agent.update(TensorDict({"state": state, "action": action, **dict.fromkeys(("done", "terminated"), over), "is_init": over, "next": after}, [400, 10]))
+    agent.update(
+        TensorDict(
+            {
+                "state": state,
+                "action": action,
+                **dict.fromkeys(("done", "terminated"), over),
+                "is_init": over,
+                "next": after,
+            },
+            [400, 10],
+        )
+    )
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         done = agent.policy(TensorDict({"state": state[:, 0]}, [400]))["action"]
     assert (done - state[:, 0, :1]).square().mean().sqrt() < 0.15
