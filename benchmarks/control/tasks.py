@@ -83,9 +83,9 @@ TASKS = {
         scale=cartpole.SCALE,
         prior=((0.0,) * 5, (0.7, 0.7, 0.7, 1.5, 4.0)),
         settings=sac.Settings(),
-        learning=Learning(window=25, windows=64, first=120, further=6, pieces=10, within=1.5),
+        learning=Learning(window=25, windows=64, first=120, further=20, pieces=10, within=1.5),
         agent=sac.SAC,
-        env_steps=60_000,
+        env_steps=80_000,
         shift=0.3,
     ),
 }
