@@ -28,15 +28,15 @@ class NoisyCartpole(LinearGaussianEnv):
     """Many carts at once. The state is the cart's position, cosine and sine of the pole's angle, and two velocities.
 
     Physics, reward and start are those of ``dm_control.suite.cartpole.swingup``. The first three entries of the state
-    (m, 1, 1) are read with noise, the velocities (m/s, rad/s) are not. The motor gets the action ``[*B, 1]`` and
-    N(0, 0.3^2), within [-1, 1]. The reward is the sum over the physics steps of an action.
+    (m, 1, 1) are read with noise, the velocities (m/s, rad/s) are not. In each physics step the motor gets the action
+    ``[*B, 1]`` and N(0, 0.3^2), within [-1, 1]. The reward is the sum over an action's physics steps.
 
     Args:
         count: carts.
         noise: standard deviation of a reading.
         missing: share of the readings that do not come.
         seed: of the environment's own generator.
-        action_noise: standard deviation of what is added to an action.
+        action_noise: standard deviation of what is added to an action, in each physics step.
     """
 
     def __init__(
@@ -69,12 +69,11 @@ class NoisyCartpole(LinearGaussianEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         position, cos, sin, velocity, turn = tensordict["state"].split(1, -1)
-        motor = tensordict["action"] + self.action_noise * self._randn(position, 1)
+        motor = tensordict["action"] + self.action_noise * self._randn(position, REPEAT)
         motor = motor.clamp(-1, 1).double().numpy()
         angle = torch.atan2(sin, cos)
         before = torch.cat([torch.zeros_like(angle), position, angle, velocity, turn], -1).double().numpy()
-        held = np.broadcast_to(motor[:, None], (len(motor), REPEAT, 1))
-        after, _ = self.simulator.rollout(self.model, self.data, before, np.ascontiguousarray(held))
+        after, _ = self.simulator.rollout(self.model, self.data, before, motor[..., None])
         _, position, angle, velocity, turn = torch.from_numpy(after[:, -1]).to(cos.dtype).split(1, -1)
         state = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1)
         reward = swing_up(after[..., 1], np.cos(after[..., 2]), after[..., 4], motor).sum(-1, keepdims=True)
