@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Unbounded
 from torchrl.envs import Compose, DoubleToFloat, GrayScale, SerialEnv, ToTensorImage, TransformedEnv
 from torchrl.envs.libs.dm_control import DMControlWrapper
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import ObservationTransform, Transform
 
-SIDE, NOISE = 64, 0.1  # pixels; rad
+SIDE, FINE = 64, 2  # pixels of a picture's side, and how many of the rendering each averages, along a side
+NOISE = 0.1  # rad
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -32,6 +33,7 @@ class Arm:
     actions: int
     stiffness: float  # of the controller: action a rad
     damping: float  # action a rad/s
+    substeps: int = 1  # of the simulator in a step
 
     @property
     def joints(self) -> int:
@@ -86,7 +88,7 @@ class Arm:
 
 ARMS = {
     "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3),
-    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15),
+    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15, substeps=5),
 }
 
 
@@ -118,6 +120,26 @@ class Encoders(Transform):
         for key, width in (("state", 3), ("goal", 1), ("reading", 2)):
             observation_spec[key] = Unbounded((*observation_spec.shape, width * self.arm.joints))
         observation_spec["observed"] = Binary(shape=(*observation_spec.shape, 1), dtype=torch.bool)
+        return observation_spec
+
+
+class Average(ObservationTransform):
+    """Pictures of a side of ``SIDE`` pixels, each the mean of some: arms that are a pixel wide need smooth edges.
+
+    MuJoCo's own smoothing and shadows cost ten times as much as all the rest.
+    """
+
+    def __init__(self):
+        super().__init__(in_keys=["pixels"], out_keys=["pixels"])
+
+    def _apply_transform(self, pixels):
+        return nn.functional.avg_pool2d(pixels, FINE)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        observation_spec["pixels"] = Unbounded((*observation_spec["pixels"].shape[:-2], SIDE, SIDE))
         return observation_spec
 
 
@@ -154,14 +176,14 @@ def make_one(arm: Arm, pixels: bool) -> DMControlWrapper:
     env = suite.load(arm.domain, arm.task)
     if not pixels:
         return DMControlWrapper(env)
-    env.physics.model.vis.quality.offsamples = 0  # shadows and smooth edges cost ten times as much as the rest
+    env.physics.model.vis.quality.offsamples = 0
     quick = {"shadow": False, "reflection": False}
-    shape = {"height": SIDE, "width": SIDE, "camera_id": 0, "render_flag_overrides": quick}
+    shape = {"height": FINE * SIDE, "width": FINE * SIDE, "camera_id": 0, "render_flag_overrides": quick}
     return DMControlWrapper(env, from_pixels=True, pixels_only=False, render_kwargs=shape)
 
 
 def make_env(arm: Arm, pixels: bool, episodes: int, missing: float = 0.0) -> TransformedEnv:
     """``episodes`` arms side by side."""
-    images = [ToTensorImage(), GrayScale()] if pixels else []
+    images = [ToTensorImage(), GrayScale(), Average()] if pixels else []
     arms = SerialEnv(episodes, partial(make_one, arm, pixels))
     return TransformedEnv(arms, Compose(DoubleToFloat(), *images, Encoders(arm, missing)))
