@@ -88,7 +88,7 @@ class Arm:
 
 ARMS = {
     "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3),
-    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15, substeps=5),
+    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15, substeps=10),
 }
 
 
