@@ -33,7 +33,6 @@ class Arm:
     actions: int
     stiffness: float  # of the controller: action a rad
     damping: float  # action a rad/s
-    substeps: int = 1  # of the simulator in a step
 
     @property
     def joints(self) -> int:
@@ -88,7 +87,7 @@ class Arm:
 
 ARMS = {
     "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3),
-    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15, substeps=10),
+    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15),
 }
 
 

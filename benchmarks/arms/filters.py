@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.arms.arms import NOISE, SIDE, Arm
+from benchmarks.arms.arms import NOISE, SIDE, Arm, wrap
 from torch_denkf import modules as m
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import ensemble_mean, ensemble_var
@@ -20,19 +20,20 @@ LENGTH = 0.3  # rad: a motion after which a picture is read with other errors, b
 
 
 class ArmTransition(m.SubModel):
-    """Learned accelerations and their noise; the new velocity turns the angle, whose cosine and sine are the state.
+    """Learned accelerations and their noise; old and new velocity turn the angle, whose cosine and sine are the state.
 
     With ``bias`` the errors of a sensor follow in the state, of standard deviations ``bias`` before training. A picture
     of an arm at rest is read with the same error again and again, and with another one when the arm has moved: the
     errors fade with the way that the joints went, not with time.
     """
 
-    def __init__(self, arm: Arm, scale: Tensor, change: Tensor, bias: Tensor | None = None):
+    def __init__(self, arm: Arm, scale: Tensor, change: Tensor, lead: Tensor, bias: Tensor | None = None):
         network = m.StochasticMLP(3 * arm.joints + arm.actions, 2 * arm.joints, (64, 64), layer="none", output_gain=0.1)
         super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
         self.arm = arm
         self.register_buffer("scale", scale)  # of velocities, rad/s
         self.register_buffer("change", change)  # of their steps, rad/s
+        self.register_buffer("lead", lead)  # share of its change that a velocity has on average in a step
         self.log_drift = nn.Parameter(torch.full((arm.joints,), DRIFT).log())
         self.log_bias = None if bias is None else nn.Parameter(bias.log())
         self.log_length = None if bias is None else nn.Parameter(torch.full_like(bias, LENGTH).log())
@@ -49,9 +50,9 @@ class ArmTransition(m.SubModel):
         action = action.to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)
         mean, std = self.faster(state, action)
         faster = mean + std * torch.randn_like(std)
-        # As MuJoCo's semi-implicit Euler has it; without the drift an arm at rest would be believed for ever.
-        lead = (self.arm.substeps + 1) / (2 * self.arm.substeps)
-        turned = angles + self.arm.dt * (velocity + lead * faster) + self.log_drift.exp() * torch.randn_like(faster)
+        # Without the drift an arm at rest would be believed for ever.
+        drift = self.log_drift.exp() * torch.randn_like(faster)
+        turned = angles + self.arm.dt * (velocity + self.lead * faster) + drift
         moved = self.arm.join(turned, velocity + faster)
         if self.log_bias is None:
             return moved
@@ -90,10 +91,13 @@ def make_filter(arm: Arm, motion: TensorDict, sensor: m.ImageSensor | None, erro
         error: standard deviations of what the sensor reads ``[2 J]``.
     """
     size, key = 2 * arm.joints, ("sensor", "ensemble") if sensor else "reading"
-    velocity = motion["state"][..., size:]
-    change = velocity.diff(dim=1).flatten(0, 1).std(0)
+    angles, velocity = arm.split(motion["state"])
+    steps = velocity.diff(dim=1).flatten(0, 1)
+    change = steps.std(0)
+    beyond = wrap(angles.diff(dim=1)).flatten(0, 1) / arm.dt - velocity[:, :-1].flatten(0, 1)
+    lead = (beyond * steps).sum(0) / steps.square().sum(0)  # 1 in MuJoCo's Euler step; of several it is less
     mean, std = motion["state"][:, 0].mean(0), motion["state"][:, 0].std(0).clamp_min(1e-3)  # both arms begin at rest
-    transition = ArmTransition(arm, velocity.flatten(0, 1).std(0), change, error)
+    transition = ArmTransition(arm, velocity.flatten(0, 1).std(0), change, lead, error)
     if sensor is None:
         observation: m.SubModel = m.Select(range(size))
         noise: m.SubModel = m.ConstantNoise([NOISE] * size, in_key=key)

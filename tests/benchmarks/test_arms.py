@@ -9,7 +9,7 @@ pytest.importorskip("dm_control", reason="dm_control is not installed: pip insta
 from benchmarks.arms.arms import ARMS, NOISE, SIDE, Average, Encoders, HoldReading, make_env, make_one, wrap
 from benchmarks.arms.filters import ArmTransition, FromBiasedSensor, make_filter, train_motion
 from benchmarks.arms.page import COLUMNS, difference, page
-from benchmarks.arms.study import scores
+from benchmarks.arms.study import collect, scores
 
 
 def physics_at(name, seed):
@@ -89,27 +89,16 @@ def test_held_readings():
     assert velocities == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_angles_turn_as_in_mujoco(name):
-    arm, _, physics = physics_at(name, 0)
-    joints = physics.model.jnt_qposadr[: arm.joints]
-    per_step = round(arm.dt / physics.timestep())
-    assert per_step == arm.substeps
-    physics.data.qvel[joints] = 0.5
-    before, slow = physics.data.qpos[joints].copy(), physics.data.qvel[joints].copy()
-    physics.set_control([1.0] + [0.0] * (arm.actions - 1))
-    physics.step(per_step)
-    faster = physics.data.qvel[joints] - slow
-    lead = (arm.substeps + 1) / (2 * arm.substeps)
-    turned = before + arm.dt * (slow + lead * faster)
-    assert abs(faster).max() > 0.01
-    # Accelerations change a little within a step.
-    assert abs(physics.data.qpos[joints] - turned).max() < 0.05 * arm.dt * abs(faster).max()
+def test_angles_turn_as_in_mujoco():
+    arm = ARMS["reacher"]
+    motion = collect(arm, False, 2, 30, 0)
+    lead = make_filter(arm, motion, None, None)["transition"].lead
+    torch.testing.assert_close(lead, torch.ones(2), atol=2e-3, rtol=0)  # one step of semi-implicit Euler
 
 
 def transition(arm, bias=None):
     torch.manual_seed(0)
-    return ArmTransition(arm, torch.ones(arm.joints), torch.ones(arm.joints), bias)
+    return ArmTransition(arm, *torch.ones(3, arm.joints), bias)
 
 
 def test_the_forecast_turns_by_the_new_velocity():
