@@ -124,7 +124,8 @@ def train_sensor(sensor: m.ImageSensor, frames: TensorDict, updates: int, out: P
     def sample(generator: torch.Generator, _: int | None) -> TensorDict:
         return frames[torch.randint(len(frames), (48,), generator=generator)]
 
-    train_part(sensor, Stage("sensor", loss, sample, updates), out=out, loggers=(), device="cpu", seed=seed)
+    stage = Stage("sensor", loss, sample, updates)
+    train_part(sensor, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)
 
 
 def train_motion(denkf: DEnKF, motion: TensorDict, updates: int, out: Path, seed: int) -> None:
@@ -142,7 +143,7 @@ def train_motion(denkf: DEnKF, motion: TensorDict, updates: int, out: Path, seed
         return steps[torch.randint(len(steps), (512,), generator=generator)]
 
     stage = Stage("motion", loss, sample, updates, parameters=transition.module.parameters(), lr=3e-3)
-    train_part(transition, stage, out=out, loggers=(), device="cpu", seed=seed)
+    train_part(transition, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)
 
 
 def train_noise(denkf: DEnKF, episodes: TensorDict, updates: int, out: Path, seed: int) -> None:
@@ -167,4 +168,4 @@ def train_noise(denkf: DEnKF, episodes: TensorDict, updates: int, out: Path, see
     parameters = [*denkf["noise"].parameters(), *slow]
     lengths = {0: 15, updates // 2: 60}
     stage = Stage("noise", loss, sample, updates, parameters=parameters, lr=1e-2, lengths=lengths)
-    train_part(denkf, stage, out=out, loggers=(), device="cpu", seed=seed)
+    train_part(denkf, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)
