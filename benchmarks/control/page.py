@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 
 from benchmarks.common.arguments import processor
+from benchmarks.common.intervals import bootstrap_interval
 from benchmarks.common.plots import plt, save
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.control.arms import ARMS
@@ -42,13 +42,7 @@ def interquartile_mean(values: Sequence[float], axis: int = -1):
 
 def summary(values: Sequence[float]) -> tuple[float, float, float]:
     """The interquartile mean, and the bounds of its 95 % percentile bootstrap interval over seeds."""
-    center = float(interquartile_mean(values))
-    if len(values) < 2 or np.ptp(values) == 0:
-        return center, np.nan, np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        interval = bootstrap((np.asarray(values),), interquartile_mean, method="percentile", rng=0)
-    return center, *map(float, interval.confidence_interval)
+    return bootstrap_interval(values, interquartile_mean)
 
 
 def last(rows: Sequence[dict]) -> list[dict]:
