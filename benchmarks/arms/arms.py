@@ -48,8 +48,8 @@ class Arm:
         return torch.cat([angles.cos(), angles.sin(), velocity], -1)
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles in (-pi, pi] and velocities."""
-        cos, sin, velocity = state.split(self.joints, -1)
+        """Angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
+        cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
     def tip(self, angles: Tensor) -> Tensor:

@@ -101,7 +101,7 @@ def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
 
 def scores(arm: Arm, episodes: TensorDict, key) -> list[dict]:
     """A row for each episode. What is at the end is of its last quarter, when the arm should rest at its goal."""
-    estimate, truth = (arm.split(episodes["next", name][..., : 3 * arm.joints]) for name in (key, "state"))
+    estimate, truth = (arm.split(episodes["next", name]) for name in (key, "state"))
     last = episodes.shape[1] // 4
     believed, tip = (100 * arm.tip(part[0][:, -last:]) for part in (estimate, truth))
     columns: dict[str, Tensor] = {
