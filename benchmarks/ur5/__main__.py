@@ -26,7 +26,7 @@ def smoke(study: Study) -> Study:
     demos = {"size": 32, "demos": 12, "frames": 2, "sequences": 10, "real": 10, "real_train": 9, "steps": 30}
     budget = Budget(sensor=3, fine_tuning=2, motion=5, filter=2, end_to_end=1, length=6, batch=4)
     folders = {"root": folder / "demos", "out": folder / "out"}
-    return replace(study, sensors=("glimpse", "paper"), sizes=(4, 8), budget=budget, **demos, **folders)
+    return replace(study, sensors=("glimpse", "paper"), sizes=(4, 8), budget=budget, pasted=6, **demos, **folders)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from torch_denkf.data import UR5ExperienceReplay
 from torch_denkf.envs import collect_ur5_demos
@@ -36,6 +37,7 @@ class Collections:
     validation: int = 16  # and at most so many decide
     real: int = 130  # demos of real_like, whole
     real_train: int = 20  # of these, on the train side
+    pasted: int = 8000  # pictures of the simulator's states as the other camera sees them, to fine-tune with
     steps: int = 350  # of a sequence
 
     def collect(self, processes: int = 1, *, real: bool = True) -> None:
@@ -70,17 +72,33 @@ class FramePool:
         rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
         if not len(rows):
             raise ValueError(f"none of the {len(data.episodes)} demos in {data.root} is chosen; collect more")
-        parts = [data[index] for index in rows.split(512)]
-        self.pixels = torch.cat([(part["pixels"] * 255).round().to(torch.uint8) for part in parts])
-        self.state = torch.cat([part["state"] for part in parts])
+        first = data[rows[:1]]
+        self.pixels = torch.empty(len(rows), *first["pixels"].shape[1:], dtype=torch.uint8)  # as floats: 17 GB
+        self.state = first["state"].new_empty(len(rows), first["state"].shape[-1])
+        for at in torch.arange(len(rows)).split(512):
+            part = data[rows[at]]
+            self.pixels[at], self.state[at] = (part["pixels"] * 255).round().to(torch.uint8), part["state"]
 
     def __len__(self) -> int:
         return len(self.state)
+
+    def shrunk(self, times: int) -> FramePool:
+        """The same frames with so many times fewer rows and columns, averaged."""
+        pool = object.__new__(FramePool)
+        parts = [avg_pool2d(part.float(), times).round().to(torch.uint8) for part in self.pixels.split(512)]
+        pool.pixels, pool.state = torch.cat(parts), self.state
+        return pool
 
     def rows(self, index: Tensor) -> TensorDict:
         """Frames with float pixels, ``[n]``."""
         pixels = self.pixels[index].float() / 255
         return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
+
+    def joined(self, pixels: Tensor, state: Tensor) -> FramePool:
+        """These frames and others, uint8 ``[n, 3, H, W]``, of states ``[n, 10]``."""
+        pool = object.__new__(FramePool)
+        pool.pixels, pool.state = torch.cat([self.pixels, pixels]), torch.cat([self.state, state])
+        return pool
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
         """Random frames ``[batch]``."""

@@ -1,7 +1,8 @@
 """Error against milliseconds a step: the trained DEnKF at all sizes and with three updates, and the other filters.
 
-Weights are those that the table's filters were trained with; nothing is trained again. Size and update are chosen by
-the validation demos, column ``validation_crps``.
+Weights are those that the table's filters were trained with; nothing is trained again. An update that a filter was not
+trained with gets its own inflation, chosen as training chooses it, with the table's number of members. Size and update
+are chosen by the validation demos, column ``validation_crps``.
 """
 
 from __future__ import annotations
@@ -13,11 +14,15 @@ from pathlib import Path
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.plots import draw_frontier
 from benchmarks.common.tables import Columns
+from benchmarks.common.training import read_filter
 from benchmarks.ur5.evaluation import size_rows
+from benchmarks.ur5.readings import read_all, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS
 from benchmarks.ur5.study import Base, Study, members_of
-from torch_denkf.training import read_checkpoint
+from benchmarks.ur5.training import INFLATIONS, joint_coverage, run_filter
+from torch_denkf.modules import ImageSensor
+from torch_denkf.training import choose_for_coverage, read_checkpoint
 
 SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" takes no localisation
 SHOWN = 3.0  # degrees: the particle filters err by more
@@ -61,12 +66,24 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
     for scheme in SCHEMES if name == "denkf" else (None,):
         names = {"filter": f"DEnKF, {scheme}" if scheme else name, "sensor": base.kind, "seed": base.seed}
         make, sizes = partial(_recipe, base, name, scheme), base.study.sizes if scheme else (MEMBERS,)
+        own = {**saved, "inflation": _inflation(base, make(MEMBERS), sensor, saved)} if scheme in SCHEMES[1:] else saved
         chunk = 0 if base.study.smoke else 1
         for row in size_rows(
-            make, sensor, base.codes("test"), sizes, saved, names, base.codes("validation"), chunk=chunk
+            make, sensor, base.codes("test"), sizes, own, names, base.codes("validation"), chunk=chunk
         ):
             row["members"] = row["ensemble_size"] if scheme else members_of(name)
             yield {column: row[column] for column in COLUMNS.names}
+
+
+def _inflation(base: Base, recipe: UR5Recipe, sensor: ImageSensor, saved: dict) -> float:
+    """What a recipe's update wants, of the validation demos' coverage."""
+    model = read_filter(recipe, recipe.build(), saved)
+    readings = with_missing(read_all(sensor, base.codes("validation"), MEMBERS))
+    return choose_for_coverage(
+        INFLATIONS,
+        lambda factor: recipe.set_inflation(model, factor),
+        lambda: joint_coverage(run_filter(recipe, model, readings)),
+    )
 
 
 def _recipe(base: Base, name: str, scheme: str | None, size: int) -> UR5Recipe:

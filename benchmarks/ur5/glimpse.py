@@ -7,21 +7,23 @@ from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
 from torch_denkf.modules import KeypointTrunk
+from torch_denkf.simulation.ur5.domains import SIM, Domain
 
-# Nominal calibration, m from the table's centre: only where the first looks go follows from it.
-CAMERA, TARGET, FIELD = (1.4, 0.0, 0.85), (-0.18, 0.02, 0.27), 33.0
 REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half pictures: hand and wrist
 COARSE = 112  # pixels: the side of the picture that the first look gets
 
 
-def project(places: Tensor) -> Tensor:
-    """Where places ``[*, 3]`` are in the picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1."""
-    camera, target = torch.tensor(CAMERA), torch.tensor(TARGET)
+def project(places: Tensor, look: Domain = SIM) -> Tensor:
+    """Where places ``[*, 3]`` are in a camera's picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
+
+    Only where the first looks go follows from it, so that roll and lens are left out.
+    """
+    camera, target = torch.tensor(look.camera), torch.tensor(look.target)
     ahead = nn.functional.normalize(target - camera, dim=0)
     right = nn.functional.normalize(torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     up = torch.linalg.cross(right, ahead)
     way = places - camera
-    depth = (way @ ahead) * torch.tan(torch.tensor(FIELD / 2).deg2rad())
+    depth = (way @ ahead) * torch.tan(torch.tensor(look.field / 2).deg2rad())
     return torch.stack([way @ right / depth, -(way @ up) / depth], -1)
 
 
@@ -64,10 +66,9 @@ class GlimpseTrunk(nn.Module):
         return self.mix(torch.cat([code, self.squeeze(self.close(patch)), centre], -1))
 
     @torch.no_grad()
-    def aim(self, images: Tensor, places: Tensor) -> float:
-        """Sets the centre of the patch by least squares to where places ``[N, 3]`` project; their error in pixels."""
-        parts = [self.coarse(part) for part in images.split(128)]
-        code, goal = torch.cat(parts), project(places)
+    def aim(self, images: Tensor, goal: Tensor) -> float:
+        """Sets the patch's centre by least squares to what :func:`project` says ``[N, 2]``; its error in pixels."""
+        code = torch.cat([self.coarse(part) for part in images.split(128)])
         mean = code.mean(0)
         design = torch.cat([code - mean, torch.ones(len(code), 1)], -1).double()
         ridge = 1e-3 * len(code) * torch.eye(design.shape[-1], dtype=torch.double)

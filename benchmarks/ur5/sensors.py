@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
-from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk
+from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.simulation.ur5.domains import SIM, Domain
 from torch_denkf.training import Stage, train_part
 from torch_denkf.transforms import Brightness, SaltAndPepper
 
@@ -22,6 +23,7 @@ SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples
 WRIST = 5  # J6, which turns the gripper
 UNDECIDED = 0.3  # length of (cos, sin) of J6 below which a reading leaves to the forecast which half turn it is
+SALT = 0.02  # share of white pixels of a frame with salt and pepper, and of black ones
 NEAR = ("sensor", "near")  # readings as states, see NearForecast
 # What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.
 JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
@@ -164,13 +166,21 @@ _PRESETS = (
 SENSORS = {preset.name: preset for preset in _PRESETS}
 
 
-def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, count: int = 1500) -> None:
-    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper."""
+def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domain = SIM, count: int = 1500) -> None:
+    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper.
+
+    Args:
+        sensor: with a second look.
+        coarse: trained.
+        pool: frames to aim by, some of them.
+        look: the camera that took these.
+        count: how many.
+    """
     trunk = sensor.module["trunk"]
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
     trunk.coarse.requires_grad_(False)
     rows = pool.rows(torch.arange(0, len(pool), max(len(pool) // count, 1)))
-    trunk.aim(sensor._prepare(rows["pixels"]), rows["state"][:, 7:])
+    trunk.aim(sensor._prepare(rows["pixels"]), project(rows["state"][:, 7:], look))
 
 
 class NearForecast(SubModel):
@@ -208,12 +218,20 @@ class NearForecast(SubModel):
         return states
 
 
-def disturb(frames: TensorDict, generator: torch.Generator) -> TensorDict:
-    """What a camera does to training frames: a third get salt and pepper, a third another exposure."""
-    seed = int(torch.randint(2**31, (), generator=generator))
+def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> TensorDict:
+    """What a camera does to training frames: a third get salt and pepper, a third another exposure.
+
+    Args:
+        frames: with pixels.
+        generator: of all draws.
+        times: so many rows, and columns, of the camera's were averaged into one: of salt there are as many grains more,
+            each as much weaker.
+    """
+    seed, area = int(torch.randint(2**31, (), generator=generator)), times**2
     own = torch.Generator().manual_seed(seed)
     frames = Brightness((0.85, 1.15), (-0.03, 0.03), p=0.33, generator=own)(frames)
-    return SaltAndPepper(p=0.33, generator=own)(frames)
+    salted = SaltAndPepper(area * SALT, p=0.33, generator=own)(frames.copy())["pixels"]
+    return frames.set("pixels", torch.lerp(frames["pixels"], salted, 1 / area))
 
 
 @torch.no_grad()
@@ -246,13 +264,17 @@ def train_sensor(
     updates: int,
     lr: float = 2e-3,
     batch: int = 64,
+    times: int = 1,
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done."""
+    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
+
+    ``times`` is that of :func:`disturb`: by how much the frames of both pools were shrunk.
+    """
     terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}
     stage = Stage(
         "sensor",
         SensorLoss(sensor, lambda frames: preset.observe(frames["state"]), unit_of(preset.dim), terms),
-        lambda generator, _: disturb(train.sample(generator, batch), generator),
+        lambda generator, _: disturb(train.sample(generator, batch), generator, times),
         updates,
         lr=lr,
         weight_decay=0.02,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,8 @@ from benchmarks.common.arguments import some_of
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.ur5.demos import Collections, FramePool, Roles, real_roles, sequences_of, sim_roles
 from benchmarks.ur5.evaluation import conditions_of, filter_rows, save_beliefs, sensor_rows, size_rows, validation_crps
+from benchmarks.ur5.glimpse import COARSE
+from benchmarks.ur5.laboratory import LEVELS, Pasted
 from benchmarks.ur5.motion import ArmMotion, train_motion
 from benchmarks.ur5.readings import read_all, read_codes
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
@@ -25,6 +27,7 @@ from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Statistics,
 from benchmarks.ur5.training import Budget, train_filter
 from torch_denkf.filters import Filter
 from torch_denkf.modules import ImageSensor
+from torch_denkf.simulation.ur5.domains import SIM, Domain
 from torch_denkf.training import read_checkpoint, write_checkpoint
 
 TRAININGS = ("sim", "real_like", "fine_tuned")
@@ -85,7 +88,7 @@ class Base:
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
         """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
-        out = self.study.out / "sensors" / self.name
+        out = self.folder(self.kind)
         if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
             facts = Statistics(**read_checkpoint(out / "facts.pt"))
             sensor = self.preset.build(facts, SAMPLES)
@@ -104,20 +107,40 @@ class Base:
         torch.manual_seed(self.seed)
         # In the other domain as many as fine-tuning gets, of a third of the pictures.
         updates, lr = budget.sensor if self.training == "sim" else budget.fine_tuning, 2e-3
+        look = SIM
         if self.parent is not None:
             facts, sensor, lr = self.parent.facts, deepcopy(self.parent.sensor), 1e-3
-            sensor.requires_grad_(True)  # the coarse part of a second look, too: the camera stands elsewhere
+            pool, look = self._pasted(pool)
         else:
             facts = Statistics.of(self.states, pool)
             sensor = self.preset.build(facts, SAMPLES)
-        if self.parent is None and self.preset.coarse is not None:
+        if self.preset.coarse is not None:
             coarse = SENSORS[self.preset.coarse]
-            first, folder = coarse.build(facts, SAMPLES), out.with_name(out.name.replace(self.kind, coarse.name))
-            train_sensor(first, coarse, pool, checked, out=folder, seed=self.seed, updates=updates, lr=lr)
-            adopt(sensor, first, pool)
-            updates, lr = max(updates // 2, 1), 1.5e-3
+            times = max(facts.size // COARSE, 1)
+            first = coarse.build(replace(facts, size=facts.size // times), SAMPLES)
+            if self.parent is not None:
+                first.load_state_dict(read_checkpoint(self.parent.folder(coarse.name) / "sensor.pt")["sensor"])
+            settings = {"out": self.folder(coarse.name), "seed": self.seed, "updates": updates, "lr": lr}
+            train_sensor(first, coarse, pool.shrunk(times), checked.shrunk(times), times=times, **settings)
+            adopt(sensor, first, pool, look)
+            updates, lr = max(updates // 2, 1), 0.75 * lr
         train_sensor(sensor, self.preset, pool, checked, out=out, seed=self.seed, updates=updates, lr=lr)
         return sensor, facts
+
+    def folder(self, kind: str) -> Path:
+        """Of the sensor of a kind with this training and seed."""
+        return self.study.out / "sensors" / f"{self.training}-{kind}-{self.seed}"
+
+    def _pasted(self, pool: FramePool) -> tuple[FramePool, Domain]:
+        """Frames, and pictures of the simulator's states as the other domain's camera would take them; that camera."""
+        assert self.parent is not None
+        states = self.parent.states.flatten(0, 1)
+        generator = torch.Generator().manual_seed(self.seed)
+        states = states[torch.randint(len(states), (self.study.pasted,), generator=generator)]
+        paste = Pasted(pool.pixels, pool.state, ((4, 8.0, 1),) if self.study.smoke else LEVELS)
+        pixels = paste(states, self.seed)
+        paste.close()
+        return pool.joined(pixels, states), paste.look
 
     def motion(self, actions: bool) -> ArmMotion:
         """The motion, trained on true states."""

@@ -17,6 +17,7 @@ from benchmarks.ur5.recipes.denkf import localisation
 from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
 from benchmarks.ur5.training import run_filter
 from tests.benchmarks.ur5_for_tests import FACTS, states
+from torch_denkf.simulation.ur5.domains import Domain
 
 # ------------------------------------------------------------------------------------------------------ the wrist
 
@@ -162,6 +163,9 @@ def test_places_project_as_a_pinhole_has_it():
     assert float(right[0]) == pytest.approx(0.1 / depth, rel=0.02)
     assert float(low[1]) > 0.15
     assert abs(float(low[0])) < 0.01
+    # Another camera, from above: its target is in the middle, too.
+    above = Domain(camera=(-0.1, 0.02, 2.0), target=(-0.2, 0.0, 0.1), field=40.0)
+    assert project(torch.tensor([-0.2, 0.0, 0.1]), above).abs().max() < 1e-6
 
 
 def test_a_second_look_is_aimed_at_where_the_coarse_code_says():
@@ -170,7 +174,7 @@ def test_a_second_look_is_aimed_at_where_the_coarse_code_says():
     images = torch.rand(300, 3, 2, 2)
     # Places whose projections are linear in the picture.
     places = torch.tensor([-0.18, 0.02, 0.27]) + torch.tensor([0.0, 0.01, 0.0]) * images[:, :1, 0, 0]
-    assert trunk.aim(images, places) < 0.01
+    assert trunk.aim(images, project(places)) < 0.01
     assert trunk(torch.rand(2, 3, 2, 2)).shape == (2, 16)
     assert keypoint_trunk()(torch.rand(2, 3, 32, 32)).shape == (2, 256)
 

@@ -1,0 +1,186 @@
+"""The other domain's camera, found from its demos; and pictures of the simulator's arm as that camera would see it.
+
+A few demos show few poses: a sensor that learns from them alone memorises them. But their states are known, and so is
+the arm's shape. So the camera's pose, field of view and lens are those with which drawn silhouettes lie on what differs
+from the picture without the arm. Then the simulator's states, thousands of them, are drawn from there onto that
+picture, in the arm's colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from torch_denkf.simulation.ur5.camera import Camera
+from torch_denkf.simulation.ur5.domains import SIM, Domain, apply_domain
+from torch_denkf.simulation.ur5.render import GHOSTS, SCENERY, Renderer
+from torch_denkf.simulation.ur5.scene import UR5Scene
+
+SIDE = 112  # pixels, of the silhouettes
+DIFFERENT = 18  # grey levels by which the arm differs from what is behind it
+SHOTS = 100  # frames that the camera is found from
+# So many of them, silhouettes blurred by so many pixels, Gauss-Newton's steps; one after the other.
+Levels = Sequence[tuple[int, float, int]]
+LEVELS: Levels = ((40, 8.0, 8), (40, 4.0, 8), (60, 2.0, 8), (SHOTS, 1.0, 6))
+OFTEN = 0.35  # share of the frames in which a pixel shows the arm: where it is more, the median does, too
+UNITS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 2.0, 0.1])  # by which each number may be off
+HELD = 0.3  # share of the pictures with the object between the fingers
+HOME = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0, 0.4])
+
+
+class Drawn:
+    """Draws the arm, and nothing behind it, as a camera sees it.
+
+    Args:
+        side: of the pictures in pixels.
+        look: camera, lens, and light.
+    """
+
+    def __init__(self, side: int, look: Domain = SIM):
+        self.side, self.scene = side, UR5Scene((side, side))
+        model = self.scene.model
+        model.geom_group[model.body_rootid[model.geom_bodyid] == model.body("base").id] = GHOSTS
+        model.geom_group[[self.scene.object_geom, self.scene.goal_geom]] = SCENERY
+        self.scene.reset(HOME, np.array([0.1, 0.0, 0.025]), np.array([1.0, 0.0, 0.0, 0.0]))
+        self.renderer = Renderer(model, (side, side))
+        self.look(look)
+
+    def look(self, look: Domain) -> None:
+        """Puts the camera elsewhere."""
+        apply_domain(self.scene, look)
+        self.lens = Camera((self.side, self.side), look.distortion, (0.0, 0.0)).lens
+
+    def arm(self, joints: np.ndarray, *, held: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Colours ``[H, W, 3]`` and share of each pixel that is covered ``[H, W]``, at joints ``[7]``.
+
+        Args:
+            joints: rad.
+            held: where an object is drawn, too, m from the table's centre ``[3]``.
+        """
+        pose = self.scene.pose_with(joints.astype(float))
+        groups = (GHOSTS,) if held is None else (GHOSTS, SCENERY)
+        if held is not None:
+            pose[self.scene.object_qpos][:3] = held
+        picture = np.ascontiguousarray(self.renderer.draw(self.scene.posed(pose), groups=groups))
+        return self.lens(picture), self.lens(picture.max(-1).astype(bool).astype(np.float32))
+
+    def close(self) -> None:
+        """Frees the context."""
+        self.renderer.close()
+
+
+def without_arm(pixels: np.ndarray) -> np.ndarray:
+    """What is behind the arm, ``[H, W, 3]``: the median of frames ``[N, H, W, 3]``."""
+    return np.median(pixels, 0)
+
+
+def foreground(pixels: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Where frames ``[N, H, W, 3]`` show something else, ``[N, H, W]`` 0 or 1; each may be brighter as a whole."""
+    gain = np.median(pixels / np.maximum(behind, 1.0), axis=(1, 2, 3), keepdims=True)
+    return (np.abs(pixels - gain * behind).max(-1) > DIFFERENT).astype(np.float32)
+
+
+def look_of(numbers: np.ndarray) -> Domain:
+    """A camera by its place and target, m, its roll, rad, its field, degrees, and its lens's first number."""
+    x, y, z, to_x, to_y, to_z, roll, field, bend = (float(value) for value in numbers)
+    return Domain(camera=(x, y, z), target=(to_x, to_y, to_z), roll=roll, field=field, distortion=(bend, 0.0))
+
+
+def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS) -> tuple[Domain, float]:
+    """The camera that saw frames ``[N, S, S, 3]`` of the arm at joints ``[N, 7]``; and the share that does not fit.
+
+    Gauss-Newton steps on silhouettes that are blurred less and less, from the simulator's camera on.
+    """
+    small = np.stack([cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for frame in pixels])
+    small = small.astype(np.float32)
+    shown = foreground(small, without_arm(small))
+    drawn = Drawn(SIDE)
+    found = np.array([*SIM.camera, *SIM.target, SIM.roll, SIM.field, 0.0])
+    order = np.random.default_rng(0).permutation(len(small))[:SHOTS]
+
+    def silhouettes(numbers: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        drawn.look(look_of(numbers))
+        return np.stack([drawn.arm(joints[row])[1] for row in rows])
+
+    for count, width, steps in levels:
+        rows = order[:count]
+        # Where the arm mostly is, the frames' median shows it, too.
+        often = (silhouettes(found, order).mean(0) > OFTEN).astype(np.float32)
+        counted = 1 - cv2.dilate(often, np.ones((int(2 * width) + 5,) * 2))
+        seen = counted * _blurred(shown[rows], width)
+
+        def misfit(way: np.ndarray, start=found, rows=rows, seen=seen, counted=counted, width=width) -> np.ndarray:
+            return (counted * _blurred(silhouettes(start + UNITS * (way - 1), rows), width) - seen).ravel()
+
+        # From one, not zero: the step of the differences is a share of it.
+        solution = least_squares(misfit, np.ones(len(found)), diff_step=0.1, max_nfev=steps)
+        found = found + UNITS * (solution.x - 1)
+        share = 2 * solution.cost / float(np.square(seen).sum())
+    drawn.close()
+    return look_of(found), share
+
+
+def _blurred(masks: np.ndarray, width: float) -> np.ndarray:
+    return np.stack([cv2.GaussianBlur(mask, (0, 0), width) for mask in masks])
+
+
+def colours(drawn: Drawn, pixels: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Gain and offset of red, green, and blue ``[2, 3]`` that make drawn arms look like those in frames."""
+    shown, before, after = foreground(pixels, without_arm(pixels)), [], []
+    for frame, mask, row in zip(pixels, shown, joints, strict=True):
+        picture, covered = drawn.arm(row)
+        both = (mask > 0) & (covered == 1)
+        before.append(picture[both])
+        after.append(frame[both])
+    x, y = np.concatenate(before).astype(float), np.concatenate(after).astype(float)
+    gain = ((x - x.mean(0)) * (y - y.mean(0))).mean(0) / x.var(0)
+    return np.stack([gain, y.mean(0) - gain * x.mean(0)])
+
+
+class Pasted:
+    """The simulator's arm as the other domain's camera would see it, before what is behind it there.
+
+    Args:
+        pixels: uint8 frames ``[N, 3, H, W]`` of demos in the other domain.
+        states: theirs ``[N, 10]``.
+        levels: of the search for the camera.
+    """
+
+    def __init__(self, pixels: Tensor, states: Tensor, levels: Levels = LEVELS):
+        frames, joints = pixels.permute(0, 2, 3, 1).numpy(), states[:, :7].numpy()
+        chosen = np.random.default_rng(0).permutation(len(frames))[: 2 * SHOTS]
+        frames, joints = frames[chosen], joints[chosen]
+        self.look, self.misfit = find_camera(frames, joints, levels)
+        self.drawn, frames = Drawn(frames.shape[1], self.look), frames.astype(np.float32)
+        self.behind = without_arm(frames)
+        self.paint = colours(self.drawn, frames, joints)
+        self.grain = float(np.median(np.abs(frames - self.behind))) / 0.67 / 2  # much of it is light
+
+    def __call__(self, states: Tensor, seed: int = 0) -> Tensor:
+        """Pictures, uint8 ``[N, 3, H, W]``, of states ``[N, 10]``, in colours that vary a little."""
+        rng, out = np.random.default_rng(seed), torch.empty(len(states), 3, *self.behind.shape[:2], dtype=torch.uint8)
+        for index, state in enumerate(states.numpy()):
+            held = state[7:] + 0.01 * rng.standard_normal(3) if rng.random() < HELD else None
+            self._light(rng)
+            picture, covered = self.drawn.arm(state[:7], held=held)
+            gain = 1 + 0.05 * rng.standard_normal(3)
+            arm = gain * (self.paint[0] * picture + self.paint[1])
+            light = self.behind + covered[..., None] * (arm - self.behind)
+            light = (1 + 0.06 * rng.standard_normal()) * light + self.grain * rng.standard_normal(light.shape)
+            out[index] = torch.from_numpy(light.clip(0, 255).astype(np.uint8).transpose(2, 0, 1))
+        return out
+
+    def _light(self, rng: np.random.Generator) -> None:
+        """Turns the main light, and paints the object."""
+        model, way = self.drawn.scene.model, rng.standard_normal(3) * [1.0, 1.0, 0.2] - [0.0, 0.0, 1.0]
+        model.light("main").dir[:] = way / np.linalg.norm(way)
+        model.geom_rgba[self.drawn.scene.object_geom, :3] = rng.uniform(0.1, 0.9, 3)
+
+    def close(self) -> None:
+        """Frees the context."""
+        self.drawn.close()
