@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Unbounded
 from torchrl.envs import Compose, DoubleToFloat, GrayScale, SerialEnv, ToTensorImage, TransformedEnv
 from torchrl.envs.libs.dm_control import DMControlWrapper
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import ObservationTransform, Transform
 
-SIDE, NOISE = 64, 0.1  # pixels; rad
+SIDE, FINE = 64, 2  # pixels of a picture's side, and how many of the rendering each averages, along a side
+NOISE = 0.1  # rad
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -47,8 +48,8 @@ class Arm:
         return torch.cat([angles.cos(), angles.sin(), velocity], -1)
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles in (-pi, pi] and velocities."""
-        cos, sin, velocity = state.split(self.joints, -1)
+        """Angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
+        cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
     def tip(self, angles: Tensor) -> Tensor:
@@ -121,6 +122,26 @@ class Encoders(Transform):
         return observation_spec
 
 
+class Average(ObservationTransform):
+    """Pictures of a side of ``SIDE`` pixels, each the mean of some: arms that are a pixel wide need smooth edges.
+
+    MuJoCo's own smoothing and shadows cost ten times as much as all the rest.
+    """
+
+    def __init__(self):
+        super().__init__(in_keys=["pixels"], out_keys=["pixels"])
+
+    def _apply_transform(self, pixels):
+        return nn.functional.avg_pool2d(pixels, FINE)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        observation_spec["pixels"] = Unbounded((*observation_spec["pixels"].shape[:-2], SIDE, SIDE))
+        return observation_spec
+
+
 class HoldReading(Transform):
     """Writes ``"held"``: the last reading that was there, and the mean of its differences over the last five or so."""
 
@@ -154,14 +175,14 @@ def make_one(arm: Arm, pixels: bool) -> DMControlWrapper:
     env = suite.load(arm.domain, arm.task)
     if not pixels:
         return DMControlWrapper(env)
-    env.physics.model.vis.quality.offsamples = 0  # shadows and smooth edges cost ten times as much as the rest
+    env.physics.model.vis.quality.offsamples = 0
     quick = {"shadow": False, "reflection": False}
-    shape = {"height": SIDE, "width": SIDE, "camera_id": 0, "render_flag_overrides": quick}
+    shape = {"height": FINE * SIDE, "width": FINE * SIDE, "camera_id": 0, "render_flag_overrides": quick}
     return DMControlWrapper(env, from_pixels=True, pixels_only=False, render_kwargs=shape)
 
 
 def make_env(arm: Arm, pixels: bool, episodes: int, missing: float = 0.0) -> TransformedEnv:
     """``episodes`` arms side by side."""
-    images = [ToTensorImage(), GrayScale()] if pixels else []
+    images = [ToTensorImage(), GrayScale(), Average()] if pixels else []
     arms = SerialEnv(episodes, partial(make_one, arm, pixels))
     return TransformedEnv(arms, Compose(DoubleToFloat(), *images, Encoders(arm, missing)))

@@ -1,30 +1,30 @@
-"""The study: episodes, the filter of the arm's joints, its training, and one controller on three estimates."""
+"""The study: episodes, trained filters, and one controller on three estimates of an arm's state."""
 
 from __future__ import annotations
 
+import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import TransformedEnv
-from tyro.conf import arg
 
-from benchmarks.arms.arms import ARMS, NOISE, SIDE, Arm, HoldReading, make_env, make_one, wrap
-from benchmarks.common.tables import head, line
-from torch_denkf import modules as m
-from torch_denkf._files import write_text
+from benchmarks.arms.arms import ARMS, Arm, HoldReading, make_env, make_one, wrap
+from benchmarks.arms.filters import make_filter, make_sensor, train_motion, train_noise, train_sensor
+from benchmarks.arms.page import COLUMNS, SOURCES, page
+from benchmarks.common.arguments import some_of
+from benchmarks.common.jobs import once, read_rows
+from benchmarks.common.tables import report
 from torch_denkf.filters import DEnKF
-from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.transforms import DEnKFTransform
 
-DRIFT = 0.004  # rad a step: noise of the angles, which the learned accelerations do not have
+AT_ONCE = 20  # arms side by side
+TEST = 1000  # seed of the test episodes
 
 
 @dataclass(frozen=True)
@@ -35,21 +35,19 @@ class Study:
     the arm to a goal on the readings, on the belief and on the truth. See benchmarks/arms/README.md.
     """
 
-    task: Literal[tuple(sorted(ARMS))] = "reacher"
-    source: Annotated[Literal["proprioception", "pixels"], arg(name="from")] = "proprioception"
-    demos: int | None = None  # episodes to train on; by default 100, from pixels 240
-    episodes: int = 20  # episodes to test on
-    steps: int | None = None  # of an episode; by default 200, from pixels 120
+    tasks: some_of(ARMS) = tuple(ARMS)
+    sources: some_of(SOURCES) = ("encoders",)
+    demos: int = 100  # episodes of 200 steps to learn the motion from
+    pictures: int = 6000  # of single poses, to learn the sensor from
+    films: int = 40  # episodes of 60 steps with pictures, to learn the sensor's errors from
+    episodes: int = 40  # to test on
+    steps: int | None = None  # of a test episode; by default 200, from pixels 120
+    motion_updates: int = 3000
     sensor_updates: int = 1500
-    updates: int = 500
+    noise_updates: int = 100
     seed: int = 0
-    out: Path = Path("runs/dm_control_arms")
-    smoke: bool = False  # some seconds, to see that it runs, on both tasks
-
-    @property
-    def pixels(self) -> bool:
-        """Whether pictures are read."""
-        return self.source == "pixels"
+    out: Path = Path("runs/dm_control_arms")  # a run that was broken off goes on from here
+    smoke: bool = False  # some seconds, to see that it runs
 
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
@@ -60,155 +58,115 @@ def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) ->
         return env.rollout(steps, policy, break_when_any_done=False)
 
 
-# ------------------------------------------------------------------------------------------------------ the filter
-
-
-class ArmTransition(m.SubModel):
-    """Learned accelerations and their noise; the new velocity turns the angle, whose cosine and sine are the state."""
-
-    def __init__(self, arm: Arm, scale: Tensor, change: Tensor):
-        network = m.StochasticMLP(3 * arm.joints + arm.actions, 2 * arm.joints, (64, 64), layer="none", output_gain=0.1)
-        super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
-        self.arm, self.scale, self.change = arm, scale, change  # of velocities and of their steps, rad/s
-
-    def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        angles, velocity = self.arm.split(ensemble)
-        action = action.to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)
-        features = torch.cat([self.arm.join(angles, velocity / self.scale), action], -1)
-        mean, noise = self.module(features).chunk(2, -1)
-        noise = (0.02 + nn.functional.softplus(noise - 1.5)) * torch.randn_like(noise)
-        velocity = velocity + self.change * (mean + noise)
-        # As MuJoCo's semi-implicit Euler has it; without the noise an arm at rest would be believed for ever.
-        angles = angles + self.arm.dt * velocity + DRIFT * torch.randn_like(angles)
-        return self.arm.join(angles, velocity)
-
-
-def collect(arm: Arm, study: Study) -> TensorDict:
-    """Episodes of the controller on the truth with noise on its actions; many short ones where pictures are learned."""
-    at_once, steps = (30, min(60, study.steps)) if study.pixels else (study.demos, study.steps)
-    env = make_env(arm, study.pixels, min(at_once, study.demos))
+def collect(arm: Arm, pixels: bool, episodes: int, steps: int, seed: int) -> TensorDict:
+    """Episodes of the controller on the truth with noise on its actions."""
+    env = make_env(arm, pixels, min(AT_ONCE, episodes))
     policy = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
-    rounds = range(-(-study.demos // at_once))
-    data = torch.cat([run(env, policy, steps, study.seed + number).exclude("next") for number in rounds])
+    rounds = range(-(-episodes // AT_ONCE))
+    data = torch.cat([run(env, policy, steps, seed + number).exclude("next") for number in rounds])
     env.close()
     return data
 
 
-def make_filter(arm: Arm, data: TensorDict, pixels: bool) -> DEnKF:
-    """State [cos, sin, velocity] of each joint; cosines and sines are read, by encoders or from a picture."""
-    states = data["state"].flatten(0, 1)
-    loc, scale = states.mean(0), states.std(0)
-    change = data["state"].diff(dim=1)[..., 2 * arm.joints :].flatten(0, 1).std(0)
-    size, key = 2 * arm.joints, ("sensor", "ensemble") if pixels else "reading"
-    sensor, noise = None, m.ConstantNoise([NOISE] * size, in_key="reading")
+def poses(arm: Arm, count: int, seed: int) -> TensorDict:
+    """Pictures and states ``[N]`` of arms that an episode begins with."""
+    env = make_env(arm, True, min(AT_ONCE, count))
+    torch.manual_seed(seed)
+    env.set_seed(seed)
+    frames = torch.cat([env.reset().select("pixels", "state") for _ in range(-(-count // AT_ONCE))])
+    env.close()
+    return frames
+
+
+def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
+    """The filter of an arm; the seeds of all that it learns from differ."""
+    seed = 10_000 * (study.seed + 1)
+    torch.manual_seed(study.seed)
+    sensor = error = None
     if pixels:
-        trunk = m.KeypointTrunk(1, channels=(16, 24, 32, 48, 64))
-        frames = {"image_shape": (1, SIDE, SIDE), "pixel_loc": 0.25, "pixel_scale": 0.1}
-        sensor = m.ImageSensor(size, trunk=trunk, num_cells=(64,), loc=loc[:size], scale=scale[:size], **frames)
-        noise = m.DiagonalNoise(size, r=0.3 * scale[:size], loc=loc[:size], scale=scale[:size])
-    return DEnKF(
-        transition=ArmTransition(arm, scale[size:], change),
-        sensor=sensor,
-        observation=m.Select(range(size)),
-        noise=noise,
-        analysis=m.EnsembleAnalysis("etkf", sensor_key=key),
-        initial=m.FromSensor(range(size), mean=loc, std=scale, sensor_key=key),
-    )
+        frames = poses(arm, study.pictures, seed)
+        sensor = make_sensor(arm, frames)
+        train_sensor(sensor, frames, study.sensor_updates, out, study.seed)
+        films = collect(arm, True, study.films, 60, seed + 1000)
+        with torch.no_grad():
+            read = torch.stack([sensor(film)["sensor", "ensemble"].mean(-2) for film in films])
+        error = (read - films["state"][..., : 2 * arm.joints]).flatten(0, 1).std(0)
+    motion = collect(arm, False, study.demos, 200, seed + 2000)
+    denkf = make_filter(arm, motion, sensor, error)
+    train_motion(denkf, motion, study.motion_updates, out, study.seed)
+    if pixels:
+        train_noise(denkf, films, study.noise_updates, out, study.seed)
+    return denkf
 
 
-def train(denkf: DEnKF, data: TensorDict, study: Study) -> None:
-    """The sensor, if there is one, on single frames of half of the episodes; the rest on windows of the others."""
-    scale, sensor = denkf.initial.std, denkf[0] if "pixels" in denkf.in_keys else None
-
-    def fit(stage: Stage) -> None:
-        trainer = FilterTrainer(denkf, [stage], out=study.out / stage.name, loggers=(), device="cpu", seed=study.seed)
-        trainer.fit(resume=False)
-
-    def draw(count: int, generator: torch.Generator) -> Tensor:
-        return torch.randint(count, (48, 1), generator=generator)
-
-    def sample_windows(generator: torch.Generator, length: int) -> TensorDict:
-        steps = torch.arange(min(length, data.shape[1]))
-        batch = data[draw(len(data), generator), draw(data.shape[1] - len(steps) + 1, generator) + steps]
-        observed = torch.rand(*batch.shape, 1, generator=generator) > 0.3  # some readings are missing
-        return batch.set("observed", observed)
-
-    if sensor is not None:
-        size, (seen, data) = denkf["observation"].dims.numel(), data.split(len(data) // 2)
-        frames = seen.select("pixels", "state").flatten(0, 1)
-
-        def loss_sensor(batch: TensorDict) -> dict[str, Tensor]:
-            error = sensor(batch)["sensor", "ensemble"].mean(-2) - batch["state"][..., :size]
-            return {"loss_sensor": (error / scale[:size]).square().mean()}
-
-        def sample_frames(generator: torch.Generator, _: int | None) -> TensorDict:
-            return frames[draw(len(frames), generator).squeeze(-1)]
-
-        fit(Stage("sensor", loss_sensor, sample_frames, study.sensor_updates, parameters=sensor.parameters()))
-        with torch.no_grad():  # once, instead of in every window
-            data = torch.stack([sensor(episode) for episode in data])
-    data = data.exclude("pixels")
-    parts = {name: denkf[name] for name in ("transition", "observation", "noise", "analysis")}
-    loss = DEnKFLoss(DEnKF(sensor=None, **parts, initial=denkf.initial), sensor=0.0, state_scale=scale)
-    lengths = {0: 10, study.updates // 3: 25, study.updates * 3 // 4: 100}
-    fit(Stage("filter", loss, sample_windows, study.updates, lr=3e-3, lengths=lengths))
-
-
-# ----------------------------------------------------------------------------------------------------------- scores
-
-
-def scores(arm: Arm, episodes: TensorDict, key) -> list[str]:
-    """RMSE of angles (degrees) and velocities (rad/s); distance of the tip from its goal in the last quarter (cm),
-    return and mean square of the action, with their standard errors over episodes.
-    """
+def scores(arm: Arm, episodes: TensorDict, key) -> list[dict]:
+    """A row for each episode. What is at the end is of its last quarter, when the arm should rest at its goal."""
     estimate, truth = (arm.split(episodes["next", name]) for name in (key, "state"))
-    errors = wrap(estimate[0] - truth[0]) * 57.2958, estimate[1] - truth[1]
-    distance = 100 * (arm.tip(episodes["goal"]) - arm.tip(truth[0])).norm(dim=-1)
-    rows = (
-        distance[:, -(episodes.shape[1] // 4) :].mean(-1),
-        episodes["next", "reward"].sum((1, 2)),
-        episodes["action"].square().mean((1, 2)),
-    )
-    return [f"{error.square().mean().sqrt():.2f}" for error in errors] + [
-        f"{row.mean():.2f} ± {row.std() / len(row) ** 0.5:.2f}" for row in rows
+    last = episodes.shape[1] // 4
+    believed, tip = (100 * arm.tip(part[0][:, -last:]) for part in (estimate, truth))
+    columns: dict[str, Tensor] = {
+        "angle": wrap(estimate[0] - truth[0]).rad2deg().square().mean((1, 2)).sqrt(),
+        "velocity": (estimate[1] - truth[1]).square().mean((1, 2)).sqrt(),
+        "tip": (100 * arm.tip(episodes["goal"][:, -last:]) - tip).norm(dim=-1).mean(-1),
+        "error": (believed - tip).norm(dim=-1).mean(-1),
+        "offset": (believed - tip).mean(1).norm(dim=-1),
+        "return": episodes["next", "reward"].sum((1, 2)),
+        "effort": episodes["action"].square().mean((1, 2)),
+    }
+    return [
+        {"episode": number, **{name: values[number].item() for name, values in columns.items()}}
+        for number in range(len(episodes))
     ]
 
 
-def compare(arm: Arm, denkf: DEnKF, missing: float, study: Study) -> list[str]:
-    """One controller on three estimates, in the same episodes."""
-    env, reading = make_env(arm, study.pixels, study.episodes, missing), denkf["analysis"].in_keys[2]
-    env.append_transform(DEnKFTransform(denkf, diagnostics=[reading] if study.pixels else []))
-    env.append_transform(HoldReading(arm, reading))
-    lines = []
-    for name, key in (("reading", "held"), ("**belief**", ("belief", "mean")), ("truth", "state")):
+def compare(arm: Arm, denkf: DEnKF, missing: float, pixels: bool, study: Study) -> list[dict]:
+    """One controller on readings, belief and truth in the same episodes; the truth is never missing, nor seen."""
+    reading, steps = denkf["analysis"].in_keys[2], study.steps or (120 if pixels else 200)
+    cases = {"reading": "held", "belief": ("belief", "mean")} | ({} if missing else {"truth": "state"})
+    rows, envs = [], {}
+    for name, key in cases.items():
+        blind = name == "truth"
+        if blind not in envs:
+            envs[blind] = make_env(arm, pixels and not blind, study.episodes, missing)
+            if not blind:
+                envs[blind].append_transform(DEnKFTransform(denkf, diagnostics=[reading] if pixels else []))
+                envs[blind].append_transform(HoldReading(arm, reading))
         policy = TensorDictModule(arm.control, in_keys=[key, "goal"], out_keys=["action"])
-        episodes = run(env, policy, study.steps, study.seed + 1000)
-        lines.append(line(f"{missing:.0%}", name, *scores(arm, episodes, key)))
-    env.close()
-    return lines
+        episodes = run(envs[blind], policy, steps, TEST)
+        rows += [{"missing": missing, "estimate": name, **row} for row in scores(arm, episodes, key)]
+    for env in envs.values():
+        env.close()
+    return rows
 
 
-def run_task(study: Study) -> None:
-    """Collects, trains and compares; leaves ``table.md`` in the study's folder.
+def rows_of(task: str, source: str, study: Study) -> list[dict]:
+    """Collects, trains and compares.
 
     Raises:
         SystemExit: if dm_control cannot show the arm.
     """
-    arm, start = ARMS[study.task], time.perf_counter()
-    torch.manual_seed(study.seed)
+    arm, pixels, start = ARMS[task], source == "pixels", time.process_time()
     try:
-        make_one(arm, study.pixels).reset()
+        make_one(arm, pixels).reset()
     except Exception as error:  # each OpenGL library has its own
-        where = "libegl1 and libgl1-mesa-dri (Debian)" if study.pixels else "dm-control and mujoco<4"
-        raise SystemExit(
-            f"dm_control cannot show {study.task}: {type(error).__name__}: {error}. Install {where}."
-        ) from error
-    data = collect(arm, study)
-    denkf = make_filter(arm, data, study.pixels)
-    train(denkf, data, study)
-    lines = head("missing", "policy reads", "angles, deg", "velocities, rad/s", "tip to goal, cm", "return", "effort")
-    for missing in (0.0, 0.3):
-        lines += compare(arm, denkf, missing, study)
-    write_text(study.out / "table.md", "\n".join(lines) + "\n")
-    print(f"\n{study.task} from {study.source}, {study.episodes} episodes:\n", *lines, sep="\n")
-    print(f"\n{time.perf_counter() - start:.0f} s")
+        where = "libegl1 and libgl1-mesa-dri (Debian)" if pixels else "dm-control and mujoco<4"
+        raise SystemExit(f"dm_control cannot show {task}: {type(error).__name__}: {error}. Install {where}.") from error
+    denkf = trained(arm, pixels, study, study.out / "filters" / f"{task}-{source}")
+    rows = [row for missing in (0.0, 0.3) for row in compare(arm, denkf, missing, pixels, study)]
+    seconds = time.process_time() - start
+    return [{"task": task, "source": source, "seed": study.seed, "cpu_s": seconds, **row} for row in rows]
+
+
+def run_study(study: Study) -> None:
+    """Runs what is not there, and leaves ``table.csv`` and ``table.md`` in the study's folder."""
+    if study.smoke:
+        with tempfile.TemporaryDirectory() as folder:
+            tiny = {"demos": 4, "pictures": 40, "films": 2, "episodes": 2, "steps": 24}
+            updates = {"motion_updates": 20, "sensor_updates": 3, "noise_updates": 2}
+            run_study(replace(study, smoke=False, out=Path(folder), **tiny, **updates))
+        return
+    for task in study.tasks:
+        for source in study.sources:
+            once(study.out / "parts" / f"{task}-{source}.json", partial(rows_of, task, source, study))
+    rows = read_rows(sorted((study.out / "parts").glob("*.json")))
+    report(study.out, COLUMNS, rows, page(rows))

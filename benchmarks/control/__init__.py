@@ -1,1 +1,1 @@
-"""Policies that read a belief, against policies that remember: the mountain hike and a pendulum without velocity."""
+"""Policies that read a belief, against policies that remember: a mountain hike, a pendulum and a cartpole."""

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.modules import ConstantNoise, GaussianPrior
 from torch_denkf.objectives import DEnKFLoss
 
@@ -29,6 +29,8 @@ class Learning:
         first: updates before the policy moves, on one batch of random actions.
         further: updates after each of the policy's batches.
         noise_lr: learning rate of the noises' logarithms; that of the rest is 1e-2.
+        pieces: windows that an episode is cut into, if more than one; otherwise windows begin anywhere in it.
+        within: pieces with a larger reading are left out.
     """
 
     window: int = 16
@@ -36,6 +38,8 @@ class Learning:
     first: int = 150
     further: int = 10
     noise_lr: float = 3e-2
+    pieces: int = 1
+    within: float = math.inf
 
 
 class Learner:
@@ -59,7 +63,7 @@ class Learner:
         settings: Learning,
         taught: bool = False,
     ):
-        self.filter, self.length = filter, settings.window
+        self.filter, self.length, self.settings = filter, settings.window, settings
         start = GaussianPrior(*prior, ensemble_size=filter.initial.ensemble_size)
         parts = {name: filter[name] for name in PARTS}
         within = DEnKF(sensor=None, **parts, initial=start, update_at_reset=True)
@@ -70,11 +74,16 @@ class Learner:
         self.optimiser = torch.optim.Adam([{"params": others}, {"params": noises, "lr": settings.noise_lr}], lr=1e-2)
         self.noises = noises
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimiser, 0.997)
-        self.episodes = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=settings.windows)
+        storage = LazyTensorStorage(episodes * settings.pieces)
+        self.episodes = ReplayBuffer(storage=storage, batch_size=settings.windows)
 
     def add(self, data: TensorDict) -> None:
         """Keeps episodes ``[B, T]``."""
-        self.episodes.extend(data.select("observation", "observed", "action", "state"))
+        data = data.select("observation", "observed", "action", "state")
+        if self.settings.pieces > 1:
+            data = data[:, : self.settings.pieces * self.length].reshape(-1, self.length)
+            data = data[(data["observation"].abs() <= self.settings.within).all(-1).all(-1)]
+        self.episodes.extend(data)
 
     def update(self, updates: int) -> float:
         """Makes some updates; the last one's loss."""
@@ -92,3 +101,18 @@ class Learner:
                 for log_variance in self.noises:
                     log_variance.clamp_(min=2 * math.log(LEAST))
         return value.item()
+
+
+def refiltered(filter: Filter, data: TensorDict) -> TensorDict:
+    """Whole episodes ``[B, T]`` with what a filter believes of them: means and variances."""
+    after = data["next"][:, -1:]
+    frames = {key: torch.cat([data[key], after[key]], 1) for key in ("observation", "observed")}
+    frames["action"] = torch.cat([data["action"], torch.zeros_like(data["action"][:, :1])], 1)
+    with torch.no_grad():
+        belief = filter.sequence(TensorDict(frames, [*data.shape[:-1], data.shape[-1] + 1]))["belief"]
+    belief = belief.select("mean", "var")
+    return (
+        data.clone(False)
+        .set("belief", belief[:, :-1])
+        .set("next", data["next"].clone(False).set("belief", belief[:, 1:]))
+    )

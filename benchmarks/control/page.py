@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 
 from benchmarks.common.arguments import processor
+from benchmarks.common.intervals import bootstrap_interval
 from benchmarks.common.plots import plt, save
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.control.arms import ARMS
+from benchmarks.control.shift import NOT_TRAINED
 
-TITLES = {"hike": "Mountain hike", "pendulum": "Pendulum without velocity"}
+TITLES = {
+    "hike": "Mountain hike",
+    "pendulum": "Pendulum without velocity",
+    "cartpole": "Cartpole swing-up without velocities",
+}
 COLUMNS = Columns(
     names=("task", "cell", "arm", "seed", "env_steps", "return", "wall_s"),
     text=("task", "cell", "arm"),
@@ -37,13 +42,7 @@ def interquartile_mean(values: Sequence[float], axis: int = -1):
 
 def summary(values: Sequence[float]) -> tuple[float, float, float]:
     """The interquartile mean, and the bounds of its 95 % percentile bootstrap interval over seeds."""
-    center = float(interquartile_mean(values))
-    if len(values) < 2 or np.ptp(values) == 0:
-        return center, np.nan, np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        interval = bootstrap((np.asarray(values),), interquartile_mean, method="percentile", rng=0)
-    return center, *map(float, interval.confidence_interval)
+    return bootstrap_interval(values, interquartile_mean)
 
 
 def last(rows: Sequence[dict]) -> list[dict]:
@@ -53,14 +52,17 @@ def last(rows: Sequence[dict]) -> list[dict]:
 
 
 def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]:
-    """The final returns, by seed; of what reads the truth those of the cell without noise."""
-    chosen = pick(rows, task=task, arm=arm) if arm == "truth" else pick(rows, task=task, cell=cell, arm=arm)
+    """The final returns, by seed; of what reads the truth those of another cell where it ran in that one alone."""
+    chosen = pick(rows, task=task, cell=cell, arm=arm)
+    if arm == "truth" and not chosen:
+        chosen = pick(rows, task=task, arm=arm)
     return [row["return"] for row in last(chosen)]
 
 
-def cells(rows: Sequence[dict], task: str) -> list[str]:
-    """Names of a task's cells, in order."""
-    return list(dict.fromkeys(row["cell"] for row in pick(rows, task=task)))
+def cells(rows: Sequence[dict], task: str, trained: bool = False) -> list[str]:
+    """Names of a task's cells, in order: all, or those that were trained in."""
+    names = dict.fromkeys(row["cell"] for row in pick(rows, task=task))
+    return [name for name in names if not (trained and NOT_TRAINED in name)]
 
 
 def arms(rows: Sequence[dict], task: str) -> list[str]:
@@ -91,11 +93,12 @@ def page(rows: Sequence[dict]) -> str:
         lines += head("cell", "seeds", *names)
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
-            lines.append(line(cell, len(found[0]), *map(_text, found)))
+            lines.append(line(cell, max(map(len, found)), *map(_text, found)))
+        lines += lost(rows, task)
         others = [arm for arm in ("LSTM", "GRU", "Kalman") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
         lines += head("cell", *others)
-        for cell in cells(rows, task):
+        for cell in cells(rows, task, trained=True):
             belief = np.array(returns(rows, task, cell, "belief mean"))
             lines.append(line(cell, *(_text(belief - returns(rows, task, cell, other)) for other in others)))
         lines += [
@@ -105,14 +108,14 @@ def page(rows: Sequence[dict]) -> str:
         ]
         learning = [arm for arm in names if arm != "truth"]
         lines += head("cell", *learning)
-        for cell in cells(rows, task):
+        for cell in cells(rows, task, trained=True):
             lines.append(line(cell, *(reached(rows, task, cell, arm) for arm in learning)))
         lines += ["", "Seconds of one core for a run, median over cells and seeds.", "", *head(*names)]
         ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
     lines += [
         "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth is the",
-        "same in all cells, and runs in the one without noise.",
+        "same in all cells of hike and pendulum, and runs in the one without noise.",
         "",
         *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
         "* Command: `python -m benchmarks.control`. A seed counts where all arms of a cell have run with it.",
@@ -121,14 +124,31 @@ def page(rows: Sequence[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def lost(rows: Sequence[dict], task: str) -> list[str]:
+    """The table of what arms lose where readings get noisier after training; none where they do not."""
+    names, (home, *_) = arms(rows, task), cells(rows, task)
+    away = [cell for cell in cells(rows, task) if NOT_TRAINED in cell]
+    if not away:
+        return []
+    lines = ["", f"Percent of the return with {home} that is lost, with the same seeds.", "", *head("cell", *names)]
+    for cell in away:
+        before, after = ([np.array(returns(rows, task, one, arm)) for arm in names] for one in (home, cell))
+        lines.append(
+            line(cell, *(_text(100 * (1 - b / a)) if len(b) else "" for a, b in zip(before, after, strict=True)))
+        )
+    return lines
+
+
 def _text(values: Sequence[float]) -> str:
+    if not len(values):
+        return ""
     center, low, high = summary(values)
     return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
     """Noises of a task's cells in which all readings come."""
-    return {cell: float(cell.split()[1]) for cell in cells(rows, task) if "missing" not in cell}
+    return {cell: float(cell.split()[1]) for cell in cells(rows, task, trained=True) if "missing" not in cell}
 
 
 def draw(rows: Sequence[dict], file: Path) -> None:

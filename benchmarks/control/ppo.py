@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
-from torch import nn
-from torchrl.modules import set_recurrent_mode
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+
+from benchmarks.control.arms import ENSEMBLE, MEMORY, Arm, Inputs, memory
+
+WIDTH = 64
 
 
 @dataclass(frozen=True)
@@ -27,32 +31,107 @@ class Settings:
     reward: float = 1.0  # factor
 
 
+class Head(nn.Module):
+    """Two hidden layers on one or two entries in units of ``scale``; of an ensemble, on its members' mean features."""
+
+    def __init__(self, width: int, outputs: int, scale: Tensor | None = None, kind: str = "vector"):
+        super().__init__()
+        self.first, self.second, self.last = nn.Linear(width, WIDTH), nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, outputs)
+        self.register_buffer("scale", scale)
+        self.kind = kind
+
+    def forward(self, value: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Outputs ``[*B, outputs]``."""
+        if self.scale is not None:
+            value = value / self.scale
+            if variance is not None:
+                value = torch.cat([value, variance.sqrt() / self.scale], -1)
+        hidden = self.first(value).tanh()
+        if self.kind == "ensemble":
+            hidden = hidden.mean(-2)
+        return self.last(self.second(hidden).tanh())
+
+
+class ActorHead(Head):
+    """Mean and standard deviation of an action; the latter is the same everywhere."""
+
+    def __init__(self, width: int, outputs: int, scale: Tensor | None = None, kind: str = "vector"):
+        super().__init__(width, outputs, scale, kind)
+        self.log_std = nn.Parameter(torch.zeros(outputs))
+        with torch.no_grad():
+            self.last.weight.mul_(0.01)
+            self.last.bias.zero_()
+
+    def forward(self, value: Tensor, variance: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Two times ``[*B, A]``."""
+        mean = super().forward(value, variance)
+        return mean, self.log_std.exp().expand_as(mean)
+
+
+def networks(arm: Arm, inputs: Inputs) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
+    """Actor, which writes ``"raw"``, and critic.
+
+    Args:
+        arm: whose they are.
+        inputs: sizes and units of what it reads.
+    """
+    parts = []
+    for name, Module, outputs in (("actor", ActorHead, inputs.actions), ("critic", Head, 1)):
+        if arm.memory:
+            module = Module(MEMORY, outputs)
+            keys, before = [f"{name}_memory"], [memory(arm.memory, inputs.seen, name)]
+        else:
+            states = arm.keys[0] != "seen"
+            width = len(arm.keys) * len(inputs.scale) if states else arm.stack * inputs.seen
+            kind = "ensemble" if ENSEMBLE in arm.keys else "vector"
+            module = Module(width, outputs, inputs.scale if states else None, kind)
+            keys, before = ["stack" if arm.stack > 1 else arm.keys[0], *arm.keys[1:]], []
+        parts.append((module, keys, before))
+    (actor, actor_keys, actor_before), (critic, critic_keys, critic_before) = parts
+    head = TensorDictModule(actor, actor_keys, ["loc", "scale"])
+    policy = ProbabilisticActor(
+        TensorDictSequential(*actor_before, head),
+        in_keys=["loc", "scale"],
+        out_keys=["raw"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    value = TensorDictSequential(*critic_before, ValueOperator(critic, in_keys=critic_keys))
+    return policy, value
+
+
 class PPO:
     """Learns from batches of whole episodes ``[B, T]``.
 
     Args:
-        policy: writes ``"raw"``.
-        critic: writes ``"state_value"``.
+        arm: who learns. With a memory, actor and critic are trained on slices of time.
+        inputs: sizes and units of what it reads.
         settings: the task's.
         batches: that will come; the learning rate goes down to 5 % meanwhile.
-        recurrent: whether both have a memory, and are trained on slices of time.
+
+    Attributes:
+        actor: writes ``"raw"``.
+        critic: writes ``"state_value"``.
+        policy: writes ``"action"``, and what the critic keeps in mind.
     """
 
-    def __init__(
-        self,
-        policy: TensorDictModuleBase,
-        critic: TensorDictModuleBase,
-        settings: Settings,
-        batches: int,
-        recurrent: bool,
-    ):
-        self.settings, self.slice = settings, settings.slice if recurrent else 1
+    ON_POLICY = True  # random actions are not learned from
+
+    def __init__(self, arm: Arm, inputs: Inputs, settings: Settings, batches: int):
+        self.settings, self.slice = settings, settings.slice if arm.memory else 1
+        self.actor, self.critic = networks(arm, inputs)
+        clamp = TensorDictModule(lambda raw: inputs.limit * raw.clamp(-1, 1), ["raw"], ["action"])
+        self.policy = TensorDictSequential(self.actor, *([self.critic] if arm.memory else []), clamp)
         self.advantage = GAE(
-            gamma=settings.gamma, lmbda=settings.lmbda, value_network=critic, average_gae=False, deactivate_vmap=True
+            gamma=settings.gamma,
+            lmbda=settings.lmbda,
+            value_network=self.critic,
+            average_gae=False,
+            deactivate_vmap=True,
         )
         self.loss = ClipPPOLoss(
-            policy,
-            critic,
+            self.actor,
+            self.critic,
             clip_epsilon=settings.clip,
             entropy_bonus=False,
             critic_coeff=0.5,

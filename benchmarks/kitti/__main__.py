@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.kitti.folds import Part, with_disturbances
+from benchmarks.kitti.frontier import draw
 from benchmarks.kitti.streams import find_streams, prepare, spans
 from benchmarks.kitti.study import Study, evaluate_and_draw, make_jobs, prepare_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
@@ -25,7 +26,8 @@ def smoke(study: Study) -> Study:
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=53, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)
     settings = {"size": (25, 75), "seeds": 1, "processes": 1, "drives": names, "test": names[:1], "budget": budget}
-    return replace(study, root=folder / "kitti", out=folder / "out", sensors=("flow", "image"), **settings)
+    kinds = {"filters": (*study.filters, "denkf_gated"), "sensors": ("flow", "image"), "sizes": (4, 8)}
+    return replace(study, root=folder / "kitti", out=folder / "out", **kinds, **settings)
 
 
 def write_table(study: Study, rows: list[dict], begun: float) -> None:
@@ -76,9 +78,13 @@ def main() -> None:
     if study.root is None:
         raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
     study.out.mkdir(parents=True, exist_ok=True)
-    {"table": table, "train": train, "evaluate": evaluate}[study.command](study)
+    if study.command == "frontier" and not study.smoke:
+        print(*draw(study), sep="\n")
+        return
+    {"table": table, "train": train, "evaluate": evaluate}.get(study.command, table)(study)
     if study.smoke:
-        evaluate(replace(study, checkpoint=next((study.out / "folds").iterdir())))
+        print(*draw(study), sep="\n")
+        evaluate(replace(study, checkpoint=next(study.out.glob("folds/*/filter.pt")).parent))
 
 
 if __name__ == "__main__":

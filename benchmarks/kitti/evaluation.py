@@ -30,7 +30,7 @@ from torch_denkf.metrics import (
     spread_skill_ratio,
     state_errors,
 )
-from torch_denkf.odometry.streams import all_frames, lose_frames
+from torch_denkf.odometry.streams import all_frames, lose_frames, shortest_spans
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
@@ -62,12 +62,14 @@ def evaluate(
     recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """All rows of the table for one drive, and its beliefs by condition, for the plots."""
+    stream = replace(stream, repair=recipe.repair)
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
-    readings = {"clean": [all_frames(clean)]}
+    readings = {"clean": [shortest_spans(clean) if recipe.repair else all_frames(clean)]}
     readings["missing"] = [lose_frames(clean, seed=stream.seed() + number) for number in range(MASKS)]
     for condition in DISTURBANCES:
         part = Part(replace(stream, condition=condition))
-        readings[condition] = [all_frames(read_spans(model["sensor"], part, cache, kind))]
+        spans = read_spans(model["sensor"], part, cache, kind)
+        readings[condition] = [shortest_spans(spans) if recipe.repair else all_frames(spans)]
     pairs = [(condition, reading) for condition in CONDITIONS for reading in readings.get(condition, ())]
     first = pairs[0][1][:TIMED]
     costs = cost(model, lambda: run_filter(recipe, model, [first]), len(first))

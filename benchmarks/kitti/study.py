@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, SensorTraining, sensor_of_fold
 from benchmarks.kitti.streams import Stream, find_streams, prepare, spans
 from benchmarks.kitti.tables import IDENTITY
-from benchmarks.kitti.training import Budget, train_filter
+from benchmarks.kitti.training import Budget, load_filter, train_filter
 from torch_denkf.data import render_drives
 from torch_denkf.modules import SubModel
 
@@ -32,10 +33,11 @@ class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
     table: leave one drive out after the other, in all conditions. train: some folds, without testing. evaluate: one
-    trained filter on any drives. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
+    trained filter on any drives. frontier: error against milliseconds a step of the filters that a table left. What
+    was broken off goes on where it stopped. See benchmarks/kitti/README.md.
     """
 
-    command: Positional[Literal["train", "evaluate", "table"]] = "table"
+    command: Positional[Literal["train", "evaluate", "table", "frontier"]] = "table"
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/kitti")  # checkpoints, logs, table and plots
     drives: tuple[str, ...] = ()  # drives of the study; all that are found
@@ -45,7 +47,9 @@ class Study:
     checkpoint: Path | None = None  # of evaluate: a folder below --out/folds
     seeds: int = 1
     rendered: int = 0  # drives to render for a first training of the sensor
+    first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
+    sizes: tuple[int, ...] = (8, 32, 128, 512)  # of the ensemble, in the frontier
     processes: int = 1  # folds side by side
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything, on rendered drives
@@ -55,6 +59,11 @@ class Study:
         """Streams."""
         return self.out / "streams"
 
+    @property
+    def begun(self) -> Path:
+        """Where the rendered drives and the first training of the sensor are."""
+        return self.first or self.out
+
     def rendered_parts(self) -> tuple[list[Part], list[Part]]:
         """Rendered drives along invented paths, with traffic, to train the sensor on; and others that it does not see.
 
@@ -62,15 +71,24 @@ class Study:
         """
         if not self.rendered:
             return [], []
-        root, names = self.out / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
-        render_drives(root, names=names, frames=RENDERED_FRAMES, size=self.size, processes=self.processes)
+        root, names = self.begun / "rendered", [f"r{number:02d}" for number in range(self.rendered)]
+        size = self.size if self.first is None else tuple(_settings(self.first)["size"])
+        render_drives(root, names=names, frames=RENDERED_FRAMES, size=size, processes=self.processes)
         pitches = (torch.rand(self.rendered, generator=torch.Generator().manual_seed(0)) * 2 - 1) * 0.03
         parts = [
-            Part(Stream(str(root), name, "image_2", size=self.size, pitch=round(float(pitch), 4)))
+            Part(Stream(str(root), name, "image_2", size=size, pitch=round(float(pitch), 4)))
             for name, pitch in zip(names, pitches, strict=True)
         ]
         held_out = max(self.rendered // 6, 1)
         return parts[held_out:], parts[:held_out]
+
+
+def _settings(out: Path) -> dict:
+    """Options of a table that was made in a folder."""
+    file = out / "settings.json"
+    if not file.exists():
+        raise FileNotFoundError(f"--first {out} has no settings.json; pass the --out of a table")
+    return json.loads(file.read_text())
 
 
 @dataclass(frozen=True)
@@ -102,10 +120,20 @@ class Job:
         )
 
     def train(self, name: str, base: SensorOfFold):
-        """Trains one filter, or goes on where it was broken off."""
+        """Trains one filter, or goes on where it was broken off; or takes the weights of another."""
+        if whose := FILTERS[name].weights_of:
+            if not self.borrows(name):
+                self.train(whose, base)
+            recipe, model, *_ = load_filter(self.out(whose))
+            return FILTERS[name](model["sensor"], recipe.facts), model
         loggers = ("csv", "tensorboard")
         settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
         return train_filter(self.fold, name, base, out=self.out(name), **settings)
+
+    def borrows(self, name: str) -> bool:
+        """Whether it takes another's weights, which are there."""
+        whose = FILTERS[name].weights_of
+        return whose is not None and (self.out(whose) / "filter.pt").exists()
 
     def run(self) -> None:
         """Trains, evaluates and draws what is not done already; leaves the rows in each filter's folder."""
@@ -113,7 +141,7 @@ class Job:
         for name in self.study.filters:
             if (self.out(name) / "rows.json").exists():
                 continue
-            base = self.base() if base is None else base
+            base = self.base() if base is None and not self.borrows(name) else base
             once(self.out(name) / "rows.json", lambda name=name, base=base: self.test(name, base))
 
     def test(self, name: str, base: SensorOfFold) -> list[dict]:
@@ -129,7 +157,7 @@ class Job:
         torch.manual_seed(self.seed)
         facts = statistics(parts, study.cache)
         training = SensorTraining(self.sensor, facts, study.cache, self.seed)
-        out, held_out = study.out / "pretrained" / f"{self.sensor}-{self.seed}", with_disturbances(self.rendered[1])
+        out, held_out = study.begun / "pretrained" / f"{self.sensor}-{self.seed}", with_disturbances(self.rendered[1])
         return training.train(SENSORS[self.sensor](facts), parts, held_out, out, study.budget.sensor)
 
     def prepare_sensor(self) -> None:
@@ -172,7 +200,14 @@ def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
         streams += [part.stream for part in job.fold.train if part.stream.steps == 1 or job.sensor == "flow"]
         read = [*job.fold.tune, *job.fold.validation, *with_disturbances([Part(stream) for stream in job.fold.test])]
         streams += [stream for part in read for stream in spans(part.stream, job.sensor)]
-    prepare(list(dict.fromkeys(streams)), jobs[0].study.cache, processes)
+    study = jobs[0].study
+    prepare(list(dict.fromkeys(streams)), study.cache, processes)
+    if any(FILTERS[name].repair for name in study.filters):  # of what is there by then
+        tested = [replace(stream, repair=True) for job in jobs for stream in job.fold.test]
+        repaired = [
+            each for part in with_disturbances([Part(s) for s in tested]) for each in spans(part.stream, "flow")
+        ]
+        prepare(list(dict.fromkeys(repaired)), study.cache, processes)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> None:

@@ -152,8 +152,13 @@ def train_filter(
     return recipe, model
 
 
-def load_filter(folder: Path) -> tuple[KITTIRecipe, Filter, str, str]:
+def load_filter(folder: Path, size: int | None = None, **options) -> tuple[KITTIRecipe, Filter, str, str]:
     """A recipe, its trained filter, and the names of filter and sensor.
+
+    Args:
+        folder: of its training.
+        size: members to run with, and samples of its sensor; those that it was trained with.
+        **options: attributes of the recipe that are to be others than in the training.
 
     Raises:
         FileNotFoundError: if no training was finished in the folder.
@@ -161,4 +166,12 @@ def load_filter(folder: Path) -> tuple[KITTIRecipe, Filter, str, str]:
     saved = read_checkpoint(folder / "filter.pt")
     facts = Statistics(**saved["facts"])
     recipe = FILTERS[saved["filter"]](SENSORS[saved["sensor"]](facts), facts)
-    return recipe, read_filter(recipe, recipe.build(), saved), saved["filter"], saved["sensor"]
+    if size is not None:
+        recipe.size = recipe.sensor.ensemble_size = size
+    for name, value in options.items():
+        setattr(recipe, name, value)
+    model = recipe.build()
+    # Which quantile a member has is no weight, and follows from their number.
+    quantiles = {key: value for key, value in model.state_dict().items() if key.endswith(".quantiles")}
+    saved["model"] |= quantiles
+    return recipe, read_filter(recipe, model, saved), saved["filter"], saved["sensor"]

@@ -18,7 +18,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.odometry import CarFilter
 from torch_denkf.odometry.batches import mark_start
 from torch_denkf.odometry.scores import first_state
-from torch_denkf.odometry.streams import read_sensor, take_spans
+from torch_denkf.odometry.streams import read_sensor, shortest_spans
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.transforms import BlackFrames, Brightness, OccludingBox
 from torch_denkf.vision import FLOW_SIGNS, KITTI_DT, PICTURE_SIGNS, flow_signs, picture_signs, plane_distance
@@ -167,19 +167,10 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
         spans: what the sensor reads of them, ``[N]`` each.
         seen: of readings, ``[N, 1]``: whether they are to be believed.
     """
-    values = {
-        name: torch.stack([each[key] for each in spans], 1)
-        for name, key in (
-            ("observed", "observed"),
-            ("ensemble", ("sensor", "ensemble")),
-            ("encoding", ("sensor", "encoding")),
-        )
-    }
+    values = {name: torch.stack([each["sensor", name] for each in spans], 1) for name in ("ensemble", "encoding")}
+    values["observed"] = torch.stack([seen(each) for each in spans], 1)
     size = torch.Size([len(spans[0]), len(spans)])
-    readings = TensorDict({"state": spans[0]["state"], "spans": TensorDict(values, size)}, size[:1])
-    good = torch.stack([seen(each).squeeze(-1) for each in spans], -1)
-    steps = torch.where(good.any(-1), good.float().argmax(-1) + 1, 0)
-    return take_spans(readings, steps)
+    return shortest_spans(TensorDict({"state": spans[0]["state"], "spans": TensorDict(values, size)}, size[:1]))
 
 
 @torch.no_grad()

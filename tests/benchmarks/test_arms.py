@@ -6,7 +6,10 @@ from tensordict import TensorDict
 
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
-from benchmarks.arms.arms import ARMS, NOISE, Encoders, HoldReading, make_env, make_one, wrap
+from benchmarks.arms.arms import ARMS, NOISE, SIDE, Average, Encoders, HoldReading, make_env, make_one, wrap
+from benchmarks.arms.filters import ArmTransition, FromBiasedSensor, make_filter, train_motion
+from benchmarks.arms.page import COLUMNS, difference, page
+from benchmarks.arms.study import collect, scores
 
 
 def physics_at(name, seed):
@@ -84,3 +87,110 @@ def test_held_readings():
     step = (2 * torch.pi - 6.2) / arm.dt  # from 3.1 on to -3.1, not all the way back
     expected = [0.0, 0.2 * step, 0.16 * step, 0.128 * step + 0.2 * 0.1 / arm.dt]
     assert velocities == pytest.approx(expected, rel=1e-4)
+
+
+def test_angles_turn_as_in_mujoco():
+    arm = ARMS["reacher"]
+    motion = collect(arm, False, 2, 30, 0)
+    lead = make_filter(arm, motion, None, None)["transition"].lead
+    torch.testing.assert_close(lead, torch.ones(2), atol=2e-3, rtol=0)  # one step of semi-implicit Euler
+
+
+def transition(arm, bias=None):
+    torch.manual_seed(0)
+    return ArmTransition(arm, *torch.ones(3, arm.joints), bias)
+
+
+def test_the_forecast_turns_by_the_new_velocity():
+    arm = ARMS["reacher"]
+    move = transition(arm)
+    state = arm.join(torch.tensor([0.3, -0.5]), torch.tensor([1.0, 2.0])).expand(4000, -1)
+    action = torch.tensor([0.2, -0.1])
+    with torch.no_grad():
+        mean, std = move.faster(state[0], action)
+        angles, velocity = arm.split(move.compute(state, action))
+    assert torch.allclose((velocity - torch.tensor([1.0, 2.0])).mean(0), mean, atol=float(5 * std.max() / 4000**0.5))
+    turned = angles - torch.tensor([0.3, -0.5]) - arm.dt * velocity
+    assert turned.std(0).tolist() == pytest.approx([0.004, 0.004], rel=0.06)  # the drift alone
+
+
+def test_biases_fade_with_the_way_and_not_with_time():
+    arm = ARMS["reacher"]
+    move = transition(arm, torch.full((4,), 0.1))
+    moving = arm.join(torch.zeros(2), torch.tensor([3.0, 4.0]))  # 5 rad/s
+    resting = arm.join(torch.zeros(2), torch.zeros(2))
+    bias = 0.1 * torch.randn(20000, 4)
+    for state, way in ((moving, 0.02 * 5), (resting, 0.02 * 1e-4)):
+        with torch.no_grad():
+            later = move.compute(torch.cat([state.expand(20000, -1), bias], -1), torch.zeros(2))[:, 6:]
+        kept = (later * bias).mean(0) / bias.square().mean(0)
+        assert kept.tolist() == pytest.approx([2.718281828 ** (-way / 0.3)] * 4, abs=0.02)
+        assert later.std(0).tolist() == pytest.approx([0.1] * 4, rel=0.03)
+
+
+def test_the_first_belief_shares_a_reading_between_state_and_bias():
+    start = FromBiasedSensor([0], mean=torch.zeros(3), std=torch.tensor([1.0, 2.0, 0.5]), ensemble_size=20000)
+    reading = TensorDict({"sensor": {"ensemble": torch.tensor([5.0]), "noise": torch.tensor([0.01])}})
+    state, rate, bias = start(reading)["belief", "ensemble"].unbind(-1)
+    assert (state + bias).mean().item() == pytest.approx(5.0, abs=0.005)
+    assert (state + bias).std().item() == pytest.approx(0.1, rel=0.03)
+    assert state.std().item() == pytest.approx(0.26**0.5, rel=0.03)
+    assert rate.std().item() == pytest.approx(2.0, rel=0.03)
+    assert start(reading)["belief", "mean"][0].item() == pytest.approx(5.0, abs=0.02)
+
+
+def test_the_motion_is_learned_from_single_steps(tmp_path):
+    arm = ARMS["reacher"]
+    torch.manual_seed(0)
+    velocity, action = [torch.zeros(20, 2)], 2 * torch.rand(20, 100, 2) - 1
+    for step in range(99):
+        velocity.append(0.9 * velocity[-1] + 0.3 * action[:, step])
+    velocity = torch.stack(velocity, 1)
+    motion = TensorDict({"state": arm.join(arm.dt * velocity.cumsum(1), velocity), "action": action}, [20, 100])
+    denkf = make_filter(arm, motion, None, None)
+    train_motion(denkf, motion, 400, tmp_path, 0)
+    with torch.no_grad():
+        mean, _ = denkf["transition"].faster(motion["state"][:, :-1], action[:, :-1])
+    error = (mean - velocity.diff(dim=1)).square().mean().sqrt()
+    assert error < 0.1 * velocity.diff(dim=1).std()
+
+
+def test_small_pictures_are_means_of_the_rendering():
+    fine = torch.arange(4.0 * SIDE * SIDE).reshape(1, 2 * SIDE, 2 * SIDE)
+    small = Average()._apply_transform(fine)
+    assert small.shape == (1, SIDE, SIDE)
+    assert small[0, 0, 0] == fine[0, :2, :2].mean()
+    assert small[0, -1, -1] == fine[0, -2:, -2:].mean()
+
+
+def test_scores_of_an_estimate_that_is_off_by_a_constant():
+    arm = ARMS["reacher"]
+    angles, goal = torch.zeros(3, 8, 2), torch.zeros(3, 8, 2)
+    state, off = arm.join(angles, angles), arm.join(angles + torch.tensor([0.1, 0.0]), angles + 2)
+    episodes = TensorDict(
+        {"next": {"state": state, "held": off, "reward": torch.ones(3, 8, 1)}, "goal": goal, "action": angles + 0.5},
+        [3, 8],
+    )
+    (row, *_), length = scores(arm, episodes, "held"), 24 * 2 * torch.sin(torch.tensor(0.05)).item()
+    assert row["angle"] == pytest.approx(0.1 * 57.29578 / 2**0.5, rel=1e-4)
+    assert (row["velocity"], row["return"], row["effort"]) == pytest.approx((2.0, 8.0, 0.25))
+    assert row["tip"] == pytest.approx(0.0, abs=1e-5)  # cm: the arm is where it should be, and believes otherwise
+    assert (row["error"], row["offset"]) == pytest.approx((length, length), rel=1e-4)
+
+
+def test_the_page_pairs_episodes(tmp_path):
+    base = {"task": "reacher", "source": "encoders", "seed": 0, "cpu_s": 60.0}
+    zeros = dict.fromkeys(("velocity", "tip", "error", "offset", "return", "effort"), 1.0)
+    rows = [
+        {**base, **zeros, "missing": missing, "estimate": estimate, "episode": episode, "angle": angle + 10 * episode}
+        for missing in (0.0, 0.3)
+        for estimate, angle in (("reading", 4.0), ("belief", 2.0), ("truth", 0.0))
+        for episode in range(4)
+        if estimate != "truth" or not missing
+    ]
+    case = {"task": "reacher", "source": "encoders", "missing": 0.3}
+    # Every pair differs by -2; the readings' mean is 19.
+    assert difference(rows, "angle", **case) == "-2.00 [+nan, +nan], -11%"
+    COLUMNS.write(rows, tmp_path / "table.csv")
+    assert page(COLUMNS.read(tmp_path / "table.csv")) == page(rows)
+    assert "| 30% | truth | 15.00" in page(rows)  # of the episodes without missing readings

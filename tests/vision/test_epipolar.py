@@ -107,3 +107,27 @@ def test_one_exposure_leaves_neighbouring_frames_alone_if_told_so():
     assert same_exposure(image, brighter, tolerance=True)[0] is image
     matched = same_exposure(image, brighter)[0]
     assert abs(matched.astype(int) - brighter).mean() < 1.0
+
+
+def test_what_hides_the_scene_gives_no_corners():
+    """A box that stands still fills most of a turning view: its corners do not turn."""
+    image = texture()[:, :414]
+    other = turned(image, 0.04)
+    hidden = np.zeros(image.shape, bool)
+    hidden[10:115, 60:330] = True
+    for picture in (image, other):
+        picture[hidden] = texture()[::-1, :414][hidden]
+    told = two_view_motion(image, other, CALIBRATION, hidden=hidden)
+    assert told[0] == pytest.approx(0.04, abs=4e-4)
+    assert abs(two_view_motion(image, other, CALIBRATION)[0] - 0.04) > 0.02
+    before, _ = track_corners(image, other, hidden)
+    assert len(before) > 20
+    assert not hidden[before[:, 1].round().astype(int), before[:, 0].round().astype(int)].any()
+
+
+def test_a_hidden_part_of_an_enlarged_image_is_the_same_part():
+    small = cv2.resize(texture()[:, :414], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    calibration = np.array(CALIBRATION) / 4
+    nothing = np.ones(small.shape, bool)
+    assert not two_view_motion(small, small, calibration, hidden=nothing).any()
+    assert two_view_motion(small, small, calibration, hidden=~nothing)[-1] > 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from tensordict.nn import TensorDictSequential
@@ -96,7 +97,7 @@ class CarSettings:
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
-def velocity_analysis(lags: int) -> EnsembleAnalysis:
+def velocity_analysis(lags: int, scheme: Literal["sensor", "perturbed", "sakov"] = "sensor") -> EnsembleAnalysis:
     """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
 
     Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
@@ -104,7 +105,7 @@ def velocity_analysis(lags: int) -> EnsembleAnalysis:
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
-        "sensor",
+        scheme,
         taper=(own, torch.eye(2)),
         inflated=VELOCITIES,
         forecast_key=("forecast", "clone"),

@@ -27,6 +27,7 @@ __all__ = [
     "read_sensor",
     "read_spans",
     "rows",
+    "shortest_spans",
     "take_spans",
 ]
 
@@ -187,6 +188,12 @@ def lose_frames(readings: TensorDict, seed: int, share: float = MISSING) -> Tens
     """What the sensor reads where some frames did not arrive: pairs of those that did."""
     kept = torch.rand(len(readings), generator=torch.Generator().manual_seed(seed)) >= share
     return take_spans(readings, steps_between(kept, readings["spans"].shape[-1]))
+
+
+def shortest_spans(readings: TensorDict) -> TensorDict:
+    """What the sensor reads of the shortest pair that is observed, for each frame."""
+    seen = readings["spans", "observed"].squeeze(-1)
+    return take_spans(readings, torch.where(seen.any(-1), seen.int().argmax(-1) + 1, 0))
 
 
 def all_frames(readings: TensorDict) -> TensorDict:

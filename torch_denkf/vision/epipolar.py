@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from torch_denkf.vision.exposure import same_exposure
+from torch_denkf.vision.hidden import grown
 from torch_denkf.vision.shapes import FOCUS_PRIOR, FOCUS_STD, TWO_VIEW_SHAPE
 
 __all__ = ["TwoView", "fit_two_view", "track_corners", "two_view_motion"]
@@ -43,17 +44,21 @@ class TwoView(NamedTuple):
     inliers: float
 
 
-def track_corners(previous: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def track_corners(
+    previous: np.ndarray, current: np.ndarray, hidden: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Finds corners of one image in the next (Lucas and Kanade's pyramids), and drops those that do not come back.
 
     Args:
         previous: grey image ``[H, W]``, uint8.
         current: grey image ``[H, W]``, uint8.
+        hidden: where no corner is taken, ``[H, W]``, bool.
 
     Returns:
         Columns and rows of the corners in both images, each ``[K, 2]``, float32; K is 0 where there are none.
     """
-    corners = cv2.goodFeaturesToTrack(previous, _CORNERS, _QUALITY, _APART)
+    seen = None if hidden is None else 1 - grown(hidden, _WINDOW[0])
+    corners = cv2.goodFeaturesToTrack(previous, _CORNERS, _QUALITY, _APART, mask=seen)
     if corners is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)  # type: ignore[unreachable]  # cv2 says it is never None
     moved, found = _track(previous, current, corners)
@@ -137,7 +142,9 @@ def _sampson(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.nd
     return (second * after).sum(1) / np.sqrt(squares + 1e-12)
 
 
-def two_view_motion(previous: np.ndarray, current: np.ndarray, calibration) -> np.ndarray:
+def two_view_motion(
+    previous: np.ndarray, current: np.ndarray, calibration, *, hidden: np.ndarray | None = None
+) -> np.ndarray:
     """The turn and the direction of travel between two images of one calibrated camera.
 
     Corners are tracked on the images as they are: a median filter over all pixels, as the dense flow has it, or
@@ -149,6 +156,8 @@ def two_view_motion(previous: np.ndarray, current: np.ndarray, calibration) -> n
         previous: grey image ``[H, W]``, uint8.
         current: grey image ``[H, W]``, uint8.
         calibration: (fx, fy, cx, cy) in pixels of the images.
+        hidden: where something hides the street in both images, ``[H, W]``, bool: its edges are no corners. ``None``
+            for nowhere.
 
     Returns:
         ``TWO_VIEW_SHAPE``, float32: turn to the left, up and anticlockwise (rad), focus right and down (tangents),
@@ -169,7 +178,8 @@ def two_view_motion(previous: np.ndarray, current: np.ndarray, calibration) -> n
             cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for image in (previous, current)
         )
         calibration = 2 * calibration + [0, 0, 0.5, 0.5]  # pixel centres are at whole numbers
-    pixels = track_corners(previous, current)
+        hidden = None if hidden is None else hidden.repeat(2, 0).repeat(2, 1)
+    pixels = track_corners(previous, current, hidden)
     result = np.zeros(TWO_VIEW_SHAPE, np.float32)
     if len(pixels[0]) < _LEAST:
         return result

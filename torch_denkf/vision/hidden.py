@@ -21,7 +21,7 @@ _REACH = 3  # pixels that the continuation looks at
 
 def continue_picture(image: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """A canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
-    return cv2.inpaint(image, _grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
+    return cv2.inpaint(image, grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
 
 
 def continue_flow(
@@ -42,7 +42,7 @@ def continue_flow(
     Returns:
         The flow ``[H, W, 2]``, and the coarse flow's mismatch, continued likewise, ``[25, 79]``.
     """
-    hole = _grown(hidden, _RIM)
+    hole = grown(hidden, _RIM)
     _, height, width = FLOW_SHAPE
     cells = (cv2.resize(hole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
     seen = coarse.copy()
@@ -60,5 +60,6 @@ def continue_flow(
     return whole, cv2.inpaint(np.ascontiguousarray(coarse[2]), cells, _REACH, cv2.INPAINT_NS)
 
 
-def _grown(hidden: np.ndarray, rim: int) -> np.ndarray:
+def grown(hidden: np.ndarray, rim: int) -> np.ndarray:
+    """What is hidden ``[H, W]``, bool, with a rim of so many pixels, as uint8."""
     return cv2.dilate(hidden.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8))

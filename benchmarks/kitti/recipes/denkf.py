@@ -16,28 +16,45 @@ LAGS = 4  # past steps that an innovation may still correct
 
 @register
 class DEnKF(KITTIRecipe):
-    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows."""
+    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows.
+
+    Attributes:
+        size: members; the sensor has as many samples.
+        scheme: of the update.
+    """
+
+    size, scheme = SAMPLES, "sensor"
 
     def modules(self):
-        analysis = velocity_analysis(LAGS)
+        analysis = velocity_analysis(LAGS, self.scheme)
         return OrderedDict(
             noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
             transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
             observation=self.observation(),
             # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
-            gain=MemberGain([0.05, 0.02], ensemble_size=SAMPLES, in_key=("forecast", "observation")),
+            gain=MemberGain([0.05, 0.02], ensemble_size=self.size, in_key=("forecast", "observation")),
             analysis=TensorDictSequential(analysis, UnicycleMotion(self.facts.dt, history_key=HISTORY, smooth=True)),
         )
 
     def initial(self, std, state_key):
-        return WithHistory(AroundState(std, ensemble_size=SAMPLES, state_key=state_key), LAGS)
+        return WithHistory(AroundState(std, ensemble_size=self.size, state_key=state_key), LAGS)
 
     def loss(self, model):
         return self.ensemble_loss(model)
 
     def set_inflation(self, model, factor):
         next(module for module in model.modules() if isinstance(module, EnsembleAnalysis)).inflation = factor
+
+
+@register
+class DEnKF_Gated(DEnKF):
+    """The DEnKF as it was trained, on pictures that are checked.
+
+    Those that are black or white are left out, and the flow is continued behind what stands still before the camera.
+    """
+
+    repair, weights_of = True, "denkf"
 
 
 @register

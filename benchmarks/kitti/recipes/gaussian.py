@@ -60,6 +60,13 @@ class DEKF(_Gaussian):
 
 
 @register
+class DEKF_Gated(DEKF):
+    """The dEKF as it was trained, on checked pictures like the DEnKF's."""
+
+    repair, weights_of = True, "dekf"
+
+
+@register
 class DUKF(_Gaussian):
     """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
 

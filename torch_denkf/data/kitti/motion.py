@@ -94,7 +94,7 @@ def with_motion(
         motion = compute()
     else:
         options = f" {signs} {repair}" if signs or repair else ""
-        options += " two_view" * two_view
+        options += " two_view" * two_view + " seen" * (two_view and repair)
         key = f"{_FORMAT} {height} {tuple(drive['image'].shape)}{options}"
         digest = hashlib.blake2b(key.encode(), digest_size=10)
         for key in ("image", "frame_valid", "calibration", *(("steps",) if "steps" in drive else ())):
@@ -120,13 +120,16 @@ def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool, tw
     for row in range(rows):
         if steps[row]:
             previous, current = (_grey(drive["image"][at]) for at in (row - steps[row], row))
-            hidden = {"hidden": static_region(previous, current)} if repair else {}
+            static = static_region(previous, current) if repair else None
+            hidden = {} if static is None or not static.any() else {"hidden": static}
             arrays = image_motion(previous, current, calibration[row], height=height, **hidden)
             flow[row], road[row] = (torch.from_numpy(array).half() for array in arrays)
             if signs:
                 motion["signs"][row] = torch.from_numpy(picture_signs(previous, current))
             if two_view:
-                motion["two_view"][row] = torch.from_numpy(two_view_motion(previous, current, calibration[row]))
+                motion["two_view"][row] = torch.from_numpy(
+                    two_view_motion(previous, current, calibration[row], **hidden)
+                )
     return TensorDict(motion, batch_size=[rows])
 
 

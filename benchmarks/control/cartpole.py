@@ -1,0 +1,133 @@
+"""dm_control's cartpole, swung up from noisy readings of position and angle; and the filter that learns it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from dm_control.suite import cartpole
+from dm_control.utils.rewards import tolerance
+from mujoco import MjData, MjModel
+from mujoco.rollout import Rollout
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Bounded
+
+from torch_denkf import modules as m
+from torch_denkf.envs import LinearGaussianEnv
+from torch_denkf.filters import DEnKF
+
+REPEAT, STEPS = 4, 250  # physics steps of 0.01 s that an action is held for; actions in an episode
+DT = 0.01 * REPEAT  # s
+ACTION_NOISE, START_STD = 0.3, 0.01
+START = (0.0, -1.0, 0.0, 0.0, 0.0)  # the cart in the middle, the pole hanging
+SCALE = (1.0, 1.0, 1.0, 2.0, 5.0)  # of a state
+TRACK = 1.8  # m from the middle
+
+
+class NoisyCartpole(LinearGaussianEnv):
+    """Many carts at once. The state is the cart's position, cosine and sine of the pole's angle, and two velocities.
+
+    Physics, reward and start are those of ``dm_control.suite.cartpole.swingup``. The first three entries of the state
+    (m, 1, 1) are read with noise, the velocities (m/s, rad/s) are not. In each physics step the motor gets the action
+    ``[*B, 1]`` and N(0, 0.3^2), within [-1, 1]. The reward is the sum over an action's physics steps.
+
+    Args:
+        count: carts.
+        noise: standard deviation of a reading.
+        missing: share of the readings that do not come.
+        seed: of the environment's own generator.
+        action_noise: standard deviation of what is added to an action, in each physics step.
+    """
+
+    def __init__(
+        self, count: int, noise: float, missing: float = 0.0, seed: int = 0, action_noise: float = ACTION_NOISE
+    ):
+        # Readings, masks and the time limit are a linear system's; motion and reward are not.
+        one = torch.eye(5)
+        super().__init__(
+            one,
+            one[:3],
+            [0.0] * 5,
+            [noise] * 3,
+            control=one[:, 3:4],
+            missing=missing,
+            max_steps=STEPS,
+            batch_size=[count],
+            seed=seed,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, (count, 1))
+        self.action_noise = action_noise
+        text, assets = cartpole.get_model_and_assets()
+        self.model = MjModel.from_xml_string(text.decode(), assets)
+        self.data, self.simulator = MjData(self.model), Rollout(nthread=0)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
+        position, angle, velocity, turn = (START_STD * self._randn(self.F, 4)).split(1, -1)
+        angle = torch.pi + angle
+        state = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1)
+        return self._emit(state, torch.zeros(*self.batch_size, 1, dtype=torch.int64))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        position, cos, sin, velocity, turn = tensordict["state"].split(1, -1)
+        motor = tensordict["action"] + self.action_noise * self._randn(position, REPEAT)
+        motor = motor.clamp(-1, 1).double().numpy()
+        angle = torch.atan2(sin, cos)
+        before = torch.cat([torch.zeros_like(angle), position, angle, velocity, turn], -1).double().numpy()
+        after, _ = self.simulator.rollout(self.model, self.data, before, motor[..., None])
+        _, position, angle, velocity, turn = torch.from_numpy(after[:, -1]).to(cos.dtype).split(1, -1)
+        state = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1)
+        reward = swing_up(after[..., 1], np.cos(after[..., 2]), after[..., 4], motor).sum(-1, keepdims=True)
+        return self._emit(state, tensordict["step"] + 1).set("reward", torch.from_numpy(reward).to(cos.dtype))
+
+
+def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.ndarray) -> np.ndarray:
+    """The reward of ``dm_control.suite.cartpole.Balance``, which is not sparse, of many carts."""
+    centered = (1 + tolerance(position, margin=2)) / 2
+    small_control = (4 + tolerance(motor, margin=1, value_at_margin=0, sigmoid="quadratic")) / 5
+    small_velocity = (1 + tolerance(turn, margin=5)) / 2
+    return (cos + 1) / 2 * small_control * small_velocity * centered
+
+
+class Push(m.SubModel):
+    """The filter's motion: a network says how the velocities change, the velocities move cart and pole.
+
+    The network gives the change of both velocities without a motor, what the motor adds to the cart's, and how much of
+    a push on the cart the pole gets. The track ends where it ends: there the cart stops, which is such a push, too.
+    """
+
+    MOST = 20.0  # m/s, rad/s: more is not believed
+
+    def __init__(self):
+        network = nn.Sequential(nn.Linear(5, 32), nn.Tanh(), nn.Linear(32, 4))
+        super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
+        self.register_buffer("scale", torch.tensor(SCALE))
+
+    def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
+        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        position, cos, sin, velocity, turn = ensemble.split(1, -1)
+        angle = torch.atan2(sin, cos)
+        features = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1) / self.scale
+        drift, spin, motor, share = self.module(features).split(1, -1)
+        push = motor * action.unsqueeze(-2)
+        faster = velocity + drift + push
+        # Velocities change evenly during a step: position and angle move with their means.
+        ahead = position + DT * (velocity + faster) / 2
+        stop = torch.where((ahead.abs() > TRACK) & (ahead * faster > 0), -faster, 0.0)
+        faster, turning = faster + stop, turn + spin + share * (push + stop)
+        angle = angle + DT * (turn + turning) / 2
+        velocities = torch.cat([faster, turning], -1).clamp(-self.MOST, self.MOST)
+        return torch.cat([ahead, angle.cos(), angle.sin(), velocities], -1)
+
+
+def unlearned_filter(members: int) -> DEnKF:
+    """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
+    q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    return DEnKF(
+        transition=m.NoisyTransition(Push(), q, dims=[3, 4], before=True),
+        sensor=None,
+        observation=m.Select([0, 1, 2]),
+        noise=m.ConstantNoise([0.2] * 3, trainable=True, in_key="observation"),
+        analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
+        initial=m.GaussianPrior(START, [0.02] * 5, ensemble_size=members),
+        update_at_reset=True,
+    )

@@ -1,0 +1,144 @@
+"""Soft actor-critic of one arm, with torchrl's parts; the same settings for all arms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator, set_recurrent_mode
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from benchmarks.control.arms import MEMORY, Arm, Inputs, memory
+from benchmarks.control.learning import refiltered
+from torch_denkf.filters import Filter
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of SAC."""
+
+    gamma: float = 0.99
+    every: int = 5  # environment steps for each update
+    batch: int = 256  # steps, in any order
+    recurrent_batch: int = 500  # steps of a recurrent network, in slices
+    slice: int = 50  # steps that a recurrent network is trained through
+    units: int = 128  # of a hidden layer
+    lr: float = 1e-3
+    target: float = 0.995  # that stays of the target networks in an update
+
+
+class Units(nn.Module):
+    """Mean and variance of a belief, or a state, in units of ``scale``; of a variance the root."""
+
+    def __init__(self, scale: Tensor):
+        super().__init__()
+        self.register_buffer("scale", scale)
+
+    def forward(self, value: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Features ``[*B, S]`` or ``[*B, 2 S]``."""
+        value = value / self.scale
+        return value if variance is None else torch.cat([value, variance.sqrt() / self.scale], -1)
+
+
+def _reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[TensorDictModuleBase], NestedKey, int]:
+    """What stands before the layers of an actor or a critic; the entry that these read, and its width."""
+    if arm.memory:
+        return [memory(arm.memory, inputs.seen, name)], f"{name}_memory", MEMORY
+    if arm.keys[0] == "seen":
+        return [], "stack" if arm.stack > 1 else "seen", arm.stack * inputs.seen
+    key = f"{name}_input"
+    return [TensorDictModule(Units(inputs.scale), list(arm.keys), [key])], key, len(arm.keys) * len(inputs.scale)
+
+
+def networks(arm: Arm, inputs: Inputs, units: int) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
+    """Actor, which writes ``"action"``, and critic, which reads it; both have two hidden layers."""
+    size = {"num_cells": [units, units], "activation_class": nn.ReLU}
+    before, key, width = _reader(arm, inputs, "actor")
+    head = nn.Sequential(MLP(width, 2 * inputs.actions, **size), NormalParamExtractor(scale_lb=1e-3))
+    actor = ProbabilisticActor(
+        TensorDictSequential(*before, TensorDictModule(head, [key], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -inputs.limit, "high": inputs.limit},
+        return_log_prob=False,
+    )
+    before, key, width = _reader(arm, inputs, "critic")
+    value = ValueOperator(MLP(width + inputs.actions, 1, **size), in_keys=[key, "action"])
+    return actor, TensorDictSequential(*before, value)
+
+
+class SAC:
+    """Learns from all episodes ``[B, T]`` that came so far.
+
+    Args:
+        arm: who learns. With a memory, actor and critics have one each, and are trained on slices of time.
+        inputs: sizes and units of what it reads.
+        settings: the task's.
+        batches: that will come.
+
+    Attributes:
+        actor: writes ``"action"``.
+        critic: the first of two.
+        policy: the actor.
+    """
+
+    ON_POLICY = False  # random actions are learned from, too
+
+    def __init__(self, arm: Arm, inputs: Inputs, settings: Settings, batches: int):
+        self.settings, self.batches = settings, batches
+        self.slice = settings.slice if arm.memory else 1
+        self.actor, self.critic = networks(arm, inputs, settings.units)
+        self.policy = self.actor
+        self.keys = ["action", ("next", "reward"), *_both("is_init", "done", "terminated"), *_both(*self.actor.in_keys)]
+        if arm.filter:
+            self.keys += _both("observation", "observed")  # to filter once more
+        self.loss = SACLoss(
+            self.actor,
+            self.critic,
+            loss_function="l2",
+            target_entropy=-float(inputs.actions),
+            deactivate_vmap=bool(arm.memory),
+        )
+        self.loss.make_value_estimator(gamma=settings.gamma)
+        self.target = SoftUpdate(self.loss, eps=settings.target)
+        self.optimiser = torch.optim.Adam(self.loss.parameters(), lr=settings.lr, fused=True)
+        self.buffer: TensorDictReplayBuffer | None = None
+
+    def refilter(self, filter: Filter) -> None:
+        """Puts what a filter believes in the place of what was believed when an episode was collected."""
+        if self.buffer is None:
+            return
+        data = refiltered(filter, self.buffer[:].select(*self.keys).clone().reshape(-1, self.steps))
+        self.buffer.empty()
+        self.buffer.extend(data.reshape(-1))
+
+    def update(self, data: TensorDict) -> None:
+        """Keeps a batch of episodes, and learns."""
+        data = data.select(*self.keys)
+        if self.buffer is None:
+            self.steps, self.buffer = data.shape[1], self._empty_buffer(data)
+        self.buffer.extend(data.reshape(-1))
+        for _ in range(data.numel() // self.settings.every):
+            sample = self.buffer.sample().reshape(-1, self.slice)
+            with set_recurrent_mode(True):
+                terms = self.loss(sample)
+            self.optimiser.zero_grad()
+            (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
+            self.optimiser.step()
+            self.target.step()
+
+    def _empty_buffer(self, data: TensorDict) -> TensorDictReplayBuffer:
+        storage = LazyTensorStorage(self.batches * data.numel())
+        if self.slice == 1:
+            return TensorDictReplayBuffer(storage=storage, batch_size=self.settings.batch)
+        sampler = SliceSampler(slice_len=self.slice, end_key=("next", "done"), cache_values=True)
+        return TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=self.settings.recurrent_batch)
+
+
+def _both(*keys: NestedKey) -> list[NestedKey]:
+    """Keys before and after a step."""
+    return [*keys, *(unravel_key(("next", key)) for key in keys)]

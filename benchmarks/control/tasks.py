@@ -1,0 +1,91 @@
+"""The tasks: worlds with their settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torchrl.envs import EnvBase
+
+from benchmarks.control import cartpole, hike, pendulum, ppo, sac
+from benchmarks.control.learning import Learning
+from torch_denkf.envs import NoisyPendulumEnv
+from torch_denkf.filters import DEnKF, Filter
+
+
+@dataclass(frozen=True)
+class Task:
+    """A world, what is known of it, and who learns in it.
+
+    Attributes:
+        world: many at once, of a count, noise of readings, missing share and seed.
+        unlearned: a filter of a number of members.
+        exact: the filter that knows the world, of the readings' noise; where there is one.
+        steps: of an episode.
+        count: worlds at once.
+        limit: of an action.
+        scale: of a state, for the networks; the readings are in units of the first of them.
+        prior: mean and standard deviations of a state anywhere in an episode.
+        settings: of PPO, or of SAC.
+        learning: of the filter.
+        agent: PPO or SAC.
+        env_steps: of a run, with those of random actions.
+        shift: noise of the readings in a second test, after all training; ``None`` for none.
+    """
+
+    world: Callable[[int, float, float, int], EnvBase]
+    unlearned: Callable[[int], DEnKF]
+    exact: Callable[[float], Filter] | None
+    steps: int
+    count: int
+    limit: float
+    scale: tuple[float, ...]
+    prior: tuple[tuple[float, ...], tuple[float, ...]]
+    settings: ppo.Settings | sac.Settings
+    learning: Learning
+    agent: type[ppo.PPO] | type[sac.SAC] = ppo.PPO
+    env_steps: int = 100_000
+    shift: float | None = None
+
+
+TASKS = {
+    "hike": Task(
+        hike.MountainHike,
+        hike.unlearned_filter,
+        hike.exact_filter,
+        hike.STEPS,
+        count=32,
+        limit=1.0,
+        scale=(0.2, 0.2),
+        prior=((0.8, 0.8), (0.8, 0.8)),
+        settings=ppo.Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25, lr=5e-4),
+        learning=Learning(),
+    ),
+    "pendulum": Task(
+        pendulum.world,
+        pendulum.unlearned_filter,
+        None,
+        pendulum.STEPS,
+        count=16,
+        limit=NoisyPendulumEnv.MAX_TORQUE,
+        scale=(1.0, 1.0, NoisyPendulumEnv.MAX_SPEED),
+        prior=((0.0, 0.0, 0.0), (0.7, 0.7, 3.0)),
+        settings=ppo.Settings(gamma=0.95, lmbda=0.9, minibatch=320, slice=40, reward=0.1),
+        learning=Learning(window=64, windows=16, first=75, further=6, noise_lr=9e-2),
+    ),
+    "cartpole": Task(
+        cartpole.NoisyCartpole,
+        cartpole.unlearned_filter,
+        None,
+        cartpole.STEPS,
+        count=8,
+        limit=1.0,
+        scale=cartpole.SCALE,
+        prior=((0.0,) * 5, (0.7, 0.7, 0.7, 1.5, 4.0)),
+        settings=sac.Settings(),
+        learning=Learning(window=25, windows=64, first=120, further=20, pieces=10, within=1.5),
+        agent=sac.SAC,
+        env_steps=80_000,
+        shift=0.3,
+    ),
+}

@@ -1,0 +1,21 @@
+"""Oracles: the normal interval of a mean, and what a bootstrap of equal values has."""
+
+import numpy as np
+import pytest
+
+from benchmarks.common.intervals import bootstrap_interval
+
+
+def test_of_a_mean_of_many_it_is_the_normal_interval():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    center, low, high = bootstrap_interval(values)
+    half = 1.96 * values.std() / 20
+    assert center == pytest.approx(values.mean())
+    assert (center - low, high - center) == pytest.approx((half, half), rel=0.06)
+
+
+def test_of_one_value_or_equal_ones_there_is_none():
+    for values in ([2.0], [2.0, 2.0, 2.0]):
+        center, low, high = bootstrap_interval(values)
+        assert center == 2.0
+        assert np.isnan([low, high]).all()
