@@ -40,6 +40,7 @@ ARMS = {
     "ensemble": Arm((ENSEMBLE,), filter="learned"),
     "belief mean, taught": Arm((MEAN,), filter="taught"),
     "Kalman": Arm((MEAN,), filter="exact"),
+    "physics": Arm((MEAN,), filter="exact"),
     "truth": Arm(("state",)),
 }
 

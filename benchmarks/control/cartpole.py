@@ -1,4 +1,4 @@
-"""dm_control's cartpole, swung up from noisy readings of position and angle; and the filter that learns it."""
+"""dm_control's cartpole, swung up from noisy readings of position and angle; filters that learn it or know it."""
 
 from __future__ import annotations
 
@@ -68,16 +68,27 @@ class NoisyCartpole(LinearGaussianEnv):
         return self._emit(state, torch.zeros(*self.batch_size, 1, dtype=torch.int64))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        position, cos, sin, velocity, turn = tensordict["state"].split(1, -1)
-        motor = tensordict["action"] + self.action_noise * self._randn(position, REPEAT)
-        motor = motor.clamp(-1, 1).double().numpy()
+        before = tensordict["state"]
+        motor = tensordict["action"] + self.action_noise * self._randn(before[..., :1], REPEAT)
+        motor = motor.clamp(-1, 1)
+        state, after = self.moved(before, motor)
+        reward = swing_up(after[..., 1], np.cos(after[..., 2]), after[..., 4], motor.double().numpy())
+        reward = torch.from_numpy(reward.sum(-1, keepdims=True)).to(state.dtype)
+        return self._emit(state, tensordict["step"] + 1).set("reward", reward)
+
+    def moved(self, state: Tensor, motor: Tensor) -> tuple[Tensor, np.ndarray]:
+        """States ``[N, 5]`` one action on, and MuJoCo's own ``[N, physics steps, 5]`` on the way.
+
+        Args:
+            state: ``[N, 5]``.
+            motor: in each physics step, ``[N, physics steps]``, within [-1, 1].
+        """
+        position, cos, sin, velocity, turn = state.split(1, -1)
         angle = torch.atan2(sin, cos)
         before = torch.cat([torch.zeros_like(angle), position, angle, velocity, turn], -1).double().numpy()
-        after, _ = self.simulator.rollout(self.model, self.data, before, motor[..., None])
+        after, _ = self.simulator.rollout(self.model, self.data, before, motor.double().numpy()[..., None])
         _, position, angle, velocity, turn = torch.from_numpy(after[:, -1]).to(cos.dtype).split(1, -1)
-        state = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1)
-        reward = swing_up(after[..., 1], np.cos(after[..., 2]), after[..., 4], motor).sum(-1, keepdims=True)
-        return self._emit(state, tensordict["step"] + 1).set("reward", torch.from_numpy(reward).to(cos.dtype))
+        return torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1), after
 
 
 def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.ndarray) -> np.ndarray:
@@ -119,14 +130,38 @@ class Push(m.SubModel):
         return torch.cat([ahead, angle.cos(), angle.sin(), velocities], -1)
 
 
+class Physics(m.SubModel):
+    """The world's own motion, with the motor's own noise: what no filter can learn better."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
+        self.world = NoisyCartpole(1, 0.0)
+
+    def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
+        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        motor = action.unsqueeze(-2) + ACTION_NOISE * torch.randn(*ensemble.shape[:-1], REPEAT)
+        state, _ = self.world.moved(ensemble.flatten(0, -2), motor.clamp(-1, 1).flatten(0, -2))
+        return state.view_as(ensemble)
+
+
+def exact_filter(noise: float, members: int = 32) -> DEnKF:
+    """A filter that knows the world, and the noise of its readings."""
+    return _filter(Physics(), m.ConstantNoise([noise] * 3, in_key="observation"), members)
+
+
 def unlearned_filter(members: int) -> DEnKF:
     """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
     q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    r = m.ConstantNoise([0.2] * 3, trainable=True, in_key="observation")
+    return _filter(m.NoisyTransition(Push(), q, dims=[3, 4], before=True), r, members)
+
+
+def _filter(transition: m.SubModel, noise: m.ConstantNoise, members: int) -> DEnKF:
     return DEnKF(
-        transition=m.NoisyTransition(Push(), q, dims=[3, 4], before=True),
+        transition=transition,
         sensor=None,
         observation=m.Select([0, 1, 2]),
-        noise=m.ConstantNoise([0.2] * 3, trainable=True, in_key="observation"),
+        noise=noise,
         analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
         initial=m.GaussianPrior(START, [0.02] * 5, ensemble_size=members),
         update_at_reset=True,

@@ -75,6 +75,8 @@ def reached(rows: Sequence[dict], task: str, cell: str, arm: str) -> str:
     """Environment steps after which the interquartile mean first is the LSTM's final one, in thousands."""
     goal = float(interquartile_mean(returns(rows, task, cell, "LSTM")))
     chosen = pick(rows, task=task, cell=cell, arm=arm)
+    if not chosen:
+        return ""
     for steps in sorted({row["env_steps"] for row in chosen}):
         if interquartile_mean([row["return"] for row in chosen if row["env_steps"] == steps]) >= goal:
             return f"{steps / 1000:.0f}"
@@ -95,12 +97,13 @@ def page(rows: Sequence[dict]) -> str:
             found = [returns(rows, task, cell, arm) for arm in names]
             lines.append(line(cell, max(map(len, found)), *map(_text, found)))
         lines += lost(rows, task)
-        others = [arm for arm in ("LSTM", "GRU", "Kalman") if arm in names]
+        others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
         lines += head("cell", *others)
         for cell in cells(rows, task, trained=True):
             belief = np.array(returns(rows, task, cell, "belief mean"))
-            lines.append(line(cell, *(_text(belief - returns(rows, task, cell, other)) for other in others)))
+            found = [returns(rows, task, cell, other) for other in others]
+            lines.append(line(cell, *(_text(belief - other if other else ()) for other in found)))
         lines += [
             "",
             "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
@@ -159,8 +162,8 @@ def draw(rows: Sequence[dict], file: Path) -> None:
     figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
     for axis, task in zip(axes[0], tasks, strict=True):
         for number, arm in enumerate(arms(rows, task)):
-            chosen = noises(rows, task).items()
-            points = sorted((noise, *summary(returns(rows, task, cell, arm))) for cell, noise in chosen)
+            chosen = [(noise, returns(rows, task, cell, arm)) for cell, noise in noises(rows, task).items()]
+            points = sorted((noise, *summary(found)) for noise, found in chosen if found)
             noise, center, low, high = np.array(points).T
             style = "--" if arm in ("truth", "Kalman") else "-"
             axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{number}", label=arm)

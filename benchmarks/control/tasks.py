@@ -76,7 +76,7 @@ TASKS = {
     "cartpole": Task(
         cartpole.NoisyCartpole,
         cartpole.unlearned_filter,
-        None,
+        cartpole.exact_filter,
         cartpole.STEPS,
         count=8,
         limit=1.0,
