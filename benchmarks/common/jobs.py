@@ -40,11 +40,18 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
     Args:
         files: in the order of their rows.
         shared: what makes a row the same as another file's, or ``None``; the first file's are kept.
+
+    Raises:
+        ValueError: if a file is damaged; names it.
     """
     rows: list[dict] = []
     seen: set[Hashable] = set()
     for file in files:
-        keyed = [(shared(row), row) for row in json.loads(file.read_text())]
+        try:
+            found = json.loads(file.read_text())
+        except ValueError as error:
+            raise ValueError(f"{file} is damaged ({error}); remove it, and the study computes it anew") from error
+        keyed = [(shared(row), row) for row in found]
         rows += [row for key, row in keyed if key not in seen]
         seen |= {key for key, _ in keyed if key is not None}
     return rows

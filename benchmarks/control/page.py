@@ -95,7 +95,8 @@ def page(rows: Sequence[dict]) -> str:
         lines += head("cell", "seeds", *names)
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
-            lines.append(line(cell, max(map(len, found)), *map(_text, found)))
+            seeds = {row["seed"] for row in pick(rows, task=task, cell=cell)}  # what reads the truth may have more
+            lines.append(line(cell, len(seeds), *map(_text, found)))
         lines += lost(rows, task)
         others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
@@ -164,6 +165,8 @@ def draw(rows: Sequence[dict], file: Path) -> None:
         for number, arm in enumerate(arms(rows, task)):
             chosen = [(noise, returns(rows, task, cell, arm)) for cell, noise in noises(rows, task).items()]
             points = sorted((noise, *summary(found)) for noise, found in chosen if found)
+            if not points:  # it ran only where readings are missing
+                continue
             noise, center, low, high = np.array(points).T
             style = "--" if arm in ("truth", "Kalman") else "-"
             axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{number}", label=arm)

@@ -69,6 +69,9 @@ def test_a_job_is_done_once_and_leaves_nothing_half(tmp_path):
     once(file, partial(rows, False))
     assert calls == [True, False]
     assert read_rows([file]) == [{"value": 1.5}]
+    file.write_text(file.read_text()[:-4])
+    with pytest.raises(ValueError, match=r"a\.json is damaged .* remove it"):
+        read_rows([file])
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -12,7 +12,7 @@ from benchmarks.control import hike, pendulum
 from benchmarks.control.arms import ARMS, Inputs
 from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
-from benchmarks.control.ppo import PPO, ActorHead, Head
+from benchmarks.control.ppo import PPO, ActorHead, Head, Settings
 from benchmarks.control.run import make_env, rollout
 from benchmarks.control.tasks import TASKS
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
@@ -131,6 +131,52 @@ def test_a_memory_is_the_same_in_steps_and_in_slices(arm):
     before = [parameter.clone() for parameter in actor.parameters()]
     ppo.update(data)
     assert all((a - b).abs().max() > 0 for a, b in zip(before, actor.parameters(), strict=True))
+
+
+def test_advantages_and_targets_are_those_of_a_constant_critic():
+    """Where values are c, each step is worth f r + (gamma - 1) c, and those to come fade by gamma lambda.
+
+    The end of an episode is a time limit: what comes after it is worth c, too.
+    """
+    torch.manual_seed(0)
+    settings = Settings(gamma=0.9, lmbda=0.8, epochs=2, minibatch=100, reward=0.1)
+    ppo, value = PPO(ARMS["truth"], Inputs(0, 2, torch.ones(2), 1.0), settings, 1), 3.0
+    with torch.no_grad():
+        last = ppo.critic[-1].module.last
+        last.weight.zero_()
+        last.bias.fill_(value)
+    data = rollout(env_of("hike", "truth", count=3), ppo.policy, hike.STEPS, ExplorationType.RANDOM)
+    reward = data["next", "reward"].clone()
+    given, forward = [], ppo.loss.forward
+    ppo.loss.forward = lambda part: given.append(part.clone()) or forward(part)
+    ppo.update(data)
+    assert [part.numel() for part in given] == 2 * [100, 100, 25]  # all of 225 steps, twice
+    fade, ahead, advantages = 0.9 * 0.8, torch.zeros(3, 1), []
+    for step in reversed(range(hike.STEPS)):
+        ahead = 0.1 * reward[:, step] - 0.1 * value + fade * ahead
+        advantages.append(ahead)
+    expected = torch.cat(advantages).flatten().sort().values
+    for epoch in (given[:3], given[3:]):
+        found, target = (torch.cat([part[key].flatten() for part in epoch]) for key in ("advantage", "value_target"))
+        torch.testing.assert_close(found.sort().values, expected, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(target, found + value, atol=1e-4, rtol=1e-4)
+    assert reward.equal(data["next", "reward"])  # the collected ones stay as they were
+
+
+def test_ppo_raises_the_reward():
+    """Steps that are rewarded by their first action: its mean goes up, the second one's stays."""
+    torch.manual_seed(0)
+    ppo = PPO(ARMS["truth"], Inputs(0, 2, torch.ones(2), 1.0), Settings(gamma=0.5, lmbda=0.5, epochs=3), 4)
+    env = env_of("hike", "truth", count=8)
+    for _ in range(4):
+        data = rollout(env, ppo.policy, hike.STEPS, ExplorationType.RANDOM)
+        data["next", "reward"] = data["action"][..., :1].clone()
+        ppo.update(data)
+    with torch.no_grad():
+        loc = ppo.actor.get_dist(data).mean.mean((0, 1))
+    assert loc[0] > 0.3
+    assert loc[1].abs() < 0.2
+    assert ppo.optimiser.param_groups[0]["lr"] == pytest.approx(0.05 * 1e-3)
 
 
 def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter():

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
+import benchmarks.control.run as protocol
 from benchmarks.control import cartpole
 from benchmarks.control.arms import ARMS, Inputs
 from benchmarks.control.learning import Learner, refiltered
@@ -191,14 +192,72 @@ def test_a_memory_is_the_same_in_steps_and_in_slices():
     assert collected.std() > 1e-3
 
 
-@pytest.mark.parametrize("arm", ["belief mean", "four readings"])
+def test_what_the_buffer_holds_is_filtered_once_more():
+    """All that is kept stays in its place; beliefs become what the filter that is used now says of whole episodes."""
+    filter, arm = still_filter(), ARMS["belief mean, spread"]
+    agent = SAC(arm, Inputs(0, 1, SCALE, 1.0), Settings(every=10_000), 3)
+    agent.refilter(filter)  # nothing is kept yet
+    env = make_env(TASKS["cartpole"], arm, 4, (0.1, 0.0), 0, filter)
+    batches = [rollout(env, agent.policy, 30, ExplorationType.RANDOM) for _ in range(3)]
+    for data in batches[:2]:
+        agent.update(data)
+    before = agent.buffer[:].clone()
+    with told(filter, 0.5):
+        agent.refilter(filter)
+        expected = refiltered(filter, torch.cat(batches[:2])).reshape(-1)
+    after = agent.buffer[:]
+    for key in ("belief", "mean"), ("belief", "var"), ("next", "belief", "mean"), ("next", "belief", "var"):
+        torch.testing.assert_close(after[key], expected[key], atol=1e-4, rtol=1e-3)
+        assert not torch.allclose(after[key], before[key], atol=1e-2)
+    for key in "observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"):
+        assert after[key].equal(before[key])
+    agent.update(batches[2])
+    assert len(agent.buffer) == 360
+    torch.testing.assert_close(agent.buffer[240:]["belief", "mean"], batches[2]["belief", "mean"].reshape(-1, 5))
+
+
+def test_what_comes_after_a_time_limit_counts():
+    """A step's worth is r + gamma V, also where an episode ends by its length; r alone where it is terminated."""
+    agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(gamma=0.9), 1)
+    flags = {"done": torch.ones(2, 1, dtype=torch.bool), "terminated": torch.tensor([[False], [True]])}
+    after = TensorDict({"reward": torch.full((2, 1), 2.0), "state_value": torch.full((2, 1), 5.0), **flags}, [2])
+    worth = agent.loss.value_estimator.value_estimate(TensorDict({"next": after}, [2]))
+    torch.testing.assert_close(worth, torch.tensor([[6.5], [2.0]]))
+
+
+def test_an_update_follows_so_many_steps():
+    agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(every=20, batch=7), 1)
+    given, forward = [], agent.loss.forward
+    agent.loss.forward = lambda sample: given.append(sample.numel()) or forward(sample)
+    env = make_env(TASKS["cartpole"], ARMS["truth"], 4, (0.1, 0.0), 0, None)
+    agent.update(rollout(env, None, 30, ExplorationType.RANDOM))
+    assert given == 6 * [7]
+
+
+@pytest.mark.parametrize("arm", ["belief mean", "four readings", "physics"])
 def test_a_run_is_tested_where_it_was_trained_and_where_it_was_not(arm, monkeypatch):
-    task = TASKS["cartpole"]
+    """Of each test the world's noise, and the filter's."""
+    task, tested = TASKS["cartpole"], []
     monkeypatch.setitem(TASKS, "cartpole", replace(task, settings=replace(task.settings, every=500)))
+
+    def noted(env, policy, steps, kind):
+        if kind == ExplorationType.DETERMINISTIC:
+            r = [one.filter["noise"].log_variance.div(2).exp() for one in env.transform if hasattr(one, "filter")]
+            tested.append((env.observation_std[0].item(), *(each.detach().clone() for each in r)))
+        return rollout(env, policy, steps, kind)
+
+    monkeypatch.setattr(protocol, "rollout", noted)
     budget = Budget(env_steps=2000, tests=1, episodes=2, members=4, updates=0.02)
     names = [row["cell"] for row in run("cartpole", (0.1, 0.0), arm, 0, budget)]
-    left = ["noise 0.3, not trained, R as learned"] * (arm == "belief mean")
+    left = ["noise 0.3, not trained, R as learned"] * (arm != "four readings")
     assert names == ["noise 0.1", "noise 0.3, not trained", *left]
+    assert [one[0] for one in tested] == pytest.approx([0.1, 0.3, 0.3][: len(names)])
+    if left:
+        (_, learned), (_, told_of), (_, as_learned) = tested
+        torch.testing.assert_close(told_of, torch.full((3,), 0.3))
+        assert as_learned.equal(learned)
+        if arm == "physics":
+            torch.testing.assert_close(learned, torch.full((3,), 0.1))
 
 
 def test_the_page_says_what_is_lost():
