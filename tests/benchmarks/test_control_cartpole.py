@@ -225,6 +225,22 @@ def test_what_comes_after_a_time_limit_counts():
     torch.testing.assert_close(worth, torch.tensor([[6.5], [2.0]]))
 
 
+def test_slices_come_from_all_batches_and_from_within_episodes():
+    torch.manual_seed(0)
+    agent = SAC(ARMS["LSTM"], Inputs(5, 1, SCALE, 1.0), Settings(every=10_000, slice=50), 3)
+    env = make_env(TASKS["cartpole"], ARMS["LSTM"], 2, (0.1, 0.0), 0, None)
+    env.append_transform(get_primers_from_module(agent.policy))
+    agent.keys += ["step", "number"]
+    for number in range(3):
+        data = rollout(env, agent.policy, cartpole.STEPS, ExplorationType.RANDOM)
+        agent.update(data.set("number", torch.full((2, cartpole.STEPS, 1), number)))
+        slices = torch.cat([agent.buffer.sample().reshape(-1, 50) for _ in range(20)])
+        assert slices["step"].diff(dim=1).eq(1).all()
+        shares = slices["number"][:, 0, 0].bincount() / len(slices)
+        # 200 slices: a share's standard deviation is at most 0.036.
+        torch.testing.assert_close(shares, torch.full((number + 1,), 1 / (number + 1)), atol=0.15, rtol=0)
+
+
 def test_an_update_follows_so_many_steps():
     agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(every=20, batch=7), 1)
     given, forward = [], agent.loss.forward

@@ -46,7 +46,7 @@ class Agent:
     last: "Agent"
 
     def __init__(self, arm, inputs, settings, batches):
-        self.batches, self.given, self.refilters = batches, [], 0
+        self.batches, self.given, self.refilters = batches, [], []
         Agent.last = self
 
         def head(observed):
@@ -64,7 +64,7 @@ class Agent:
         self.given.append(data)
 
     def refilter(self, filter):
-        self.refilters += 1
+        self.refilters.append(len(self.given))
 
 
 class OffPolicy(Agent):
@@ -149,7 +149,7 @@ def test_who_learns_from_random_actions(agent, arm, tiny):
     assert within == [False] * (BATCHES - skipped) if agent.ON_POLICY else [True] + [False] * (BATCHES - 1)
     counts = [30] + [4] * (BATCHES - 1)
     assert updates == ([(count, COUNT * (number + 1)) for number, count in enumerate(counts)] if learns else [])
-    assert agent.last.refilters == (4 if learns and not agent.ON_POLICY else 0)  # after 1, 2, 3 and 5 batches
+    assert agent.last.refilters == ([0, 1, 2, 4] if learns and not agent.ON_POLICY else [])  # each with a new batch
 
 
 @pytest.mark.parametrize("arm", list(ARMS))
