@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import ExplorationType, check_env_specs
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
@@ -14,6 +15,7 @@ from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO, ActorHead, Head, Settings
 from benchmarks.control.run import make_env, rollout
+from benchmarks.control.sac import Units
 from benchmarks.control.tasks import TASKS
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 
@@ -97,6 +99,28 @@ def test_a_set_encoder_knows_no_order():
     plain.load_state_dict(head.state_dict())
     same = ensemble[:, :1].expand(5, 8, 3)
     torch.testing.assert_close(head(same), plain(same[:, 0]))
+
+
+@pytest.mark.parametrize("reader", [Head(6, 2, torch.tensor([1.0, 2.0, 4.0])), Units(torch.tensor([1.0, 2.0, 4.0]))])
+def test_beliefs_are_read_in_units_of_the_scale(reader):
+    """Means 1, 4, 12 and variances 1, 16, 64 are 1, 2, 3 and standard deviations 1, 2, 2 of 1, 2 and 4."""
+    mean, variance = torch.tensor([1.0, 4.0, 12.0]), torch.tensor([1.0, 16.0, 64.0])
+    expected = torch.tensor([1.0, 2.0, 3.0, 1.0, 2.0, 2.0])
+    if isinstance(reader, Head):
+        plain = Head(6, 2)
+        plain.load_state_dict(reader.state_dict(), strict=False)
+        expected = plain(expected)
+    torch.testing.assert_close(reader(mean, variance), expected)
+
+
+def test_ppo_holds_actions_within_the_limit():
+    """The mean is zero and one standard deviation is the limit: 32 % of the actions are at it."""
+    torch.manual_seed(0)
+    ppo = PPO(ARMS["truth"], Inputs(0, 1, torch.ones(3), 2.0), TASKS["pendulum"].settings, 1)
+    with torch.no_grad():
+        out = ppo.policy(TensorDict({"state": torch.zeros(4000, 3)}, [4000]))
+    torch.testing.assert_close(out["action"], 2 * out["raw"].clamp(-1, 1))
+    assert out["action"].abs().eq(2).float().mean().item() == pytest.approx(0.317, abs=0.037)
 
 
 def test_actors_begin_alike():

@@ -138,9 +138,10 @@ def test_no_world_is_both_trained_in_and_tested_in(tiny):
 
 @pytest.mark.parametrize("agent", [Agent, OffPolicy])
 @pytest.mark.parametrize("arm", ["belief mean", "last reading"])
-def test_who_learns_from_random_actions(agent, arm, tiny):
-    """Random actions stay within one; a policy's do not."""
+def test_who_learns_from_random_actions(agent, arm, tiny, monkeypatch):
+    """Random actions stay within one; a policy's do not. What was collected is filtered anew with what is kept."""
     updates = tiny(agent)
+    monkeypatch.setattr(protocol, "refiltered", lambda filter, data: data.set("anew", data["step"]))
     torch.manual_seed(0)
     run("tiny", (0.2, 0.0), arm, 0, BUDGET)
     learns = arm == "belief mean"
@@ -149,7 +150,18 @@ def test_who_learns_from_random_actions(agent, arm, tiny):
     assert within == [False] * (BATCHES - skipped) if agent.ON_POLICY else [True] + [False] * (BATCHES - 1)
     counts = [30] + [4] * (BATCHES - 1)
     assert updates == ([(count, COUNT * (number + 1)) for number, count in enumerate(counts)] if learns else [])
-    assert agent.last.refilters == ([0, 1, 2, 4] if learns and not agent.ON_POLICY else [])  # each with a new batch
+    anew = [0, 1, 2, 4] if learns and not agent.ON_POLICY else []
+    assert agent.last.refilters == anew
+    assert [number for number, data in enumerate(agent.last.given) if data.get("anew", None) is not None] == anew
+
+
+@pytest.mark.parametrize("arm", ["belief mean", "belief mean, taught"])
+def test_who_is_taught(arm, tiny, monkeypatch):
+    tiny(Agent)
+    taught = []
+    monkeypatch.setattr(protocol, "Learner", lambda *given: taught.append(given[-1]) or Learner(*given))
+    run("tiny", (0.2, 0.0), arm, 0, BUDGET)
+    assert taught == [arm == "belief mean, taught"]
 
 
 @pytest.mark.parametrize("arm", list(ARMS))
