@@ -201,6 +201,7 @@ def test_ppo_raises_the_reward():
     assert loc[0] > 0.3
     assert loc[1].abs() < 0.2
     assert ppo.optimiser.param_groups[0]["lr"] == pytest.approx(0.05 * 1e-3)
+    assert ppo.loss.clip_epsilon.item() == pytest.approx(0.2)
 
 
 def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter():

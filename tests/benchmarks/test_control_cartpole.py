@@ -242,12 +242,29 @@ def test_slices_come_from_all_batches_and_from_within_episodes():
 
 
 def test_an_update_follows_so_many_steps():
-    agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(every=20, batch=7), 1)
-    given, forward = [], agent.loss.forward
-    agent.loss.forward = lambda sample: given.append(sample.numel()) or forward(sample)
+    """Six of 120 steps; the targets follow the first, of what is learned they keep 90 %."""
+    agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(every=20, batch=7, target=0.9), 1)
+    given, forward, targets = [], agent.loss.forward, []
+
+    def noted(sample):
+        given.append(sample.numel())
+        targets.append([values.detach().clone() for values in (learned(), followed())])
+        return forward(sample)
+
+    def learned():
+        return torch.cat([value.flatten() for value in agent.loss.qvalue_network_params.values(True, True)])
+
+    def followed():
+        return torch.cat([value.flatten() for value in agent.loss.target_qvalue_network_params.values(True, True)])
+
+    agent.loss.forward = noted
     env = make_env(TASKS["cartpole"], ARMS["truth"], 4, (0.1, 0.0), 0, None)
     agent.update(rollout(env, None, 30, ExplorationType.RANDOM))
     assert given == 6 * [7]
+    torch.testing.assert_close(targets[0][0], targets[0][1])
+    torch.testing.assert_close(targets[1][1], 0.9 * targets[0][1] + 0.1 * targets[1][0])
+    assert not targets[1][0].equal(targets[0][0])
+    assert agent.loss.target_entropy.item() == -1.0  # minus the number of actions
 
 
 @pytest.mark.parametrize("arm", ["belief mean", "four readings", "physics"])
