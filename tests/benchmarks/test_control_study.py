@@ -202,6 +202,28 @@ def test_a_filter_that_is_not_taught_never_sees_the_state():
     assert not learned(other, True).equal(learned(data, True))
 
 
+def test_windows_begin_anywhere_and_noises_have_a_least():
+    """All of the 60 places where 16 of 75 steps fit; what would make the noises vanish leaves them at 0.01."""
+    torch.manual_seed(0)
+    filter, starts = hike.unlearned_filter(4), []
+    learner = Learner(filter, TASKS["hike"].prior, 4, Learning(windows=4))
+    data = hike.MountainHike(4, 0.2).rollout(hike.STEPS)
+    learner.add(data.set("observation", data["step"].expand(-1, -1, 2).float()))
+
+    def loss(windows):
+        steps = windows["observation"][..., 0]
+        assert steps.shape == (4, 16)
+        assert steps.diff(dim=1).eq(1).all()
+        starts.append(int(steps[0, 0]))
+        return {"loss": sum(parameter.sum() for parameter in filter.parameters())}
+
+    learner.loss = loss
+    learner.update(600)
+    assert set(starts) == set(range(60))  # one is missing with a probability of 0.3 %; the seed is fixed
+    noises = torch.cat([noise.exp().sqrt() for noise in learner.noises])
+    torch.testing.assert_close(noises, torch.full((4,), 0.01))
+
+
 # ------------------------------------------------------------------------------------------------- cells and tables
 
 
