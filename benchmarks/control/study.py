@@ -26,9 +26,9 @@ WHOLE = 2  # cells of a task in which all arms run
 READERS = {
     "hike": ("Kalman", *BELIEFS, *MEMORIES),
     "pendulum": (*BELIEFS, "belief mean, taught", *MEMORIES),
-    "cartpole": ("belief mean", "LSTM", "physics", "truth", "four readings"),
+    "cartpole": ("belief mean", "LSTM", "physics", "truth"),
 }  # of a cell; what reads the truth is the same in all cells of a task, and runs in the one without noise
-FEW = ("Kalman", "belief mean", "LSTM", "four readings", "last reading")  # of them, in further cells
+FEW = ("Kalman", "belief mean", "LSTM", "last reading")  # of them, in further cells
 
 
 @dataclass(frozen=True)

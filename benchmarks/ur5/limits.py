@@ -1,8 +1,9 @@
-"""How far linear filters get on a sensor's readings: what is left for any filter that is not told where the arm goes.
+"""How far simple filters get on a sensor's readings: what is left for any filter that is not told where the arm goes.
 
-Two kinds, for each of the table's ten numbers by itself. A regression on the last readings knows no motion at all. A
-Kalman filter carries the number, its rate, its acceleration if wanted, and the sensor's slow errors
-(:class:`~torch_denkf.modules.FadingBias`); noise, damping, size and time of the errors are fitted. Both are fitted on
+Three kinds, for each of the table's ten numbers by itself. A regression on the last readings knows no motion at all. A
+recurrent network remembers all readings of a demo, and is not linear: it may tell a joint that stands still from one
+that moves. A Kalman filter carries the number, its rate, its acceleration if wanted, and the sensor's slow errors
+(:class:`~torch_denkf.modules.FadingBias`); noise, damping, size and time of the errors are fitted. All are fitted on
 the demos that train the filters; nothing here sees a picture.
 """
 
@@ -16,6 +17,8 @@ from torch import Tensor, nn
 from benchmarks.common.tables import head, line, write_page
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.evaluation import errors
+from benchmarks.ur5.memory import START, Memory
+from benchmarks.ur5.memory import UPDATES as MEMORY_UPDATES
 from benchmarks.ur5.readings import read_all
 from benchmarks.ur5.sensors import MEMBERS, WRIST, Preset
 from benchmarks.ur5.study import Base, Study
@@ -26,7 +29,6 @@ LAGS = (1, 10, 30)  # readings that a regression sees
 KINDS = ((2, 0), (2, 1), (3, 1), (3, 2))  # 2: rates, 3: accelerations, too; and how many biases
 TIMES = {1: (20.0,), 2: (3.0, 30.0)}  # steps in which biases fade, before fitting
 UPDATES, LENGTH, BLIND, BATCH = 120, 100, 20, 48  # fitting; the first steps of a window do not count
-START = 0.05  # standard deviation of the belief at a demo's start, in those of the training states
 
 
 class LinearFilter(nn.Module):
@@ -134,13 +136,22 @@ def regress(tune: tuple[Tensor, Tensor], readings: Tensor, lags: int, ridge: flo
     return torch.stack(said, -1).float()
 
 
-def limits(tune: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor], *, updates: int = UPDATES) -> list[dict]:
-    """Errors of readings, regressions and Kalman filters on ``test``, fitted on ``tune``; both readings and truth."""
+def limits(
+    tune: tuple[Tensor, Tensor],
+    test: tuple[Tensor, Tensor],
+    *,
+    updates: int = UPDATES,
+    remembering: int = MEMORY_UPDATES,
+) -> list[dict]:
+    """Errors of readings and of all three kinds on ``test``, fitted on ``tune``; both readings and truth."""
     readings, truth = test
     std = START * tune[1].flatten(0, 1).std(0)
     rows = [{"method": "the readings", **errors(readings, truth)}]
     for lags in LAGS:
         rows.append({"method": f"regression on {lags}", **errors(regress(tune, readings, lags), truth)})
+    memory = Memory(*tune, updates=remembering)
+    with torch.no_grad():
+        rows.append({"method": "GRU on all so far", **errors(memory(readings, truth[:, 0]), truth)})
     for order, biases in KINDS:
         filter = fit(order, biases, *tune, updates=updates)
         with torch.no_grad():
@@ -152,7 +163,7 @@ def limits(tune: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor], *, updates:
 
 def page(studied: dict[str, tuple[list[dict], Tensor]]) -> str:
     """Markdown of the rows of each sensor, and how far its readings follow the truth ``[10]``."""
-    lines = ["# How far linear filters get on the sensors' readings", ""]
+    lines = ["# How far simple filters get on the sensors' readings", ""]
     lines += ["Test demos, clean. Each of the ten numbers by itself; fitted on the demos that train the filters.", ""]
     for sensor, (rows, slopes) in studied.items():
         lines += [f"**{sensor}**", "", *head("", "joints deg", "end effector cm", "J1 to J7")]
@@ -176,7 +187,8 @@ def run(study: Study) -> list[Path]:
     for kind in study.sensors:
         base = Base(study, kind, "sim", study.seeds[0])
         tune, test = (_read(base, role) for role in ("tune", "test"))
-        studied[kind] = limits(tune, test, updates=2 if study.smoke else UPDATES), slopes(*tune)
+        few = {"updates": 2, "remembering": 2} if study.smoke else {}
+        studied[kind] = limits(tune, test, **few), slopes(*tune)
     file = study.out / "limits.md"
     write_page(page(studied), file)
     return [file]

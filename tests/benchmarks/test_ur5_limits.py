@@ -1,10 +1,11 @@
-"""Oracles: the Kalman filter's steady state by its Riccati equation, and a regression's closed form."""
+"""Oracles: the Kalman filter that knows a system, the Riccati equation of its steady state, a closed form."""
 
 import math
 
 import torch
 
 from benchmarks.ur5.limits import LinearFilter, fit, regress, slopes
+from benchmarks.ur5.memory import Memory
 
 ERROR, CHANGE = torch.tensor([0.5, 2.0]), torch.tensor([0.01, 0.3])
 
@@ -42,6 +43,7 @@ def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system():
     known.damping.data.fill_(20.0)
     fitted = fit(2, 0, readings[:40], truth[:40], updates=60)
     start, std = truth[40:, 0], torch.full((1,), 0.05)
+    memory = Memory(readings[:40], truth[:40], updates=120)
     with torch.no_grad():
         scores = []
         for filter in (known, fitted):
@@ -51,6 +53,12 @@ def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system():
             assert 0.87 < (error.abs() < 1.645 * variance.sqrt()).float().mean() < 0.93
     assert scores[0] < 0.3  # of readings 0.5
     assert scores[1] < 1.05 * scores[0]
+    with torch.no_grad():
+        remembered = memory(readings[40:], start)[:, 1:] - truth[40:, 1:]
+        assert remembered.square().mean().sqrt() < 1.3 * scores[0]
+        later = readings[40:].clone()
+        later[:, 60:] += 10.0
+        torch.testing.assert_close(memory(later, start)[:, :60], memory(readings[40:], start)[:, :60])
 
 
 def test_a_regression_on_one_reading_shrinks_it_as_the_closed_form_has_it():
