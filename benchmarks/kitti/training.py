@@ -1,4 +1,7 @@
-"""The stages of a filter: on the frozen sensor's readings, then end to end; then its one number is chosen."""
+"""The stages of a filter: on the frozen sensor's readings, then end to end; then its two numbers are chosen.
+
+These are the inflation, and a factor on all speeds that the sensor reads, where drives that it has not seen share one.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from scipy.stats import ttest_1samp
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
 from benchmarks.common.scores import belief_crps
 from benchmarks.common.training import fit_filter, read_filter
@@ -78,15 +82,22 @@ def calibration_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[Ten
     return _crps(recipe, runs) * float(torch.cat(apart).mean())
 
 
-def gain_error(fold: Fold, base: SensorOfFold) -> float:
-    """How far off a sensor's speed is over a whole drive that it has not seen: root mean square of the logarithm."""
+def log_gains(fold: Fold, base: SensorOfFold) -> Tensor:
+    """How far off a sensor's speed is over each whole drive that it has not seen: logarithms of read by driven."""
     logarithms = []
     for part, (first, last, _) in zip(fold.tune, base.readings[::2], strict=True):
         if part.stream.condition == "clean":
             drive = all_frames(torch.cat([first, last]))[1:]
             read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
             logarithms.append((read.sum() / driven.sum()).clamp(0.5, 2.0).log())
-    return float(torch.stack(logarithms).square().mean().sqrt())
+    return torch.stack(logarithms)
+
+
+def certain_gain(gains: Tensor) -> float:
+    """The mean logarithm, if a t test over the drives tells it from 0 at 5 %; else 0."""
+    if len(gains) < 3 or not ttest_1samp(gains.double().numpy(), 0.0).pvalue < 0.05:
+        return 0.0
+    return float(gains.mean())
 
 
 def train_filter(
@@ -107,6 +118,8 @@ def train_filter(
     sensor.load_state_dict(base.sensor.state_dict())  # a copy of the fold's, because the last stage trains it
     recipe = FILTERS[filter_name](sensor, facts)
     model = recipe.build()
+    gains = log_gains(fold, base)
+    gain = certain_gain(gains)
     # How wrong the first velocity of a training window is; its pose is right.
     start_std = torch.cat([torch.zeros(3), 0.2 * facts.scale])
 
@@ -115,7 +128,7 @@ def train_filter(
 
     def stages() -> list[Stage]:
         readings, weights = [tune for tune, _, _ in base.readings], [share for *_, share in base.readings]
-        windows = ReadingSampler(readings, weights, budget.length, gain_error(fold, base))
+        windows = ReadingSampler(readings, weights, budget.length, float(gains.square().mean().sqrt()))
         frames = FrameSampler(fold.train, cache, kind)
         third = max(budget.end_to_end // 3, 1)
         return [
@@ -143,12 +156,14 @@ def train_filter(
         ]
 
     settings = {"validate_every": max(budget.filter // 3, 1), "save_every": 200, "loggers": loggers, "seed": seed}
-    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts)}
+    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts), "gain": gain}
 
     def error() -> float:
+        recipe.set_gain(model, gain)
         return calibration_error(recipe, model, base.validation)
 
     fit_filter(recipe, model, stages, None, out=out, inflations=INFLATIONS, error=error, notes=notes, **settings)
+    recipe.set_gain(model, read_checkpoint(out / "filter.pt").get("gain", 0.0))
     return recipe, model
 
 
@@ -174,4 +189,5 @@ def load_filter(folder: Path, size: int | None = None, **options) -> tuple[KITTI
     # Which quantile a member has is no weight, and follows from their number.
     quantiles = {key: value for key, value in model.state_dict().items() if key.endswith(".quantiles")}
     saved["model"] |= quantiles
+    recipe.set_gain(model, saved.get("gain", 0.0))
     return recipe, read_filter(recipe, model, saved), saved["filter"], saved["sensor"]

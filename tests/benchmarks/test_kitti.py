@@ -16,8 +16,9 @@ from benchmarks.kitti.sensors import SENSORS, SensorOfFold
 from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from benchmarks.kitti.study import rows_of
 from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
-from benchmarks.kitti.training import calibration_error, gain_error, run_filter
+from benchmarks.kitti.training import calibration_error, certain_gain, log_gains, run_filter
 from torch_denkf.metrics import dead_reckoning
+from torch_denkf.modules import PairObservation
 from torch_denkf.odometry.batches import ReadingSampler
 from torch_denkf.odometry.streams import all_frames, lose_frames, take_spans
 
@@ -126,7 +127,7 @@ def test_errors_of_a_path_that_is_a_tenth_too_fast():
         assert row["devkit_t_rel_percent"] == pytest.approx(10.1, abs=0.15)  # a segment ends behind 100 m, by a frame
 
 
-def test_gain_error_is_that_of_clean_unseen_drives():
+def test_gains_are_those_of_clean_unseen_drives():
     """Drives at 7 m/s read as 7 e^0.03 and 7 e^-0.04; what a disturbed one reads does not count."""
     parts = with_disturbances([Part(stream) for stream in streams("a", "b")])
     fold = Fold("t", [], parts, [])
@@ -135,7 +136,27 @@ def test_gain_error_is_that_of_clean_unseen_drives():
         off = {"a": 0.03, "b": -0.04}[part.stream.drive] if part.stream.condition == "clean" else 0.5
         read = readings([[7.0 * math.exp(off), 0.0]] * 20)
         base.readings += [(read[:12], read[12:], 1.0)] * 2  # as they are, and mirrored
-    assert gain_error(fold, base) == pytest.approx(((0.03**2 + 0.04**2) / 2) ** 0.5, rel=1e-4)
+    torch.testing.assert_close(log_gains(fold, base), torch.tensor([0.03, -0.04]), rtol=1e-4, atol=0)
+
+
+def test_a_gain_counts_where_drives_agree_on_it():
+    """Student's t of -0.03, -0.01, -0.02, -0.04 is -3.87; the bound for four drives is 3.18, for three 4.30."""
+    assert certain_gain(torch.tensor([-0.03, -0.01, -0.02, -0.04])) == pytest.approx(-0.025)
+    assert certain_gain(torch.tensor([-0.03, -0.01, -0.02])) == 0.0  # t = 3.46
+    assert certain_gain(torch.tensor([0.03, -0.01, -0.02, -0.04])) == 0.0
+    assert certain_gain(torch.tensor([0.03])) == 0.0
+
+
+def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
+    sensor = SENSORS["flow"](facts := Statistics(torch.zeros(2), torch.ones(2), torch.zeros(2), torch.ones(2), 0.1))
+    for name in ("denkf", "dekf", "dukf", "bkf", "dpf_m"):
+        recipe = FILTERS[name](sensor, facts)
+        model = recipe.build()
+        recipe.set_gain(model, math.log(0.9))
+        (h,) = [module for module in model.modules() if isinstance(module, PairObservation)]
+        read = h.module(torch.tensor([10.0, 0.5]))
+        torch.testing.assert_close(read, torch.tensor([9.0, 0.5]))
+        assert "logarithm" not in " ".join(model.state_dict())
 
 
 def test_the_calibration_counts_the_path_and_the_crps_of_the_velocities(monkeypatch):

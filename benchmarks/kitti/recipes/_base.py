@@ -49,8 +49,14 @@ class KITTIRecipe(Recipe):
     def observation(self, **kwargs) -> PairObservation:
         """What is read of pairs of frames: metres by the flow sensor; one that was trained on grey values hedges."""
         if self.flow:
-            return PairObservation([REACH / self.facts.dt, torch.inf], **kwargs)
+            return PairObservation([REACH / self.facts.dt, torch.inf], curve=SpeedGain(), **kwargs)
         return PairObservation(curve=SensorCurve(self.facts.loc, self.facts.scale), **kwargs)
+
+    def set_gain(self, model: Filter, logarithm: float) -> None:
+        """Sets the logarithm of what the flow sensor makes of every speed."""
+        for module in model.modules():
+            if isinstance(module, SpeedGain):
+                module.logarithm.fill_(logarithm)
 
     def transition(self, network: nn.Module) -> SubModel:
         """Known motion of the pose; the velocities walk at random, with a trend."""
@@ -72,6 +78,18 @@ class KITTIRecipe(Recipe):
         names = [name for name in model.module if sensor or name != "sensor"]
         initial = model.initial if start_std is None else self.initial(start_std, "start")
         return Filter(OrderedDict((name, model[name]) for name in names), initial=initial)
+
+
+class SpeedGain(nn.Module):
+    """h of a sensor that reads every speed too slow, or too fast, by the same factor; its logarithm is measured."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("logarithm", torch.zeros(()), persistent=False)  # it lies beside the weights
+
+    def forward(self, velocity: torch.Tensor) -> torch.Tensor:
+        """Predicts (v, theta_dot) ``[*, 2]``."""
+        return velocity * torch.stack([self.logarithm.exp(), torch.ones_like(self.logarithm)])
 
 
 class SensorCurve(nn.Module):
