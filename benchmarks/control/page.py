@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from scipy.stats import trim_mean
 
-from benchmarks.common.arguments import processor
+from benchmarks.common.arguments import command, processor
 from benchmarks.common.intervals import bootstrap_interval
 from benchmarks.common.plots import plt, save
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.control.arms import ARMS
+from benchmarks.control.run import Budget
 from benchmarks.control.shift import NOT_TRAINED
+from benchmarks.control.tasks import TASKS
 
 TITLES = {
     "hike": "Mountain hike",
@@ -83,15 +85,32 @@ def reached(rows: Sequence[dict], task: str, cell: str, arm: str) -> str:
     return "never"
 
 
-def page(rows: Sequence[dict]) -> str:
-    """The tables."""
+def tested(rows: Sequence[dict], task: str) -> list[set[int]]:
+    """For each run of a task, the environment steps after which it was tested."""
+    runs: dict[tuple, set[int]] = {}
+    for row in pick(rows, task=task):
+        if NOT_TRAINED not in row["cell"]:
+            runs.setdefault((row["cell"], row["arm"], row["seed"]), set()).add(row["env_steps"])
+    return list(runs.values())
+
+
+def whole(rows: Sequence[dict], task: str) -> bool:
+    """Whether all runs of a task had the budget that the study gives them."""
+    batch = TASKS[task].count * TASKS[task].steps
+    end = TASKS[task].env_steps // batch * batch
+    return all(max(steps) == end and len(steps) == Budget().tests for steps in tested(rows, task))
+
+
+def page(rows: Sequence[dict], budget: Budget = Budget()) -> str:
+    """The tables; ``budget`` is the runs'."""
     drawn = any(len(noises(rows, task)) > 1 for task in TITLES)
     lines = ["# Policies that read a belief, against policies that remember", ""]
     for task, title in TITLES.items():
         names = arms(rows, task)
         if not names:
             continue
-        lines += [f"## {title}", "", "Return of a test episode: interquartile mean over seeds, 95 % interval.", ""]
+        lines += [f"## {title}", ""]
+        lines += ["Return of a test episode, the higher the better: interquartile mean over seeds, 95 % interval.", ""]
         lines += head("cell", "seeds", *names)
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
@@ -105,11 +124,10 @@ def page(rows: Sequence[dict]) -> str:
             belief = np.array(returns(rows, task, cell, "belief mean"))
             found = [returns(rows, task, cell, other) for other in others]
             lines.append(line(cell, *(_text(belief - other if other else ()) for other in found)))
-        lines += [
-            "",
-            "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
-            "",
-        ]
+        steps = "Thousands of environment steps until the mean return is the LSTM's final one, the fewer the better"
+        counts = {len(tests) for tests in tested(rows, task)}
+        some = f"; a run has {max(counts)} test{'s' * (max(counts) > 1)}" if len(counts) == 1 else ""
+        lines += ["", f"{steps}{some}.", ""]
         learning = [arm for arm in names if arm != "truth"]
         lines += head("cell", *learning)
         for cell in cells(rows, task, trained=True):
@@ -117,12 +135,15 @@ def page(rows: Sequence[dict]) -> str:
         lines += ["", "Seconds of one core for a run, median over cells and seeds.", "", *head(*names)]
         ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
+    planned = budget == Budget() and all(whole(rows, task) for task in {row["task"] for row in rows})
+    size = f"Each test is of {budget.episodes} episodes, in which" if planned or budget != Budget() else "In a test"
+    made = "`python -m benchmarks.control`." if planned else f"`{command('control')}`; the runs had another budget than the study's."
     lines += [
-        "Each test is of 100 episodes, in which a policy takes the mean of its actions. What reads the truth is the",
+        f"{size} a policy takes the mean of its actions. What reads the truth is the",
         "same in all cells of hike and pendulum, and runs in the one without noise.",
         "",
         *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
-        "* Command: `python -m benchmarks.control`. A seed counts where all arms of a cell have run with it.",
+        f"* Command: {made} A seed counts where all arms of a cell have run with it.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",
     ]
     return "\n".join(lines) + "\n"
@@ -134,7 +155,8 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     away = [cell for cell in cells(rows, task) if NOT_TRAINED in cell]
     if not away:
         return []
-    lines = ["", f"Percent of the return with {home} that is lost, with the same seeds.", "", *head("cell", *names)]
+    title = f"Percent of the return with {home} that is lost, with the same seeds. A negative loss is a gain."
+    lines = ["", title, "", *head("cell", *names)]
     for cell in away:
         before, after = ([np.array(returns(rows, task, one, arm)) for arm in names] for one in (home, cell))
         lines.append(
@@ -147,7 +169,7 @@ def _text(values: Sequence[float]) -> str:
     if not len(values):
         return ""
     center, low, high = summary(values)
-    return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
+    return f"{center:z.1f}" if np.isnan(low) else f"{center:z.1f} [{low:z.1f}, {high:z.1f}]"
 
 
 def noises(rows: Sequence[dict], task: str) -> dict[str, float]:

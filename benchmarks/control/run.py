@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict
@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import CatFrames, EnvBase, ExplorationType, InitTracker, TransformedEnv, set_exploration_type
 from torchrl.modules import get_primers_from_module
 
+from benchmarks.control import sac
 from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, Inputs
 from benchmarks.control.inputs import Seen
 from benchmarks.control.learning import Learner, refiltered
@@ -30,6 +31,7 @@ class Budget:
         episodes: of a test.
         members: of an ensemble.
         updates: of a filter, as a share of the task's.
+        every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
     """
 
     env_steps: int | None = None
@@ -37,6 +39,7 @@ class Budget:
     episodes: int = 100
     members: int = 32
     updates: float = 1.0
+    every: int | None = None
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
@@ -84,7 +87,10 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     tests = make_env(task, arm, budget.episodes, cell, 2 * seed + 1, filter)
     seen = env.observation_spec["seen"].shape[-1] if "seen" in arm.keys else 0
     actions = env.full_action_spec["action"].shape[-1]
-    agent = task.agent(arm, Inputs(seen, actions, torch.tensor(task.scale), task.limit), task.settings, batches)
+    settings = task.settings
+    if budget.every is not None and isinstance(settings, sac.Settings):
+        settings = replace(settings, every=budget.every)
+    agent = task.agent(arm, Inputs(seen, actions, torch.tensor(task.scale), task.limit), settings, batches)
     if arm.memory:
         for one in (env, tests):
             one.append_transform(get_primers_from_module(agent.policy))

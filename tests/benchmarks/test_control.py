@@ -14,7 +14,7 @@ from benchmarks.control.arms import ARMS, Inputs
 from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO, ActorHead, Head, Settings
-from benchmarks.control.run import make_env, rollout
+from benchmarks.control.run import Budget, make_env, rollout
 from benchmarks.control.sac import Units
 from benchmarks.control.tasks import TASKS
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
@@ -253,11 +253,11 @@ def test_statistics():
     assert np.isnan(summary([2.0])[1])
 
 
-def rows():
+def rows(ends=(1000, 2000, 3000)):
+    """Three tests or more, of which the last two count."""
     for arm, final in (("LSTM", -20.0), ("belief mean", -10.0), ("truth", -5.0)):
         for seed in range(2):
-            for number, value in enumerate((-40.0, final - 5, final)):
-                steps = 1000 * (number + 1)
+            for steps, value in zip(ends, (*[-40.0] * (len(ends) - 2), final - 5, final), strict=True):
                 entries = {"arm": arm, "seed": seed, "env_steps": steps, "return": value - seed, "wall_s": 1.0}
                 yield {"task": "hike", "cell": "noise 0", **entries}
 
@@ -270,6 +270,31 @@ def test_tables():
     assert "control.png" not in text  # one noise makes no line
     assert "| noise 0 | 10.0 |" in text  # more than the LSTM, with both seeds
     assert "| noise 0 | 2 | -20.5 [-21.0, -20.0] | -10.5 [-11.0, -10.0] | -5.5 [-6.0, -5.0] |" in text
+
+
+def test_the_page_names_the_budget_that_ran(monkeypatch):
+    """Five tests until 98,400 steps, 41 batches of 32 hikes, are the study's; anything else is not called so."""
+    monkeypatch.setattr("sys.argv", ["control", "--smoke"])
+    plain, tiny = "`python -m benchmarks.control`", "`python -m benchmarks.control --smoke`"
+    study = page(list(rows((21600, 40800, 60000, 79200, 98400))))
+    assert plain in study
+    assert "Each test is of 100 episodes" in study
+    assert "a run has 5 tests" in study
+    for other in (page(list(rows())), page(list(rows((40800, 60000, 98400))))):
+        assert plain not in other
+        assert "episodes" not in other
+        assert "a run has 3 tests" in other
+    smoke = page(list(rows()), Budget(episodes=2))
+    assert plain not in smoke
+    assert tiny in smoke
+    assert "Each test is of 2 episodes" in smoke
+    uneven = [row for row in rows() if (row["seed"], row["env_steps"]) != (1, 1000)]
+    assert "a run has" not in page(uneven)
+
+
+def test_zero_has_no_sign():
+    table = [row | {"return": row["return"] if row["arm"] == "LSTM" else -20.04 - 1.005 * row["seed"]} for row in rows()]
+    assert "| noise 0 | 0.0 [0.0, 0.0] |" in page(table)
 
 
 def test_the_picture_is_of_tasks_with_two_noises(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from benchmarks.control.arms import ARMS, Inputs
 from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, noises, page
 from benchmarks.control.run import Budget, cell_name, make_env, run
+from benchmarks.control.sac import Settings
 from benchmarks.control.study import CELLS, Study, arms_of, complete, jobs, part
 from benchmarks.control.tasks import TASKS, Task
 
@@ -69,6 +71,12 @@ class Agent:
 
 class OffPolicy(Agent):
     ON_POLICY = False
+
+
+class Keeper(OffPolicy):
+    def __init__(self, arm, inputs, settings, batches):
+        super().__init__(arm, inputs, settings, batches)
+        self.settings = settings
 
 
 @pytest.fixture
@@ -153,6 +161,15 @@ def test_who_learns_from_random_actions(agent, arm, tiny, monkeypatch):
     anew = [0, 1, 2, 4] if learns and not agent.ON_POLICY else []
     assert agent.last.refilters == anew
     assert [number for number, data in enumerate(agent.last.given) if data.get("anew", None) is not None] == anew
+
+
+@pytest.mark.parametrize(("given", "every"), [(None, 5), (200, 200)])
+def test_a_budget_says_how_often_sac_updates(given, every, tiny, monkeypatch):
+    """It comes with the call, and so reaches processes of their own."""
+    tiny(Keeper)
+    monkeypatch.setitem(TASKS, "tiny", replace(TASKS["tiny"], settings=Settings()))
+    run("tiny", (0.2, 0.0), "last reading", 0, replace(BUDGET, every=given))
+    assert Agent.last.settings == Settings(every=every)
 
 
 @pytest.mark.parametrize("arm", ["belief mean", "belief mean, taught"])
