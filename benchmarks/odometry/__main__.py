@@ -103,12 +103,12 @@ def page(rows: Sequence[dict]) -> str:
         speed = f"{row['frames'] / row['seconds']:.0f}"
         lines.append(line(row["drive"], row["frames"], row["window"], *errors, *devkit, f"{row['scale']:.3f}", speed))
     lines += ["", "A height that is guessed wrong scales the path; means and medians over the drives:", ""]
-    lines += head("height given, m", "m/m, mean", "m/m, median", "deg/m, mean", "length / true")
+    lines += head("height given, m", "m/m, mean", "m/m, median", "deg/m, mean", "deg/m, median", "length / true")
     for height in heights:
         some = [row for row in rows if row["height_m"] == height]
-        way = [row["translation_m_per_m"] for row in some]
-        turn, scale = fmean(row["rotation_deg_per_m"] for row in some), fmean(row["scale"] for row in some)
-        lines.append(line(f"{height:g}", f"{fmean(way):.3f}", f"{median(way):.3f}", f"{turn:.3f}", f"{scale:.3f}"))
+        errors = [[row[key] for row in some] for key in ("translation_m_per_m", "rotation_deg_per_m")]
+        centers = [f"{center(error):.3f}" for error in errors for center in (fmean, median)]
+        lines.append(line(f"{height:g}", *centers, f"{fmean(row['scale'] for row in some):.3f}"))
     return "\n".join(lines) + "\n"
 
 
