@@ -7,6 +7,10 @@ it: ``InitTracker`` marks resets, a primer carries the hidden state through the 
 of time, each of which begins with the hidden state that was collected there. PPO, its settings and the logs are those
 of policy.py.
 
+All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN returns
+NaN without an error. Then append ``torch_denkf.transforms.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
+last reading that arrived, in the place of ``"observation"``.
+
 It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -511, on the belief -188 (one run each).
 """
 

@@ -16,8 +16,8 @@ filter into the policy, where the filter learns from the reward, too.
 # ---------------
 # ``LinearGaussianEnv`` is a torchrl environment that is written in torch, so that gradients can go through it. Its
 # rewards are zero; a transform of ours writes the reward: it is negative, and the farther off the cart is and the
-# stronger the motor pushes, the smaller it is. The last reading is held where none arrives. The state is [position in
-# m, speed in m/s].
+# stronger the motor pushes, the smaller it is. A missing reading is NaN, which a network cannot read: ``HoldReading``
+# writes the last reading that arrived beside it, as ``"held"``. The state is [position in m, speed in m/s].
 
 import matplotlib.pyplot as plt
 import torch
@@ -27,7 +27,7 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.modules import MLP
 from torchrl.modules.utils import get_env_transforms_from_module
 
-from torch_denkf import DEnKF, DEnKFTransform, LinearGaussianEnv
+from torch_denkf import DEnKF, DEnKFTransform, HoldReading, LinearGaussianEnv
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, Select
 from torch_denkf.plots import plot_bands
 
@@ -43,22 +43,6 @@ class Reward(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         off, push = next_tensordict["state"][..., :1], tensordict["action"]
         return next_tensordict.set("reward", -off.square() - 0.1 * push.square())
-
-
-class HoldReading(Transform):
-    """Adds ``"held"``, the last reading that arrived."""
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        reading = next_tensordict["observation"]
-        return next_tensordict.set("held", torch.where(next_tensordict["observed"], reading, tensordict["held"]))
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return tensordict_reset.set("held", tensordict_reset["observation"].nan_to_num(0.0))
-
-    def transform_observation_spec(self, observation_spec):
-        """Adds the reading that is held."""
-        observation_spec["held"] = observation_spec["observation"].clone()
-        return observation_spec
 
 
 def make_env(*transforms: Transform) -> TransformedEnv:

@@ -4,6 +4,7 @@ from torch_denkf.filters._primer import LastAction
 from torch_denkf.transforms.denkf import DEnKFTransform
 from torch_denkf.transforms.disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 from torch_denkf.transforms.flow import OpticalFlow
+from torch_denkf.transforms.hold import HoldReading
 from torch_denkf.transforms.missing import MissingFrames
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Blur",
     "Brightness",
     "DEnKFTransform",
+    "HoldReading",
     "LastAction",
     "MissingFrames",
     "OccludingBox",

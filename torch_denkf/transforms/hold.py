@@ -1,0 +1,103 @@
+"""The last reading that arrived, for what cannot do without one."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from torch_denkf.filters._steps import where_rows
+
+__all__ = ["HoldReading"]
+
+
+class HoldReading(Transform):
+    """Adds the last reading that arrived: what a network without a filter can read where readings are missing.
+
+    A missing reading is NaN or zero. A filter leaves it out; an LSTM that reads NaN returns NaN from then on, without
+    an error. An episode begins with zeros where no reading has arrived yet. Nothing is kept on the transform: the held
+    reading is part of the observation spec and of the state spec, so workers and partial resets carry it, and stored
+    data hold it already.
+
+    Args:
+        in_key: the reading ``[*B, ...]``.
+        observed_key: its mask, ``[*B, 1]``, or that of single components, ``[*B, O]``; True where it has arrived.
+        out_key: where to write the held reading, of the reading's shape.
+
+    Raises:
+        KeyError: if there is no reading or no mask, or if a step's tensordict lacks what was held.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torch_denkf.envs import NoisyPendulumEnv
+        >>> env = TransformedEnv(NoisyPendulumEnv(noise=0.1, missing=0.5), HoldReading())
+        >>> rollout = env.rollout(20)
+        >>> bool(rollout["observation"].isnan().any()), bool(rollout["held"].isnan().any())
+        (True, False)
+    """
+
+    def __init__(
+        self,
+        in_key: NestedKey = "observation",
+        *,
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = "held",
+    ):
+        super().__init__(in_keys=[in_key, observed_key], out_keys=[out_key])
+
+    def _entry(self, tensordict: TensorDictBase, key: NestedKey, cure: str) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            present = sorted(map(str, tensordict.keys(True, True)))
+            raise KeyError(f"HoldReading reads {key!r}, which is not there; there are {present}. {cure}")
+        return value
+
+    def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
+        reading = self._entry(tensordict, self.in_keys[0], "Set in_key=.")
+        cure = "Set observed_key=, or put what writes the mask, as MissingFrames does, before this transform."
+        observed = self._entry(tensordict, self.in_keys[1], cure)
+        observed = observed.reshape(*observed.shape, *(1,) * (reading.ndim - observed.ndim))
+        before = torch.zeros_like(reading) if before is None else before
+        return tensordict.set(self.out_keys[0], torch.where(observed, reading, before))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        before = self._entry(
+            tensordict, self.out_keys[0], "Start from env.reset(), and pass on what step_mdp() returns."
+        )
+        return self._write(next_tensordict, before)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._write(tensordict_reset, None)  # the environment puts back what the other rows held
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        masks = [tensordict.get(key, None) for key in (["_reset"] if self.parent is None else self.parent.reset_keys)]
+        rows = [mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks if mask is not None]
+        before, out = tensordict_reset.get(self.out_keys[0]), self._write(tensordict_reset, None)
+        return out.set(self.out_keys[0], where_rows(torch.stack(rows).any(0), out.get(self.out_keys[0]), before))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Does nothing to data that hold the reading already, as an environment's do.
+
+        Raises:
+            KeyError: if they do not.
+        """
+        self._entry(tensordict, self.out_keys[0], "Append HoldReading to the environment, not to a replay buffer.")
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the held reading."""
+        reading = observation_spec[self.in_keys[0]]
+        observation_spec[self.out_keys[0]] = Unbounded(reading.shape, dtype=reading.dtype, device=reading.device)
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Adds it to the state, by which it reaches workers."""
+        if input_spec.get("full_state_spec", None) is None:
+            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+        held = self.parent.full_observation_spec[self.in_keys[0]]
+        input_spec["full_state_spec"][self.out_keys[0]] = Unbounded(held.shape, dtype=held.dtype, device=held.device)
+        return input_spec
