@@ -58,7 +58,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     """
     env = TransformedEnv(task.world(count, *cell, seed), InitTracker())
     if filter is not None:
-        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys))
+        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys or arm.end_to_end))
     if "seen" in arm.keys:
         env.append_transform(Seen(task.scale[0]))
     if arm.stack > 1:
@@ -84,7 +84,9 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     tests = make_env(task, arm, budget.episodes, cell, 2 * seed + 1, filter)
     seen = env.observation_spec["seen"].shape[-1] if "seen" in arm.keys else 0
     actions = env.full_action_spec["action"].shape[-1]
-    agent = task.agent(arm, Inputs(seen, actions, torch.tensor(task.scale), task.limit), task.settings, batches)
+    inputs = Inputs(seen, actions, torch.tensor(task.scale), task.limit)
+    within = {"filter": filter} if arm.end_to_end else {}
+    agent = task.agent(arm, inputs, task.settings, batches, **within)
     if arm.memory:
         for one in (env, tests):
             one.append_transform(get_primers_from_module(agent.policy))
