@@ -7,7 +7,7 @@ it: ``InitTracker`` marks resets, a primer carries the hidden state through the 
 of time, each of which begins with the hidden state that was collected there. PPO, its settings and the logs are those
 of policy.py.
 
-All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN returns
+All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN writes
 NaN without an error. Then append ``torch_denkf.transforms.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
 last reading that arrived, in the place of ``"observation"``.
 

@@ -21,12 +21,14 @@ class Arm:
         stack: readings side by side.
         memory: ``"lstm"`` or ``"gru"``, or nothing.
         filter: ``"learned"`` from readings, ``"taught"`` with the simulator's states, ``"exact"``, or nothing.
+        end_to_end: whether the loss of the actor trains the filter, too.
     """
 
     keys: tuple[NestedKey, ...]
     stack: int = 1
     memory: str = ""
     filter: str = ""
+    end_to_end: bool = False
 
 
 MEAN, VAR, ENSEMBLE = ("belief", "mean"), ("belief", "var"), ("belief", "ensemble")
@@ -39,6 +41,7 @@ ARMS = {
     "belief mean, spread": Arm((MEAN, VAR), filter="learned"),
     "ensemble": Arm((ENSEMBLE,), filter="learned"),
     "belief mean, taught": Arm((MEAN,), filter="taught"),
+    "belief mean, end to end": Arm((MEAN,), filter="learned", end_to_end=True),
     "Kalman": Arm((MEAN,), filter="exact"),
     "physics": Arm((MEAN,), filter="exact"),
     "truth": Arm(("state",)),

@@ -23,6 +23,7 @@ TITLES = {
     "pendulum": "Pendulum without velocity",
     "cartpole": "Cartpole swing-up without velocities",
 }
+PLANNED = Budget()
 COLUMNS = Columns(
     names=("task", "cell", "arm", "seed", "env_steps", "return", "wall_s"),
     text=("task", "cell", "arm"),
@@ -98,10 +99,10 @@ def whole(rows: Sequence[dict], task: str) -> bool:
     """Whether all runs of a task had the budget that the study gives them."""
     batch = TASKS[task].count * TASKS[task].steps
     end = TASKS[task].env_steps // batch * batch
-    return all(max(steps) == end and len(steps) == Budget().tests for steps in tested(rows, task))
+    return all(max(steps) == end and len(steps) == PLANNED.tests for steps in tested(rows, task))
 
 
-def page(rows: Sequence[dict], budget: Budget = Budget()) -> str:
+def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
     """The tables; ``budget`` is the runs'."""
     drawn = any(len(noises(rows, task)) > 1 for task in TITLES)
     lines = ["# Policies that read a belief, against policies that remember", ""]
@@ -135,9 +136,10 @@ def page(rows: Sequence[dict], budget: Budget = Budget()) -> str:
         lines += ["", "Seconds of one core for a run, median over cells and seeds.", "", *head(*names)]
         ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
-    planned = budget == Budget() and all(whole(rows, task) for task in {row["task"] for row in rows})
-    size = f"Each test is of {budget.episodes} episodes, in which" if planned or budget != Budget() else "In a test"
-    made = "`python -m benchmarks.control`." if planned else f"`{command('control')}`; the runs had another budget than the study's."
+    planned = budget == PLANNED and all(whole(rows, task) for task in {row["task"] for row in rows})
+    size = f"Each test is of {budget.episodes} episodes, in which" if planned or budget != PLANNED else "In a test"
+    made = f"`{command('control')}`; the runs had another budget than the study's."
+    made = "`python -m benchmarks.control`." if planned else made
     lines += [
         f"{size} a policy takes the mean of its actions. What reads the truth is the",
         "same in all cells of hike and pendulum, and runs in the one without noise.",

@@ -6,13 +6,19 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from benchmarks.control.arms import ENSEMBLE, MEMORY, Arm, Inputs, memory
+from torch_denkf.filters import Filter
 
 WIDTH = 64
 
@@ -108,6 +114,8 @@ class PPO:
         inputs: sizes and units of what it reads.
         settings: the task's.
         batches: that will come; the learning rate goes down to 5 % meanwhile.
+        filter: of the environment, which the actor's loss trains, too: it filters slices of time once more, each from
+            the ensemble that was stored there. The critic reads what was believed when the data came.
 
     Attributes:
         actor: writes ``"raw"``.
@@ -117,8 +125,8 @@ class PPO:
 
     ON_POLICY = True  # random actions are not learned from
 
-    def __init__(self, arm: Arm, inputs: Inputs, settings: Settings, batches: int):
-        self.settings, self.slice = settings, settings.slice if arm.memory else 1
+    def __init__(self, arm: Arm, inputs: Inputs, settings: Settings, batches: int, filter: Filter | None = None):
+        self.settings, self.slice = settings, settings.slice if arm.memory or filter is not None else 1
         self.actor, self.critic = networks(arm, inputs)
         clamp = TensorDictModule(lambda raw: inputs.limit * raw.clamp(-1, 1), ["raw"], ["action"])
         self.policy = TensorDictSequential(self.actor, *([self.critic] if arm.memory else []), clamp)
@@ -130,7 +138,7 @@ class PPO:
             deactivate_vmap=True,
         )
         self.loss = ClipPPOLoss(
-            self.actor,
+            self.actor if filter is None else ProbabilisticTensorDictSequential(filter, *self.actor),
             self.critic,
             clip_epsilon=settings.clip,
             entropy_bonus=False,
@@ -138,6 +146,7 @@ class PPO:
             loss_critic_type="l2",
             normalize_advantage=True,
         )
+        self.filtered = [] if filter is None else ["observation", "observed", "action", "belief"]
         self.loss.set_keys(action="raw", sample_log_prob="raw_log_prob")
         self.optimiser = torch.optim.Adam(self.loss.parameters(), lr=settings.lr)
         self.schedule = torch.optim.lr_scheduler.LinearLR(self.optimiser, 1.0, 0.05, batches)
@@ -149,7 +158,7 @@ class PPO:
         data["next", "reward"] = s.reward * data["next", "reward"]
         with torch.no_grad(), set_recurrent_mode(True):
             self.advantage(data)
-        keys = [*self.loss.in_keys, "advantage", "value_target", "is_init"]
+        keys = [*self.loss.in_keys, "advantage", "value_target", "is_init", *self.filtered]
         slices = data.select(*keys, strict=False).exclude("next").reshape(-1, self.slice)
         for _ in range(s.epochs):
             for part in torch.randperm(len(slices)).split(s.minibatch // self.slice):

@@ -61,7 +61,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     """
     env = TransformedEnv(task.world(count, *cell, seed), InitTracker())
     if filter is not None:
-        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys))
+        env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys or arm.end_to_end))
     if "seen" in arm.keys:
         env.append_transform(Seen(task.scale[0]))
     if arm.stack > 1:
@@ -90,7 +90,9 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     settings = task.settings
     if budget.every is not None and isinstance(settings, sac.Settings):
         settings = replace(settings, every=budget.every)
-    agent = task.agent(arm, Inputs(seen, actions, torch.tensor(task.scale), task.limit), settings, batches)
+    inputs = Inputs(seen, actions, torch.tensor(task.scale), task.limit)
+    within = {"filter": filter} if arm.end_to_end else {}
+    agent = task.agent(arm, inputs, settings, batches, **within)
     if arm.memory:
         for one in (env, tests):
             one.append_transform(get_primers_from_module(agent.policy))

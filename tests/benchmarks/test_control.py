@@ -293,7 +293,9 @@ def test_the_page_names_the_budget_that_ran(monkeypatch):
 
 
 def test_zero_has_no_sign():
-    table = [row | {"return": row["return"] if row["arm"] == "LSTM" else -20.04 - 1.005 * row["seed"]} for row in rows()]
+    table = [
+        row | {"return": row["return"] if row["arm"] == "LSTM" else -20.04 - 1.005 * row["seed"]} for row in rows()
+    ]
     assert "| noise 0 | 0.0 [0.0, 0.0] |" in page(table)
 
 
@@ -303,3 +305,22 @@ def test_the_picture_is_of_tasks_with_two_noises(tmp_path):
     assert not (tmp_path / "none.png").exists()
     draw([*table, *({**row, "cell": "noise 0.2"} for row in table if row["arm"] != "truth")], tmp_path / "two.png")
     assert (tmp_path / "two.png").exists()
+
+
+def test_the_actors_loss_filters_slices_from_what_was_stored_and_trains_the_filter():
+    """Without process noise all is determined: the policy is the one that collected, and the ratio is one."""
+    torch.manual_seed(0)
+    task, arm = TASKS["pendulum"], ARMS["belief mean, end to end"]
+    filter = task.unlearned(8)
+    with torch.no_grad():
+        filter["transition"].module["noise"].log_variance.fill_(-60.0)
+    env = make_env(task, arm, 3, (0.2, 0.3), 0, filter)
+    ppo = PPO(arm, Inputs(0, 1, torch.tensor(task.scale), task.limit), task.settings, 1, filter=filter)
+    data = rollout(env, ppo.policy, 80, ExplorationType.RANDOM)
+    said = []
+    ppo.loss.register_forward_hook(lambda *args: said.append(args[-1]["kl_approx"].item()))
+    before = {name: parameter.detach().clone() for name, parameter in filter.named_parameters()}
+    ppo.update(data)
+    assert abs(said[0]) < 1e-4
+    still = {name for name, parameter in filter.named_parameters() if parameter.equal(before[name])}
+    assert still == {"module.transition.module.noise.log_variance"}  # that of e^-60 has no gradient

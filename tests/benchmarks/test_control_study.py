@@ -261,7 +261,10 @@ def fill(folder, wanted):
 
 def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
     files = [job.args[0] for job in jobs(Study(out=tmp_path), 0, Budget())]
-    assert len(files) == len(set(files)) == sum(len(arms_of(task, cell)) for task in CELLS for cell in CELLS[task])
+    apart = sum(map(len, study.APART.values()))  # of the first seeds
+    planned = sum(len(arms_of(task, cell)) for task in CELLS for cell in CELLS[task])
+    assert len(files) == len(set(files)) == planned + apart
+    assert len(list(jobs(Study(out=tmp_path), study.APART_SEEDS, Budget()))) == planned
     for job in jobs(Study(out=tmp_path), 2, BUDGET):
         file, (task, cell, arm, seed, budget) = job.args[0], job.args[1].args
         assert file == part(Study(out=tmp_path), task, cell, arm, seed)

@@ -14,4 +14,4 @@ def test_means_and_medians_of_the_recorded_rows():
     lines = page(rows).splitlines()
     assert "| height given, m | m/m, mean | m/m, median | deg/m, mean | deg/m, median | length / true |" in lines
     assert "| 1.65 | 0.044 | 0.037 | 0.021 | 0.014 | 1.038 |" in lines
-    assert lines.index("| 00 | 200 | 100 | 0.037 | 0.036 | 3.01 | 2.35 | 1.027 | 28 |") < len(lines) - 4
+    assert "| 00 | 200 | 100 | 0.037 | 0.036 | 3.01 | 2.35 | 1.027 | 28 |" in lines

@@ -153,9 +153,9 @@ def test_a_replay_buffer_finds_it_held_already():
 
 def test_what_is_not_there_is_named():
     seen, unseen = frames((1.0, True), (1.0, True))
-    with pytest.raises(KeyError, match="'reading'.*in_key="):
+    with pytest.raises(KeyError, match=r"'reading'.*in_key="):
         HoldReading("reading")._reset(seen, seen)
-    with pytest.raises(KeyError, match="'mask'.*MissingFrames"):
+    with pytest.raises(KeyError, match=r"'mask'.*MissingFrames"):
         HoldReading(observed_key="mask")._reset(seen, seen)
-    with pytest.raises(KeyError, match="'held'.*env.reset"):
+    with pytest.raises(KeyError, match=r"'held'.*env\.reset"):
         HoldReading()._step(seen.exclude("held"), unseen)
