@@ -21,18 +21,14 @@ CELLS = {  # noise of readings, and missing share; those that say most come firs
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
     "cartpole": [(0.1, 0.0)],
 }
-WHOLE = 2  # cells of a task in which all arms run
 READERS = {
     "hike": ("Kalman", *BELIEFS, *MEMORIES),
-    "pendulum": (*BELIEFS, "belief mean, taught", *MEMORIES),
+    "pendulum": (*BELIEFS, "belief mean, taught", "belief mean, end to end", *MEMORIES),
     "cartpole": ("belief mean", "LSTM", "physics", "truth"),
-}  # of a cell; what reads the truth is the same in all cells of a task, and runs in the one without noise
-FEW = ("Kalman", "belief mean", "LSTM", "last reading")  # of them, in further cells
-
-APART = {
-    ("pendulum", (0.2, 0.3)): ("belief mean, end to end",)
-}  # slow ones, of a cell's first seeds; it counts without
-APART_SEEDS = 3
+}  # in the order in which they run; what reads the truth is the same in all cells, and runs in the one without noise
+FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells with all seeds
+MORE_CELLS, MORE_SEEDS = 2, 3  # the others run in a task's first cells with the first seeds,
+ONCE = ("belief mean, end to end",)  # and these, which take long, in its first cell
 
 
 @dataclass(frozen=True)
@@ -47,11 +43,13 @@ class Study:
     smoke: bool = False  # a tiny run of a cell of each task: does it run?
 
 
-def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
-    """The arms that run in a cell."""
-    if cell not in CELLS[task][:WHOLE]:
-        return tuple(arm for arm in READERS[task] if arm in FEW)
-    return (*READERS[task], "truth") if cell == (0.0, 0.0) else READERS[task]
+def arms_of(task: str, cell: tuple[float, float], seed: int) -> tuple[str, ...]:
+    """The arms that run in a cell with a seed."""
+    number = CELLS[task].index(cell)
+    arms = (*READERS[task], "truth") if cell == (0.0, 0.0) else READERS[task]
+    if number >= MORE_CELLS or seed >= MORE_SEEDS:
+        return tuple(arm for arm in arms if arm in FEW)
+    return tuple(arm for arm in arms if number == 0 or arm not in ONCE)
 
 
 def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int) -> Path:
@@ -64,8 +62,7 @@ def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
     """All runs with a seed."""
     for task in study.tasks:
         for cell in CELLS[task][: study.cells]:
-            slow = APART.get((task, cell), ()) if seed < APART_SEEDS else ()
-            for arm in (*arms_of(task, cell), *slow):
+            for arm in arms_of(task, cell, seed):
                 yield partial(once, part(study, task, cell, arm, seed), partial(run, task, cell, arm, seed, budget))
 
 
@@ -75,10 +72,8 @@ def complete(study: Study) -> list[dict]:
     for task in study.tasks:
         for cell in CELLS[task]:
             for seed in range(100):
-                found = [part(study, task, cell, arm, seed) for arm in arms_of(task, cell)]
-                if all(file.exists() for file in found):
-                    slow = [part(study, task, cell, arm, seed) for arm in APART.get((task, cell), ())]
-                    files += [*found, *(file for file in slow if file.exists())]
+                found = [part(study, task, cell, arm, seed) for arm in arms_of(task, cell, seed)]
+                files += found if all(file.exists() for file in found) else []
     return sorted(read_rows(files), key=COLUMNS.order)
 
 

@@ -225,8 +225,9 @@ def run_jobs(
         for name in filters if domain == base.domain else set(filters) & {"denkf"}:
             rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": members_of(name)})
             once(folder / f"{name}-{base.name}-{domain}.json", rows)
-    if "denkf" in filters and training == "sim":
-        once(folder / f"sizes-{base.name}.json", partial(_sizes, base, {**names, "domain": "sim", "filter": "denkf"}))
+    if "denkf" in filters and training != "real_like":
+        own = {**names, "domain": base.domain, "filter": "denkf"}
+        once(folder / f"sizes-{base.name}.json", partial(_sizes, base, own))
 
 
 def members_of(name: str) -> int:

@@ -25,7 +25,7 @@ COLUMNS = Columns(
 FAIRNESS = (
     "All filters of a sensor start from the same sensor's weights and the same learned motion, and learn from the same "
     "windows of its readings with as many updates; each then trains its own copy of the sensor's head. Each has one "
-    "number (a factor on the noise, or tempering of weights) chosen from the same seven values for the coverage on the "
+    "number (a factor on the noise, or tempering of weights) chosen from the same nine values for the coverage on the "
     "same validation demos. 'sensor' is the mean of its samples; where nothing is seen its last reading stays."
 )
 
@@ -98,7 +98,11 @@ def _sizes(rows: Sequence[dict], resized: Sequence[dict]) -> list[str]:
     titles = ("members", "CRPS, validation demos", "joints deg", "end effector cm", "90 % hold", "ms")
     for same in dict.fromkeys(tuple(row[key] for key in keys) for row in resized):
         own = pick(rows, condition="clean", **dict(zip(keys, same, strict=True)))
-        lines += [f"Size of the ensemble, {same[0]} on {same[1]}, clean", "", *head(*titles)]
+        lines += [
+            f"Size of the ensemble, {same[0]} on {same[1]}, {same[2]}, trained {same[3]}, clean",
+            "",
+            *head(*titles),
+        ]
         for size in sorted({row["ensemble_size"] for row in own}):
             at = pick(own, ensemble_size=size)
             covered = over_seeds([{"percent": 100 * row["coverage90"]} for row in at], "percent", "{:.0f} %")
