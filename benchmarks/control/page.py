@@ -62,6 +62,22 @@ def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]
     return [row["return"] for row in last(chosen)]
 
 
+def gains(rows: Sequence[dict], task: str, cell: str, other: str) -> list[float]:
+    """How much more the belief's mean returns than another arm, for each seed that both have."""
+    chosen = (last(pick(rows, task=task, cell=cell, arm=arm)) for arm in ("belief mean", other))
+    belief, less = ({row["seed"]: row["return"] for row in ends} for ends in chosen)
+    return [value - less[seed] for seed, value in belief.items() if seed in less]
+
+
+def seeds(rows: Sequence[dict], task: str, cell: str) -> str:
+    """With how many seeds the arms of a cell have run, from the fewest to the most."""
+    found: dict[str, set[int]] = {}
+    for row in pick(rows, task=task, cell=cell):
+        found.setdefault(row["arm"], set()).add(row["seed"])
+    fewest, most = (choose(map(len, found.values())) for choose in (min, max))
+    return f"{most}" if fewest == most else f"{fewest} to {most}"
+
+
 def cells(rows: Sequence[dict], task: str, trained: bool = False) -> list[str]:
     """Names of a task's cells, in order: all, or those that were trained in."""
     names = dict.fromkeys(row["cell"] for row in pick(rows, task=task))
@@ -115,16 +131,13 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         lines += head("cell", "seeds", *names)
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
-            seeds = {row["seed"] for row in pick(rows, task=task, cell=cell)}  # what reads the truth may have more
-            lines.append(line(cell, len(seeds), *map(_text, found)))
+            lines.append(line(cell, seeds(rows, task, cell), *map(_text, found)))
         lines += lost(rows, task)
         others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
         lines += head("cell", *others)
         for cell in cells(rows, task, trained=True):
-            belief = np.array(returns(rows, task, cell, "belief mean"))
-            found = [returns(rows, task, cell, other) for other in others]
-            lines.append(line(cell, *(_text(belief - other if other else ()) for other in found)))
+            lines.append(line(cell, *(_text(gains(rows, task, cell, other)) for other in others)))
         steps = "Thousands of environment steps until the mean return is the LSTM's final one, the fewer the better"
         counts = {len(tests) for tests in tested(rows, task)}
         some = f"; a run has {max(counts)} test{'s' * (max(counts) > 1)}" if len(counts) == 1 else ""

@@ -13,7 +13,7 @@ import benchmarks.control.run as protocol
 from benchmarks.control import hike, study
 from benchmarks.control.arms import ARMS, Inputs
 from benchmarks.control.learning import Learner, Learning
-from benchmarks.control.page import draw, noises, page
+from benchmarks.control.page import draw, gains, noises, page
 from benchmarks.control.run import Budget, cell_name, make_env, run
 from benchmarks.control.sac import Settings
 from benchmarks.control.study import CELLS, Study, arms_of, complete, jobs, part
@@ -249,8 +249,9 @@ def fill(folder, wanted):
     found = Study(out=folder)
     for task in CELLS:
         for number, cell in enumerate(CELLS[task]):
-            for order, arm in enumerate(arms_of(task, cell)):
-                for seed in range(4):
+            for seed in range(4):
+                for arm in arms_of(task, cell, seed):
+                    order = [*study.READERS[task], "truth"].index(arm)
                     if wanted(task, number, arm, seed):
                         entries = {"arm": arm, "seed": seed, "env_steps": 1000, "return": 100.0 + order, "wall_s": 1.0}
                         file = part(found, task, cell, arm, seed)
@@ -261,10 +262,7 @@ def fill(folder, wanted):
 
 def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
     files = [job.args[0] for job in jobs(Study(out=tmp_path), 0, Budget())]
-    apart = sum(map(len, study.APART.values()))  # of the first seeds
-    planned = sum(len(arms_of(task, cell)) for task in CELLS for cell in CELLS[task])
-    assert len(files) == len(set(files)) == planned + apart
-    assert len(list(jobs(Study(out=tmp_path), study.APART_SEEDS, Budget()))) == planned
+    assert len(files) == len(set(files)) == sum(len(arms_of(task, cell, 0)) for task in CELLS for cell in CELLS[task])
     for job in jobs(Study(out=tmp_path), 2, BUDGET):
         file, (task, cell, arm, seed, budget) = job.args[0], job.args[1].args
         assert file == part(Study(out=tmp_path), task, cell, arm, seed)
@@ -275,15 +273,19 @@ def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
 
 @pytest.mark.parametrize("task", list(CELLS))
 def test_arms_of_cells(task):
-    """All in the first two; then what the page compares. The truth runs in one cell."""
-    first, further = CELLS[task][:2], CELLS[task][2:]
-    for cell in first:
-        assert set(arms_of(task, cell)) - {"truth"} == set(study.READERS[task]) - {"truth"}
-    for cell in further:
-        assert {"belief mean", "LSTM"} <= set(arms_of(task, cell)) < set(study.READERS[task])
-    assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell)] == [
-        first[0] if task == "cartpole" else (0, 0)
-    ]
+    """All in the first two cells with three seeds, slow ones in the first; then what the page compares."""
+    first, further, slow = CELLS[task][:2], CELLS[task][2:], set(study.ONCE)
+    readers = set(study.READERS[task])
+    for seed in range(3):
+        assert set(arms_of(task, first[0], seed)) - {"truth"} == readers - {"truth"}
+        for cell in first[1:]:
+            assert set(arms_of(task, cell, seed)) - {"truth"} == readers - {"truth"} - slow
+    for cell, seed in [*((cell, 0) for cell in further), *((cell, 3) for cell in CELLS[task])]:
+        assert {"belief mean", "LSTM"} <= set(arms_of(task, cell, seed)) <= {*readers, "truth"} & {*study.FEW}
+    for seed in (0, 4):  # the truth runs in one cell
+        assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell, seed)] == [
+            first[0] if task == "cartpole" else (0, 0)
+        ]
 
 
 def test_a_seed_counts_where_all_arms_have_run(tmp_path):
@@ -298,7 +300,7 @@ def test_a_seed_counts_where_all_arms_have_run(tmp_path):
     )
     rows = complete(found)
     assert {(row["cell"], row["seed"]) for row in rows} == {("noise 0.4", 0), ("noise 0.4", 2)}
-    assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0)))
+    assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0), 0))
 
 
 @pytest.mark.parametrize(
@@ -319,6 +321,15 @@ def test_tables_of_what_is_there(wanted, tmp_path, monkeypatch, capsys):
     study.main()
     assert "nan" not in capsys.readouterr().out
     assert all((tmp_path / f"control.{kind}").exists() for kind in ("csv", "md", "png"))
+
+
+def test_arms_with_fewer_seeds_are_compared_seed_by_seed(tmp_path):
+    """Seeds 0 to 3 of the LSTM, 0 to 2 of the GRU: each has as many differences from the belief's mean."""
+    found = fill(tmp_path, lambda task, number, arm, seed: task == "hike" and number == 0)
+    rows = [row | {"return": 10.0 * row["seed"] ** 2 + (row["arm"] == "belief mean")} for row in complete(found)]
+    assert gains(rows, "hike", "noise 0.4", "LSTM") == [1.0] * 4
+    assert gains(rows, "hike", "noise 0.4", "GRU") == [1.0] * 3
+    assert "| noise 0.4 | 3 to 4 | " in page(rows)
 
 
 def test_no_tables_of_nothing(tmp_path, monkeypatch):
