@@ -59,6 +59,13 @@ def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]
     return [row["return"] for row in last(chosen)]
 
 
+def ahead(rows: Sequence[dict], task: str, cell: str, arm: str, other: str) -> list[float]:
+    """How much more an arm returns than another, with each seed that both have."""
+    ends = (last(pick(rows, task=task, cell=cell, arm=name)) for name in (arm, other))
+    own, others = ({row["seed"]: row["return"] for row in end} for end in ends)
+    return [value - others[seed] for seed, value in own.items() if seed in others]
+
+
 def cells(rows: Sequence[dict], task: str, trained: bool = False) -> list[str]:
     """Names of a task's cells, in order: all, or those that were trained in."""
     names = dict.fromkeys(row["cell"] for row in pick(rows, task=task))
@@ -91,20 +98,23 @@ def page(rows: Sequence[dict]) -> str:
         names = arms(rows, task)
         if not names:
             continue
-        lines += [f"## {title}", "", "Return of a test episode: interquartile mean over seeds, 95 % interval.", ""]
+        lines += [
+            f"## {title}",
+            "",
+            "Return of a test episode: interquartile mean over seeds, 95 % interval; (n): of n seeds.",
+            "",
+        ]
         lines += head("cell", "seeds", *names)
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
             seeds = {row["seed"] for row in pick(rows, task=task, cell=cell)}  # what reads the truth may have more
-            lines.append(line(cell, len(seeds), *map(_text, found)))
+            lines.append(line(cell, len(seeds), *(_text(each, len(seeds)) for each in found)))
         lines += lost(rows, task)
         others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
         lines += head("cell", *others)
         for cell in cells(rows, task, trained=True):
-            belief = np.array(returns(rows, task, cell, "belief mean"))
-            found = [returns(rows, task, cell, other) for other in others]
-            lines.append(line(cell, *(_text(belief - other if other else ()) for other in found)))
+            lines.append(line(cell, *(_text(ahead(rows, task, cell, "belief mean", other)) for other in others)))
         lines += [
             "",
             "Thousands of environment steps until the mean return is the LSTM's final one; a run has five tests.",
@@ -143,11 +153,13 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     return lines
 
 
-def _text(values: Sequence[float]) -> str:
+def _text(values: Sequence[float], seeds: int = 0) -> str:
+    """Mean and interval; with the number of values where there are fewer than ``seeds``."""
     if not len(values):
         return ""
     center, low, high = summary(values)
-    return f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
+    text = f"{center:.1f}" if np.isnan(low) else f"{center:.1f} [{low:.1f}, {high:.1f}]"
+    return f"{text} ({len(values)})" if len(values) < seeds else text
 
 
 def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
