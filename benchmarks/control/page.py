@@ -101,7 +101,7 @@ def page(rows: Sequence[dict]) -> str:
         lines += [
             f"## {title}",
             "",
-            "Return of a test episode: interquartile mean over seeds, 95 % interval; (n): of n seeds.",
+            "Return of a test episode: interquartile mean over seeds, 95 % interval; (n): n seeds.",
             "",
         ]
         lines += head("cell", "seeds", *names)
