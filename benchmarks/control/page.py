@@ -62,20 +62,11 @@ def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]
     return [row["return"] for row in last(chosen)]
 
 
-def gains(rows: Sequence[dict], task: str, cell: str, other: str) -> list[float]:
-    """How much more the belief's mean returns than another arm, for each seed that both have."""
-    chosen = (last(pick(rows, task=task, cell=cell, arm=arm)) for arm in ("belief mean", other))
-    belief, less = ({row["seed"]: row["return"] for row in ends} for ends in chosen)
-    return [value - less[seed] for seed, value in belief.items() if seed in less]
-
-
-def seeds(rows: Sequence[dict], task: str, cell: str) -> str:
-    """With how many seeds the arms of a cell have run, from the fewest to the most."""
-    found: dict[str, set[int]] = {}
-    for row in pick(rows, task=task, cell=cell):
-        found.setdefault(row["arm"], set()).add(row["seed"])
-    fewest, most = (choose(map(len, found.values())) for choose in (min, max))
-    return f"{most}" if fewest == most else f"{fewest} to {most}"
+def ahead(rows: Sequence[dict], task: str, cell: str, arm: str, other: str) -> list[float]:
+    """How much more an arm returns than another, with each seed that both have."""
+    ends = (last(pick(rows, task=task, cell=cell, arm=name)) for name in (arm, other))
+    own, others = ({row["seed"]: row["return"] for row in end} for end in ends)
+    return [value - others[seed] for seed, value in own.items() if seed in others]
 
 
 def cells(rows: Sequence[dict], task: str, trained: bool = False) -> list[str]:
@@ -126,18 +117,18 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         names = arms(rows, task)
         if not names:
             continue
-        lines += [f"## {title}", ""]
-        lines += ["Return of a test episode, the higher the better: interquartile mean over seeds, 95 % interval.", ""]
-        lines += head("cell", "seeds", *names)
+        what = "Return of a test episode, the higher the better: interquartile mean over seeds, 95 % interval"
+        lines += [f"## {title}", "", f"{what}; (n): n seeds.", "", *head("cell", "seeds", *names)]
         for cell in cells(rows, task):
             found = [returns(rows, task, cell, arm) for arm in names]
-            lines.append(line(cell, seeds(rows, task, cell), *map(_text, found)))
+            seeds = {row["seed"] for row in pick(rows, task=task, cell=cell)}  # what reads the truth may have more
+            lines.append(line(cell, len(seeds), *(_text(each, len(seeds)) for each in found)))
         lines += lost(rows, task)
         others = [arm for arm in ("LSTM", "GRU", "Kalman", "physics") if arm in names]
         lines += ["", "How much more the belief's mean returns than another arm with the same seed.", ""]
         lines += head("cell", *others)
         for cell in cells(rows, task, trained=True):
-            lines.append(line(cell, *(_text(gains(rows, task, cell, other)) for other in others)))
+            lines.append(line(cell, *(_text(ahead(rows, task, cell, "belief mean", other)) for other in others)))
         steps = "Thousands of environment steps until the mean return is the LSTM's final one, the fewer the better"
         counts = {len(tests) for tests in tested(rows, task)}
         some = f"; a run has {max(counts)} test{'s' * (max(counts) > 1)}" if len(counts) == 1 else ""
@@ -180,11 +171,13 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     return lines
 
 
-def _text(values: Sequence[float]) -> str:
+def _text(values: Sequence[float], seeds: int = 0) -> str:
+    """Mean and interval; with the number of values where there are fewer than ``seeds``."""
     if not len(values):
         return ""
     center, low, high = summary(values)
-    return f"{center:z.1f}" if np.isnan(low) else f"{center:z.1f} [{low:z.1f}, {high:z.1f}]"
+    text = f"{center:z.1f}" if np.isnan(low) else f"{center:z.1f} [{low:z.1f}, {high:z.1f}]"
+    return f"{text} ({len(values)})" if len(values) < seeds else text
 
 
 def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
