@@ -57,8 +57,8 @@ def last(rows: Sequence[dict]) -> list[dict]:
 def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]:
     """The final returns, by seed; of what reads the truth those of another cell where it ran in that one alone."""
     chosen = pick(rows, task=task, cell=cell, arm=arm)
-    if arm == "truth" and not chosen:
-        chosen = pick(rows, task=task, arm=arm)
+    if arm == "truth" and not chosen and NOT_TRAINED not in cell:
+        chosen = [row for row in pick(rows, task=task, arm=arm) if NOT_TRAINED not in row["cell"]]
     return [row["return"] for row in last(chosen)]
 
 
@@ -150,6 +150,7 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         "",
         *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
         f"* Command: {made} A seed counts where all arms of a cell have run with it.",
+        "* Of two or three seeds an interval is about their range.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",
     ]
     return "\n".join(lines) + "\n"

@@ -16,6 +16,7 @@ from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, noises, page
 from benchmarks.control.run import Budget, cell_name, make_env, run
 from benchmarks.control.sac import Settings
+from benchmarks.control.shift import LEFT, SHIFTED
 from benchmarks.control.study import CELLS, Study, arms_of, complete, jobs, part
 from benchmarks.control.tasks import TASKS, Task
 
@@ -338,3 +339,18 @@ def test_the_truth_of_another_cell_brings_no_seeds(tmp_path):
     assert noises(complete(found), "hike") == {"noise 0": 0.0, "noise 0.4": 0.4}
     draw(complete(found), tmp_path / "picture.png")
     assert protocol.cell_name((0.2, 0.3)) == "noise 0.2, 30% missing"
+
+
+def test_what_reads_the_truth_is_not_there_where_a_filter_keeps_its_r():
+    """The truth has rows of both noises, but none of "R as learned": it has no R."""
+    cells = {"noise 0.1": 800.0, SHIFTED.format(0.3): 700.0, LEFT.format(0.3): 600.0}
+    rows = [
+        {"task": "cartpole", "cell": cell, "arm": arm, "seed": seed, "env_steps": 9, "return": value, "wall_s": 1.0}
+        for cell, value in cells.items()
+        for arm in ("belief mean", "LSTM", "truth")
+        for seed in range(2)
+        if arm == "belief mean" or cell != LEFT.format(0.3)
+    ]
+    lines = page(rows).splitlines()
+    (left,) = [line for line in lines if line.startswith(f"| {LEFT.format(0.3)} |") and "25.0" in line]
+    assert [part.split()[:1] for part in left.split("|")[2:-1]] == [[], ["25.0"], []]
