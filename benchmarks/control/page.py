@@ -187,21 +187,21 @@ def noises(rows: Sequence[dict], task: str) -> dict[str, float]:
 
 
 def draw(rows: Sequence[dict], file: Path) -> None:
-    """Return against the noise of the readings, where all come: a line for each arm of tasks that have two noises."""
+    """Return against the noise of the readings, where all come: of arms that ran with each noise, if there are two."""
     tasks = [task for task in TITLES if len(noises(rows, task)) > 1]
     if not tasks:
         return
     figure, axes = plt.subplots(1, len(tasks), figsize=(6.5 * len(tasks), 4.5), squeeze=False, layout="constrained")
     for axis, task in zip(axes[0], tasks, strict=True):
-        for number, arm in enumerate(arms(rows, task)):
+        for arm in arms(rows, task):
             chosen = [(noise, returns(rows, task, cell, arm)) for cell, noise in noises(rows, task).items()]
-            points = sorted((noise, *summary(found)) for noise, found in chosen if found)
-            if not points:  # it ran only where readings are missing
+            if not all(found for _, found in chosen):
                 continue
+            points = sorted((noise, *summary(found)) for noise, found in chosen)
             noise, center, low, high = np.array(points).T
             style = "--" if arm in ("truth", "Kalman") else "-"
-            axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{number}", label=arm)
-            axis.fill_between(noise, low, high, color=f"C{number}", alpha=0.12, linewidth=0)
+            axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{list(ARMS).index(arm)}", label=arm)
+            axis.fill_between(noise, low, high, color=f"C{list(ARMS).index(arm)}", alpha=0.12, linewidth=0)
         axis.set(title=TITLES[task], xlabel="standard deviation of a reading", ylabel="return of an episode")
         axis.legend(fontsize=8)
     save(figure, file)
