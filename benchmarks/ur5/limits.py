@@ -17,9 +17,10 @@ from torch import Tensor, nn
 from benchmarks.common.tables import head, line, write_page
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.evaluation import errors
-from benchmarks.ur5.memory import START, Memory
 from benchmarks.ur5.memory import UPDATES as MEMORY_UPDATES
+from benchmarks.ur5.memory import Memory
 from benchmarks.ur5.readings import read_all
+from benchmarks.ur5.recipes._base import INITIAL
 from benchmarks.ur5.sensors import MEMBERS, WRIST, Preset
 from benchmarks.ur5.study import Base, Study
 from torch_denkf.functional import crps_gaussian, kalman_predict, kalman_update
@@ -145,7 +146,7 @@ def limits(
 ) -> list[dict]:
     """Errors of readings and of all three kinds on ``test``, fitted on ``tune``; both readings and truth."""
     readings, truth = test
-    std = START * tune[1].flatten(0, 1).std(0)
+    std = INITIAL * tune[1].flatten(0, 1).std(0)
     rows = [{"method": "the readings", **errors(readings, truth)}]
     for lags in LAGS:
         rows.append({"method": f"regression on {lags}", **errors(regress(tune, readings, lags), truth)})

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from benchmarks.ur5.recipes._base import INITIAL
+
 UNITS, UPDATES, LENGTH, BATCH = 48, 500, 150, 32
-START = 0.05  # standard deviation of the belief at a demo's start, in those of the training states
 
 
 class Memory(nn.Module):
@@ -38,7 +39,7 @@ class Memory(nn.Module):
             rows = torch.randint(len(truth), (BATCH,))
             first = int(torch.randint(truth.shape[1] - length + 1, ()))
             seen, true = readings[rows, first : first + length], truth[rows, first : first + length]
-            start = true[:, 0] + START * self.scale * torch.randn(true[:, 0].shape)
+            start = true[:, 0] + INITIAL * self.scale * torch.randn(true[:, 0].shape)
             correction, log_size = self._say(seen, start)
             # The likelihood of a Laplace distribution: absolute errors are what the table counts.
             loss = (((true - seen) / self.error - correction).abs() / log_size.exp() + log_size).mean()
