@@ -182,14 +182,17 @@ def test_who_is_taught(arm, tiny, monkeypatch):
     assert taught == [arm == "belief mean, taught"]
 
 
-@pytest.mark.parametrize("arm", list(ARMS))
-@pytest.mark.parametrize("task", list(TASKS))
+@pytest.mark.parametrize(
+    ("task", "arm"),
+    [
+        (task, arm)
+        for task in TASKS
+        for arm in (study.READERS[task] if task == "cartpole" else ARMS)
+        if ARMS[arm].filter != "exact" or TASKS[task].exact is not None
+    ],
+)
 def test_only_one_arm_reads_the_truth(task, arm):
     world, reader = TASKS[task], ARMS[arm]
-    if reader.filter == "exact" and world.exact is None:
-        pytest.skip("no exact filter of the pendulum")
-    if task == "cartpole" and arm not in study.READERS[task]:
-        pytest.skip("not an arm of the cartpole")
     filter = world.exact(0.2) if reader.filter == "exact" else world.unlearned(4) if reader.filter else None
     env = make_env(world, reader, 2, (0.2, 0.0), 0, filter)
     seen = env.observation_spec["seen"].shape[-1] if "seen" in reader.keys else 0
