@@ -5,13 +5,13 @@
 Actor and critic share an ``LSTMModule`` of 64 units that reads the encoder and the last torque. What torchrl needs for
 it: ``InitTracker`` marks resets, a primer carries the hidden state through the environment, and the loss is fed slices
 of time, each of which begins with the hidden state that was collected there. PPO, its settings and the logs are those
-of policy.py.
+of policy.py, but for a learning rate three times as large: at that of policy.py this LSTM returns -511.
 
 All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN writes
 NaN without an error. Then append ``torch_denkf.transforms.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
 last reading that arrived, in the place of ``"observation"``.
 
-It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -511, on the belief -188 (one run each).
+It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -236, on the belief -188 (one run each).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> None:
         env.append_transform(CatTensors(["observation", ("previous", "action")], "seen", del_keys=False))
         return env.append_transform(memory.make_tensordict_primer())
 
-    print(f"return with an LSTM: {ppo(make_env, actor, critic, args, slice_length=40):.0f}")
+    print(f"return with an LSTM: {ppo(make_env, actor, critic, args, slice_length=40, lr=3e-3):.0f}")
 
 
 if __name__ == "__main__":

@@ -23,8 +23,11 @@ def parse(options: type[T], arguments: Sequence[str] | None = None) -> T:
     The matrices of the studies are small: more threads would only wait for each other.
     """
     torch.set_num_threads(1)
-    program = f"python -m {options.__module__.rpartition('.')[0]}"
-    return tyro.cli(options, prog=program, args=arguments, config=CONFIG, description=inspect.getdoc(options))
+    running = sys.modules["__main__"].__spec__ if options.__module__ == "__main__" else None
+    name = running.name.removesuffix(".__main__") if running else options.__module__.rpartition(".")[0]
+    return tyro.cli(
+        options, prog=f"python -m {name}", args=arguments, config=CONFIG, description=inspect.getdoc(options)
+    )
 
 
 def run_one(commands: dict[str, type[Callable[[], None]]], arguments: Sequence[str] | None = None) -> None:

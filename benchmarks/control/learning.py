@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torch_denkf.filters import DEnKF, Filter
@@ -24,28 +24,40 @@ class Learning:
     """Of a filter.
 
     Attributes:
-        window: steps of a window that is learned from.
+        window: steps of a window that is learned from; ``None`` for whole episodes, which begin as the filter's own do.
         windows: in an update.
         first: updates before the policy moves, on one batch of random actions.
         further: updates after each of the policy's batches.
         noise_lr: learning rate of the noises' logarithms; that of the rest is 1e-2.
         pieces: windows that an episode is cut into, if more than one; otherwise windows begin anywhere in it.
+            With ``window=None`` one.
         within: pieces with a larger reading are left out.
+        guess: whether the readings' noise begins at the value that :func:`between` finds in the first episodes, and not
+            at the filter's own.
+
+    Raises:
+        ValueError: on pieces of whole episodes.
     """
 
-    window: int = 16
+    window: int | None = 16
     windows: int = 32
     first: int = 150
     further: int = 10
     noise_lr: float = 3e-2
     pieces: int = 1
     within: float = math.inf
+    guess: bool = False
+
+    def __post_init__(self):
+        if self.window is None and self.pieces > 1:
+            raise ValueError(f"window=None takes whole episodes: give pieces=1, not {self.pieces}, or a window's steps")
 
 
 class Learner:
     """Trains a filter on random windows of a replay buffer of episodes.
 
-    A window begins anywhere in an episode, where little is known: its filter has the same parts, and a wide prior.
+    A window that begins anywhere in an episode, where little is known, has a filter of the same parts with a wide
+    prior. A whole episode has the filter's own start.
 
     Args:
         filter: trained in place.
@@ -64,7 +76,8 @@ class Learner:
         taught: bool = False,
     ):
         self.filter, self.length, self.settings = filter, settings.window, settings
-        start = GaussianPrior(*prior, ensemble_size=filter.initial.ensemble_size)
+        members = filter.initial.ensemble_size
+        start = filter.initial if settings.window is None else GaussianPrior(*prior, ensemble_size=members)
         parts = {name: filter[name] for name in PARTS}
         within = DEnKF(sensor=None, **parts, initial=start, update_at_reset=True)
         scale = torch.tensor(prior[1])
@@ -80,6 +93,10 @@ class Learner:
     def add(self, data: TensorDict) -> None:
         """Keeps episodes ``[B, T]``."""
         data = data.select("observation", "observed", "action", "state")
+        if self.settings.guess and not len(self.episodes):
+            own, found = self.filter["noise"].log_variance, between(data["observation"]).log()
+            with torch.no_grad():
+                own.copy_(torch.where(found.isnan(), own, found))  # NaN where no two neighbouring readings came
         if self.settings.pieces > 1:
             data = data[:, : self.settings.pieces * self.length].reshape(-1, self.length)
             data = data[(data["observation"].abs() <= self.settings.within).all(-1).all(-1)]
@@ -90,8 +107,9 @@ class Learner:
         value = torch.zeros(())
         for _ in range(updates):
             episodes = self.episodes.sample()
-            start = torch.randint(episodes.shape[1] - self.length + 1, ())
-            value = sum(self.loss(episodes[:, start : start + self.length]).values())
+            length = self.length or episodes.shape[1]
+            start = torch.randint(episodes.shape[1] - length + 1, ())
+            value = sum(self.loss(episodes[:, start : start + length]).values())
             self.optimiser.zero_grad()
             value.backward()
             nn.utils.clip_grad_norm_(self.filter.parameters(), 1.0)
@@ -101,6 +119,14 @@ class Learner:
                 for log_variance in self.noises:
                     log_variance.clamp_(min=2 * math.log(LEAST))
         return value.item()
+
+
+def between(readings: Tensor) -> Tensor:
+    """The readings' noise as a variance ``[O]``: half of the mean square difference of neighbours in ``[B, T, O]``.
+
+    The true value's own mean square step adds half of itself. NaN where no two neighbouring readings came.
+    """
+    return (readings.diff(dim=1).square().nanmean((0, 1)) / 2).clamp_min(LEAST**2)
 
 
 def refiltered(filter: Filter, data: TensorDict) -> TensorDict:

@@ -129,7 +129,7 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         lines += head("cell", *others)
         for cell in cells(rows, task, trained=True):
             lines.append(line(cell, *(_text(ahead(rows, task, cell, "belief mean", other)) for other in others)))
-        steps = "Thousands of environment steps until the mean return is the LSTM's final one, the fewer the better"
+        steps = "Thousands of environment steps until the interquartile mean is the LSTM's final one; fewer is better"
         counts = {len(tests) for tests in tested(rows, task)}
         some = f"; a run has {max(counts)} test{'s' * (max(counts) > 1)}" if len(counts) == 1 else ""
         lines += ["", f"{steps}{some}.", ""]
@@ -150,7 +150,6 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         "",
         *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
         f"* Command: {made} A seed counts where all arms of a cell have run with it.",
-        "* Of two or three seeds an interval is about their range.",
         f"* Hardware: {processor()}; torch {torch.__version__}.",
     ]
     return "\n".join(lines) + "\n"

@@ -11,12 +11,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import CatFrames, EnvBase, ExplorationType, InitTracker, TransformedEnv, set_exploration_type
 from torchrl.modules import get_primers_from_module
 
-from benchmarks.control import sac
+from benchmarks.control import ppo, sac
 from benchmarks.control.arms import ARMS, ENSEMBLE, Arm, Inputs
 from benchmarks.control.inputs import Seen
 from benchmarks.control.learning import Learner, refiltered
 from benchmarks.control.shift import LEFT, SHIFTED, told
-from benchmarks.control.tasks import TASKS, Task
+from benchmarks.control.tasks import RATES, TASKS, Task
 from torch_denkf.filters import Filter
 from torch_denkf.transforms import DEnKFTransform
 
@@ -26,6 +26,7 @@ class Budget:
     """What all arms of all tasks may use.
 
     Attributes:
+        rate: factor on the task's learning rate of PPO; ``None`` for what the search chose for the arm.
         env_steps: in the place of the task's; ``None`` for those.
         tests: in a run, evenly spaced.
         episodes: of a test.
@@ -34,6 +35,7 @@ class Budget:
         every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
     """
 
+    rate: float | None = None
     env_steps: int | None = None
     tests: int = 5
     episodes: int = 100
@@ -88,8 +90,11 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     seen = env.observation_spec["seen"].shape[-1] if "seen" in arm.keys else 0
     actions = env.full_action_spec["action"].shape[-1]
     settings = task.settings
-    if budget.every is not None and isinstance(settings, sac.Settings):
-        settings = replace(settings, every=budget.every)
+    if isinstance(settings, sac.Settings):
+        settings = replace(settings, every=budget.every or settings.every)
+    elif isinstance(settings, ppo.Settings):
+        rate = RATES.get((task_name, arm_name), 1.0) if budget.rate is None else budget.rate
+        settings = replace(settings, lr=rate * settings.lr)
     inputs = Inputs(seen, actions, torch.tensor(task.scale), task.limit)
     within = {"filter": filter} if arm.end_to_end else {}
     agent = task.agent(arm, inputs, settings, batches, **within)

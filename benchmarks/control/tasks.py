@@ -59,7 +59,7 @@ TASKS = {
         scale=(0.2, 0.2),
         prior=((0.8, 0.8), (0.8, 0.8)),
         settings=ppo.Settings(gamma=0.99, lmbda=0.95, minibatch=300, slice=25, lr=5e-4),
-        learning=Learning(),
+        learning=Learning(window=None, first=60, further=4, guess=True),
     ),
     "pendulum": Task(
         pendulum.world,
@@ -88,4 +88,9 @@ TASKS = {
         env_steps=80_000,
         shift=0.3,
     ),
+}
+
+RATES = {  # of PPO: factors on a task's learning rate, which the search chose for these arms; 1 for the others
+    **dict.fromkeys([("hike", arm) for arm in ("belief mean", "belief mean, spread", "ensemble", "last reading")], 0.3),
+    **dict.fromkeys([("pendulum", arm) for arm in ("LSTM", "GRU", "last reading", "four readings")], 3.0),
 }

@@ -1,9 +1,11 @@
 """What the studies share: options, jobs that are done once, rows that survive their file."""
 
 import json
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,6 +33,21 @@ def test_options_of_the_ur5_study(capsys):
     with pytest.raises(SystemExit):
         parse(UR5, ["--filters", "nonsense"])
     assert "nonsense" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file", ["benchmarks.study.search", "benchmarks.study.search.__main__"])
+def test_a_study_is_called_as_it_was_run(file, capsys, monkeypatch):
+    @dataclass
+    class Options:
+        """Finds."""
+
+        __module__ = "__main__"
+        seeds: int = 1
+
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", SimpleNamespace(name=file))
+    with pytest.raises(SystemExit):
+        parse(Options, ["--help"])
+    assert "usage: python -m benchmarks.study.search [" in capsys.readouterr().out
 
 
 def test_smoke_alone_runs_all_commands():

@@ -9,15 +9,13 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
-from benchmarks.control import hike, pendulum
+from benchmarks.control import hike
 from benchmarks.control.arms import ARMS, Inputs
-from benchmarks.control.learning import Learner, Learning
 from benchmarks.control.page import draw, interquartile_mean, page, reached, summary
 from benchmarks.control.ppo import PPO, ActorHead, Head, Settings
 from benchmarks.control.run import Budget, make_env, rollout
 from benchmarks.control.sac import Units
 from benchmarks.control.tasks import TASKS
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 
 
 def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
@@ -202,46 +200,6 @@ def test_ppo_raises_the_reward():
     assert loc[1].abs() < 0.2
     assert ppo.optimiser.param_groups[0]["lr"] == pytest.approx(0.05 * 1e-3)
     assert ppo.loss.clip_epsilon.item() == pytest.approx(0.2)
-
-
-def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter():
-    """On the hike: the innovations' likelihood within 0.04 nats a reading of the exact one's, from over 0.1."""
-    torch.manual_seed(0)
-    learned, exact = hike.unlearned_filter(32), hike.exact_filter(0.2)
-    learner = Learner(learned, TASKS["hike"].prior, 64, Learning())
-    learner.add(hike.MountainHike(64, 0.2, seed=0).rollout(hike.STEPS))
-    test = hike.MountainHike(200, 0.2, seed=1).rollout(hike.STEPS).exclude("next")
-
-    def score(filter, Loss):
-        zeros = {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0}
-        with torch.no_grad():
-            return Loss(filter, **zeros)(test)["loss_nll"].item()
-
-    best, before = score(exact, GaussianLoss), score(learned, DEnKFLoss)
-    learner.update(300)
-    after = score(learned, DEnKFLoss)
-    assert best < after < best + 0.04
-    assert before > best + 0.1
-    strides = learned["transition"].module["transition"].module.weight[:, 2:]
-    torch.testing.assert_close(strides, hike.STRIDE * torch.eye(2), atol=0.02, rtol=0)
-
-
-def test_a_taught_filter_learns_the_pendulum():
-    """Half of the error of the velocity that the untaught filter has."""
-    torch.manual_seed(0)
-    filter = pendulum.unlearned_filter(16)
-    learner = Learner(filter, TASKS["pendulum"].prior, 16, Learning(), taught=True)
-    learner.add(pendulum.world(16, 0.1, 0.0, 0).rollout(100))
-    test = pendulum.world(16, 0.1, 0.0, 1).rollout(100).exclude("next")
-
-    def error():
-        with torch.no_grad():
-            out = filter.sequence(test.copy())
-        return (out["belief", "mean"] - out["state"])[:, 10:, 2].square().mean().sqrt().item()
-
-    before = error()
-    learner.update(60)
-    assert error() < 0.5 * before
 
 
 def test_statistics():

@@ -254,7 +254,7 @@ def fill(folder, wanted):
     for task in CELLS:
         for number, cell in enumerate(CELLS[task]):
             for seed in range(4):
-                for order, arm in enumerate(arms_of(task, cell, seed)):
+                for order, arm in enumerate(arms_of(task, cell)):
                     if wanted(task, number, arm, seed):
                         entries = {"arm": arm, "seed": seed, "env_steps": 1000, "return": 100.0 + order, "wall_s": 1.0}
                         file = part(found, task, cell, arm, seed)
@@ -265,7 +265,7 @@ def fill(folder, wanted):
 
 def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
     files = [job.args[0] for job in jobs(Study(out=tmp_path), 0, Budget())]
-    assert len(files) == len(set(files)) == sum(len(arms_of(task, cell, 0)) for task in CELLS for cell in CELLS[task])
+    assert len(files) == len(set(files)) == sum(len(arms_of(task, cell)) for task in CELLS for cell in CELLS[task])
     for job in jobs(Study(out=tmp_path), 2, BUDGET):
         file, (task, cell, arm, seed, budget) = job.args[0], job.args[1].args
         assert file == part(Study(out=tmp_path), task, cell, arm, seed)
@@ -274,16 +274,34 @@ def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
     assert set(first) == {("pendulum", (0.2, 0.3))}
 
 
+def test_all_runs_are_in_one_list_seed_after_seed(tmp_path, monkeypatch):
+    """The same ones with each of five seeds; all are there before any is made, so that no process waits for another."""
+    lists = []
+    monkeypatch.setattr(study, "side_by_side", lambda calls, processes, title: lists.append((calls, processes)))
+    monkeypatch.setattr("sys.argv", ["control", "--processes", "3", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match="no cell"):
+        study.main()
+    ((calls, processes),) = lists
+    assert processes == 3
+    planned = [job.args[0] for seed in range(5) for job in jobs(Study(out=tmp_path), seed, Budget())]
+    assert [call.args[0] for call in calls] == planned
+    assert {call.args[1].args[-1] for call in calls} == {Budget()}
+    cells = [(file.stem.rpartition("-")[2], *file.parts[-3:-1]) for file in planned]  # each once, and not in between
+    assert [one for one, before in zip(cells, [None, *cells], strict=False) if one != before] == list(
+        dict.fromkeys(cells)
+    )
+
+
 @pytest.mark.parametrize("task", list(CELLS))
 def test_arms_of_cells(task):
-    """All in the first two, one that is slow in the first alone; then what the page compares, as with later seeds."""
+    """All in the first two, one that is slow in the first alone; then what the page compares."""
     first, further, slow = CELLS[task][:2], CELLS[task][2:], {"belief mean, end to end"}
     for cell in first:
-        arms = set(arms_of(task, cell, 2)) - {"truth"}
+        arms = set(arms_of(task, cell)) - {"truth"}
         assert arms == set(study.READERS[task]) - {"truth"} - (set() if cell == first[0] else slow)
-    for arms in [arms_of(task, cell, 0) for cell in further] + [arms_of(task, cell, 3) for cell in CELLS[task]]:
-        assert {"belief mean", "LSTM"} <= set(arms) <= set(study.FEW)
-    assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell, 4)] == [
+    for cell in further:
+        assert {"belief mean", "LSTM"} <= set(arms_of(task, cell)) <= set(study.FEW)
+    assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell)] == [
         first[0] if task == "cartpole" else (0, 0)
     ]
 
@@ -300,7 +318,7 @@ def test_a_seed_counts_where_all_arms_have_run(tmp_path):
     )
     rows = complete(found)
     assert {(row["cell"], row["seed"]) for row in rows} == {("noise 0.4", 0), ("noise 0.4", 2)}
-    assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0), 0))
+    assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0)))
 
 
 @pytest.mark.parametrize(
@@ -338,7 +356,7 @@ def test_the_truth_of_another_cell_brings_no_seeds(tmp_path):
     columns = next(line.strip("| ").split(" | ") for line in lines if line.startswith("| cell | seeds"))
     line = next(line.strip("| ").split(" | ") for line in lines if line.startswith("| noise 0.4 | "))
     assert line[1] == "2"
-    assert line[columns.index("truth")].startswith("108.0 ")  # the ninth arm without noise
+    assert line[columns.index("truth")] == "108.0"  # the ninth arm without noise
     assert noises(complete(found), "hike") == {"noise 0": 0.0, "noise 0.4": 0.4}
     draw(complete(found), tmp_path / "picture.png")
     assert protocol.cell_name((0.2, 0.3)) == "noise 0.2, 30% missing"
