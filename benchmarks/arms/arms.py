@@ -33,6 +33,10 @@ class Arm:
     actions: int
     stiffness: float  # of the controller: action a rad
     damping: float  # action a rad/s
+    torques: tuple[float, ...]  # of full actions, N m
+    view: float  # from the root, in the middle of a picture, to its side, m
+    ahead: float = 0.0  # direction of the links where all angles are 0, rad
+    weights: tuple[float, ...] = (0.0, 0.0)  # torque of each link and of what it carries, when it lies flat, N m
 
     @property
     def joints(self) -> int:
@@ -52,10 +56,20 @@ class Arm:
         cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
+    def places(self, angles: Tensor) -> Tensor:
+        """Where the links of angles ``[*, J]`` end, from the root, in the plane of motion, m ``[*, J, 2]``."""
+        turned, links = self.ahead + angles.cumsum(-1), torch.tensor(self.links)
+        return torch.stack([links * turned.cos(), links * turned.sin()], -1).cumsum(-2)
+
+    def angles(self, places: Tensor) -> Tensor:
+        """The angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
+        x, y = torch.cat([places[..., :1, :], places.diff(dim=-2)], -2).unbind(-1)
+        turned = torch.atan2(y, x) - self.ahead
+        return wrap(torch.cat([turned[..., :1], turned.diff(dim=-1)], -1))
+
     def tip(self, angles: Tensor) -> Tensor:
-        """Where the chain of links ends, in the plane of motion, m ``[*, 2]``."""
-        turned, links = angles.cumsum(-1), torch.tensor(self.links)
-        return torch.stack([(links * turned.cos()).sum(-1), (links * turned.sin()).sum(-1)], -1)
+        """Where the last link ends, m ``[*, 2]``."""
+        return self.places(angles)[..., -1, :]
 
     def goal(self, emitted: TensorDictBase) -> Tensor:
         """The joint angles to go to, at the start of an episode."""
@@ -69,8 +83,15 @@ class Arm:
         shoulder = torch.atan2(target[..., 1], target[..., 0]) - torch.atan2(b * wrist.sin(), a + b * wrist.cos())
         return torch.stack([shoulder, wrist], -1)
 
+    def hold(self, angles: Tensor) -> Tensor:
+        """The action that holds the arm against gravity, of angles ``[*, J]``; angles are 0 where a link stands up."""
+        flat = torch.tensor(self.weights) * angles.cumsum(-1).sin()
+        return -flat.flip(-1).cumsum(-1).flip(-1) / torch.tensor(self.torques)  # a joint carries all that follows
+
     def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
-        """Proportional to the angles' errors, damped: the policy, whatever its estimate of the state comes from.
+        """The policy, whatever its estimate of the state comes from.
+
+        Proportional to the angles' errors, damped, and what holds the arm at its goal.
 
         With ``explore`` random actions come on top, the larger the later the arm stands in the batch; an arm at rest
         has to be learned, too.
@@ -79,15 +100,27 @@ class Arm:
         error = torch.cat(
             [wrap(goal - angles)[..., :1], (goal - angles)[..., 1:]], -1
         )  # only the first turns all round
-        action = self.stiffness * error - self.damping * velocity
+        action = self.hold(goal) + self.stiffness * error - self.damping * velocity
         if explore:
             action = action + explore * torch.linspace(0, 1, len(action)).unsqueeze(-1) * torch.randn_like(action)
         return nn.functional.pad(action, (0, self.actions - self.joints)).clamp(-1, 1)  # the grip stays as it is
 
 
 ARMS = {
-    "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3),
-    "manipulator": Arm("manipulator", "bring_ball", (0.18, 0.15, 0.12, 0.09), 0.01, 5, 1.5, 0.15),
+    "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3, (0.05, 0.05), 0.3065),
+    "manipulator": Arm(
+        domain="manipulator",
+        task="bring_ball",
+        links=(0.18, 0.15, 0.12, 0.09),
+        dt=0.01,
+        actions=5,
+        stiffness=1.5,
+        damping=0.15,
+        torques=(12.0, 8.0, 4.0, 2.0),
+        view=0.5587,
+        ahead=torch.pi / 2,
+        weights=(0.3833, 0.1662, 0.0617, 0.0145),
+    ),
 }
 
 
@@ -142,27 +175,28 @@ class Average(ObservationTransform):
         return observation_spec
 
 
-class HoldReading(Transform):
+class HoldAngles(Transform):
     """Writes ``"held"``: the last reading that was there, and the mean of its differences over the last five or so."""
 
     def __init__(self, arm: Arm, in_key):
         super().__init__(in_keys=[in_key], out_keys=["held"])
         self.arm = arm
 
-    def _reading(self, tensordict: TensorDictBase) -> Tensor:
+    def _angles(self, tensordict: TensorDictBase) -> Tensor:
         reading = tensordict[self.in_keys[0]]
-        reading = reading.mean(-2) if reading.ndim > tensordict.ndim + 1 else reading  # of a sensor's samples
-        return nn.functional.pad(reading, (0, self.arm.joints))  # at rest
+        if self.in_keys[0] == "reading":
+            return self.arm.split(nn.functional.pad(reading, (0, self.arm.joints)))[0]
+        return self.arm.angles(reading.unflatten(-1, (-1, 2)))  # of places
 
     def _step(self, tensordict, next_tensordict):
         before, velocity = self.arm.split(tensordict["held"])
-        now = self.arm.split(self._reading(next_tensordict))[0]
-        angles = torch.where(next_tensordict["observed"], now, before)
+        angles = torch.where(next_tensordict["observed"], self._angles(next_tensordict), before)
         velocity = velocity + 0.2 * (wrap(angles - before) / self.arm.dt - velocity)
         return next_tensordict.set("held", self.arm.join(angles, velocity))
 
     def _reset(self, tensordict, tensordict_reset):
-        return tensordict_reset.set("held", self._reading(tensordict_reset))
+        angles = self._angles(tensordict_reset)
+        return tensordict_reset.set("held", self.arm.join(angles, torch.zeros_like(angles)))  # at rest
 
     def transform_observation_spec(self, observation_spec):
         observation_spec["held"] = observation_spec["state"].clone()
