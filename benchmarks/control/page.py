@@ -146,7 +146,7 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
     made = "`python -m benchmarks.control`." if planned else made
     lines += [
         f"{size} a policy takes the mean of its actions. What reads the truth is the",
-        "same in all cells of hike and pendulum, and runs in the one without noise.",
+        "same in all cells of a task, and runs in the one with the least noise.",
         "",
         *(["![Return against the noise of the readings](control.png)", ""] if drawn else []),
         f"* Command: {made} A seed counts where all arms of a cell have run with it.",
@@ -156,10 +156,9 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
 
 
 def lost(rows: Sequence[dict], task: str) -> list[str]:
-    """The table of what arms lose where readings get noisier after training; none where they do not."""
-    names, (home, *_) = arms(rows, task), cells(rows, task)
-    away = [cell for cell in cells(rows, task) if NOT_TRAINED in cell]
-    if not away:
+    """The table of what arms lose where readings are noisier, in training too or after it; none without the latter."""
+    names, (home, *away) = arms(rows, task), cells(rows, task)
+    if not any(NOT_TRAINED in cell for cell in away):
         return []
     title = f"Percent of the return with {home} that is lost, with the same seeds. A negative loss is a gain."
     lines = ["", title, "", *head("cell", *names)]

@@ -124,7 +124,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
             spent += time.process_time() - begun
             test(cell_name(cell), tests)
             begun = time.process_time()
-    if task.shift is not None:
+    if task.shift not in (None, cell[0]):
         shifted = make_env(task, arm, budget.episodes, (task.shift, cell[1]), 2 * seed + 1, filter)
         if arm.memory:
             shifted.append_transform(get_primers_from_module(agent.policy))

@@ -12,20 +12,20 @@ from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import write_page
 from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, run
+from benchmarks.control.run import Budget, cell_name, run
 
 BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
 MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
 CELLS = {  # noise of readings, and missing share; those that say most come first
     "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
-    "cartpole": [(0.1, 0.0)],
+    "cartpole": [(0.1, 0.0), (0.3, 0.0)],
 }
 READERS = {
     "hike": ("Kalman", *BELIEFS, *MEMORIES),
     "pendulum": (*BELIEFS, "belief mean, taught", "belief mean, end to end", *MEMORIES),
-    "cartpole": ("belief mean", "LSTM", "physics", "truth"),
-}  # in the order in which they run; what reads the truth is the same in all cells, and runs in the one without noise
+    "cartpole": ("belief mean", "LSTM", "physics"),
+}  # in the order in which they run; what reads the truth is the same in all cells, and runs in that of the least noise
 FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells
 MORE_CELLS = 2  # the others run in a task's first cells,
 ONCE = ("belief mean, end to end",)  # and these, which take long, in its first cell
@@ -40,13 +40,14 @@ class Study:
     cells: int = 6  # the first so many of each task
     seeds: int = 5  # 0 only makes the tables of what is there
     processes: int = 1
+    known: Path | None = None  # a control.csv: what has rows there is not run again
     smoke: bool = False  # a tiny run of a cell of each task: does it run?
 
 
 def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
     """The arms that run in a cell."""
     number = CELLS[task].index(cell)
-    arms = (*READERS[task], "truth") if cell == (0.0, 0.0) else READERS[task]
+    arms = (*READERS[task], "truth") if cell == min(CELLS[task]) else READERS[task]
     if number >= MORE_CELLS:
         return tuple(arm for arm in arms if arm in FEW)
     return tuple(arm for arm in arms if number == 0 or arm not in ONCE)
@@ -64,6 +65,20 @@ def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
         for cell in CELLS[task][: study.cells]:
             for arm in arms_of(task, cell):
                 yield partial(once, part(study, task, cell, arm, seed), partial(run, task, cell, arm, seed, budget))
+
+
+def keep(study: Study, table: Path) -> None:
+    """Leaves the rows of a table where their runs would have left them.
+
+    A run's rows under another noise, after its training, name that noise: they are of a task's first cell.
+    """
+    runs: dict[Path, list[dict]] = {}
+    for row in COLUMNS.read(table):
+        cells = CELLS[row["task"]]
+        cell = {cell_name(cell): cell for cell in cells}.get(row["cell"], cells[0])
+        runs.setdefault(part(study, row["task"], cell, row["arm"], row["seed"]), []).append(row)
+    for file, rows in runs.items():
+        once(file, partial(list, rows))
 
 
 def complete(study: Study) -> list[dict]:
@@ -86,6 +101,8 @@ def main() -> None:
         for task in ("hike", "pendulum"):
             CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
         READERS["cartpole"] = ("four readings", "LSTM", "belief mean, spread", "physics")
+    if study.known is not None:
+        keep(study, study.known)
     todo = [job for seed in range(study.seeds) for job in jobs(study, seed, budget)]
     side_by_side(todo, study.processes, "runs")
     rows = complete(study)
