@@ -1,9 +1,9 @@
 """What a run of the study is made of, who may see what, and which runs the tables are of."""
 
 import json
-from pathlib import Path
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
