@@ -8,7 +8,8 @@ from tensordict.nn import TensorDictModuleBase
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
-from torch_denkf.modules._base import Call, run_module
+from torch_denkf.modules._call import Call
+from torch_denkf.modules._running import run_module
 
 ENSEMBLE, FORECAST = ("belief", "ensemble"), ("forecast", "ensemble")
 

@@ -16,7 +16,7 @@ from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
-from torch_denkf.modules._base import flat_noise
+from torch_denkf.modules._call import flat_noise
 
 
 class _FlatStep(nn.Module):

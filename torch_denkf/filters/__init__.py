@@ -5,7 +5,8 @@ from torch_denkf.filters.base import Filter
 from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
-from torch_denkf.filters.fused import FusedFilter, FusedSensor
+from torch_denkf.filters.fused import FusedFilter
+from torch_denkf.filters.fused_sensor import FusedSensor
 from torch_denkf.filters.kalman import KalmanFilter
 from torch_denkf.filters.monitored import Gated, Monitored
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter

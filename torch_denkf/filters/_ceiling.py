@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_denkf._checks import flag_value
 from torch_denkf.filters._said import say_once
-from torch_denkf.modules._base import Entries
+from torch_denkf.modules._call import Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

@@ -11,7 +11,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch_denkf._checks import has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
 from torch_denkf.filters._structure import Structure, previous_key, submodels
-from torch_denkf.modules._base import Entries, random_parts
+from torch_denkf.modules._call import Entries
+from torch_denkf.modules._running import random_parts
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

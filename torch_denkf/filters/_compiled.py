@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.filters._steps import Steps
-from torch_denkf.modules._base import Call, Entries
+from torch_denkf.modules._call import Call, Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters._sequence import Rows

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from torch_denkf.filters._checks import refuse_unknown_noise
-from torch_denkf.modules._base import Entries, flat_noise
+from torch_denkf.modules._call import Entries, flat_noise
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
-from torch_denkf.modules._base import check_module
+from torch_denkf.modules._running import check_module
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 

@@ -11,7 +11,9 @@ from tensordict import TensorDictBase, unravel_key
 from torch_denkf.filters._entries import write
 from torch_denkf.filters._said import say_eager
 from torch_denkf.filters._structure import Placed
-from torch_denkf.modules._base import Entries, SubModel, flat_noise, random_parts
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries, flat_noise
+from torch_denkf.modules._running import random_parts
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

@@ -24,7 +24,8 @@ from torch_denkf.filters._slices import starts_of
 from torch_denkf.filters._steps import blank
 from torch_denkf.filters._structure import KNOWN, previous_key, submodels
 from torch_denkf.filters._summaries import summaries
-from torch_denkf.modules._base import Call, Entries, reads, run_module
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import reads, run_module
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

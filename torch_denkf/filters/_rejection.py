@@ -12,7 +12,8 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
-from torch_denkf.modules._base import Entries, SubModel
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
 
 __all__ = ["LARGEST_READING", "REJECTED", "Guard", "guards_of", "rejected_keys", "usable"]
 

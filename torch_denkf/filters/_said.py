@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torch.utils.weak import WeakIdKeyDictionary
 
-from torch_denkf.modules._base import reads
+from torch_denkf.modules._running import reads
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

@@ -20,7 +20,7 @@ from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.filters._steps import Steps, blank
 from torch_denkf.filters._structure import KNOWN, Structure, previous_key
 from torch_denkf.filters._summaries import summaries
-from torch_denkf.modules._base import Call, Entries
+from torch_denkf.modules._call import Call, Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

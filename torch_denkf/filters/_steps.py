@@ -14,7 +14,9 @@ from torch import Tensor
 from torch_denkf.filters._ceiling import hold_variances
 from torch_denkf.filters._rejection import REJECTED, usable
 from torch_denkf.filters._structure import Placed, Structure, previous_key
-from torch_denkf.modules._base import Call, Entries, SubModel, named_modules_of, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import named_modules_of, run_module
 
 __all__ = ["Steps", "blank", "where_rows"]
 

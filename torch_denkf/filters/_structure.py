@@ -10,7 +10,8 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._rejection import Guard, guards_of
-from torch_denkf.modules._base import SubModel, in_sequences, reads, reads_of, writes
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import in_sequences, reads, reads_of, writes
 
 __all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
 

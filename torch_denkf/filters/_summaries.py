@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters._entries import write
 from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._base import Entries
+from torch_denkf.modules._call import Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter

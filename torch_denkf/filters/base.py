@@ -35,7 +35,8 @@ from torch_denkf.filters._sequence import filter_sequence, stepped
 from torch_denkf.filters._steps import Steps
 from torch_denkf.filters._structure import Structure, all_modules
 from torch_denkf.filters._summaries import summarise
-from torch_denkf.modules._base import Call, Entries, check_module, named_modules_of, reads
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import check_module, named_modules_of, reads
 
 __all__ = ["Filter"]
 

@@ -25,7 +25,7 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
-from torch_denkf.modules._base import check_module
+from torch_denkf.modules._running import check_module
 
 __all__ = ["DEnKF"]
 

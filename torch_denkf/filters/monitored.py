@@ -12,9 +12,10 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch_denkf.filters._options import options_of
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules import GatedAnalysis, GateOptions, InnovationMonitor, KalmanAnalysis, LaggedAnalysis, WithState
-from torch_denkf.modules._base import SubModel, check_module, named_modules_of
+from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._running import check_module, named_modules_of
 
 __all__ = ["Gated", "Monitored"]
 

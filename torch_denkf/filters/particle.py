@@ -20,7 +20,7 @@ from torch_denkf.modules import (
     WithWeights,
     as_process_noise,
 )
-from torch_denkf.modules._base import check_module
+from torch_denkf.modules._running import check_module
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 

@@ -3,9 +3,11 @@
 Import from here: ``from torch_denkf.modules import EnsembleAnalysis, ImageSensor, ...``.
 """
 
-from torch_denkf.modules._base import Call, SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules._gaussian import GaussianAnalysisOptions, GaussianTransitionKeys
+from torch_denkf.modules._running import reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
 from torch_denkf.modules.bias import BiasedNoise, BiasedObservation, BiasedTransition, FadingBias

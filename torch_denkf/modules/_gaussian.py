@@ -12,7 +12,9 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional import GaussianUpdate, mean_observation
-from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 

@@ -26,7 +26,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import as_standard_deviations
 
 __all__ = ["BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]

@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.modules._base import reads, run_module
+from torch_denkf.modules._running import reads, run_module
 from torch_denkf.modules.past import InPlaceOf, copy_sizes
 
 __all__ = ["Stateful", "WithState"]

@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import GaussianUpdate, ensemble_cov, ensemble_mean, kalman_update, weighted_mean
-from torch_denkf.modules._base import SubModel, random_parts, reads
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import random_parts, reads
 
 __all__ = ["check_analysis"]
 

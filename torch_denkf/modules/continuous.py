@@ -9,7 +9,8 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
 from torch_denkf.functional import discretise
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import as_floating, register_constant
 
 __all__ = ["ContinuousMotion", "ContinuousNoise", "NoisePerSecond"]

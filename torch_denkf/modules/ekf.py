@@ -10,8 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf.functional import kalman_update, wrap_angles
-from torch_denkf.modules._base import Call, Entries, reads
+from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
+from torch_denkf.modules._running import reads
 
 __all__ = ["EKFAnalysis", "EKFTransition"]
 

@@ -12,7 +12,9 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import mean_observation
-from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module, writes
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import check_module, reads, run_module, writes
 from torch_denkf.modules.past import InPlaceOf
 
 __all__ = ["JoinedObservation", "JoinedReading", "Renamed", "StateObservation"]

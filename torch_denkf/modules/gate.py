@@ -13,10 +13,12 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import adapt, chi_square_quantile, disbelief, interpolate, spread_about_mean
-from torch_denkf.modules._base import Call, Entries, SubModel, flat_noise, writes
+from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
+from torch_denkf.modules._call import Call, Entries, flat_noise
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._running import writes
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.modules.past import InPlaceOf, LaggedAnalysis
 

@@ -11,8 +11,10 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var, inflate, iterated_smoothing, random_rotation
-from torch_denkf.modules._base import Call, Entries, SubModel, check_module, random_parts, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import further_keys
+from torch_denkf.modules._running import check_module, random_parts, reads, run_module
 from torch_denkf.modules.motion_noise import NoisyTransition
 from torch_denkf.modules.past import InPlaceOf, copy_sizes
 

@@ -12,7 +12,8 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.functional import joint_forecast
-from torch_denkf.modules._base import SubModel, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import run_module
 from torch_denkf.modules.past import WithPast
 
 __all__ = ["JointForecast", "PresentOfJoint", "WithJointMoments"]

@@ -11,8 +11,10 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
-from torch_denkf.modules._base import Call, Entries, SubModel, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
+from torch_denkf.modules._running import run_module
 from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]

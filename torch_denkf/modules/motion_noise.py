@@ -10,7 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional import semidefinite_root, weighted_mean
-from torch_denkf.modules._base import Call, Entries, SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["NoisyTransition"]

@@ -9,7 +9,8 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_values
-from torch_denkf.modules._base import SubModel, check_network
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
 

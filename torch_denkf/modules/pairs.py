@@ -16,7 +16,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import register_constant
 
 __all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "WithHistory"]

@@ -31,7 +31,8 @@ from torch_denkf.functional import (
     weighted_mean,
     weighted_var,
 )
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules.likelihood import GaussianLikelihood
 
 __all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]

@@ -19,7 +19,8 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional import ensemble_mean, ensemble_var, weighted_mean, weighted_var
-from torch_denkf.modules._base import SubModel, check_module, named_modules_of, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, named_modules_of, reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 

@@ -13,8 +13,9 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf.functional import smoothing_gain
-from torch_denkf.modules._base import SubModel, reads, run_module
+from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._gaussian import GaussianTransition
+from torch_denkf.modules._running import reads, run_module
 from torch_denkf.modules.kalman import LinearTransition
 from torch_denkf.modules.past import InPlaceOf, WithPast, check_age
 

@@ -17,7 +17,8 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import unicycle_jacobians
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import (
     as_floating,
     mean_of_members,

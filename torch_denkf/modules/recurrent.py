@@ -17,7 +17,8 @@ from torchrl.modules import LSTMCell
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import unicycle_jacobians, unicycle_move
-from torch_denkf.modules._base import SubModel, check_module, reads, run_module
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import as_vector, mean_of_members
 from torch_denkf.modules.unicycle import check_dt, keys_of_dt
 

@@ -17,7 +17,8 @@ from torch_denkf.functional import (
     semidefinite_root,
     wrap_angles,
 )
-from torch_denkf.modules._base import SubModel, reads
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import reads
 from torch_denkf.modules.fused import StateObservation
 
 __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]

@@ -8,7 +8,8 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf.modules._base import SubModel, check_network
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
 

@@ -10,7 +10,8 @@ from torch import nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var, unicycle_move
-from torch_denkf.modules._base import SubModel, check_network
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.pairs import within_pair
 from torch_denkf.modules.transition import MemberNetwork

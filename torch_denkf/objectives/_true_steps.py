@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._structure import previous_key
-from torch_denkf.modules._base import Call, Entries, reads, run_module, run_modules
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import reads, run_module, run_modules
 
 __all__ = ["forecasts_from_truth", "has_members", "members_of"]
 

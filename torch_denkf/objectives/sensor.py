@@ -10,8 +10,9 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules._base import Call, reads, run_modules
+from torch_denkf.modules._call import Call
 from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.modules._running import reads, run_modules
 from torch_denkf.objectives._options import ReadingsOptions
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._readings import ReadingsLoss

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_denkf.filters import Filter
 from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.functional.smoothing import check_lag
-from torch_denkf.modules._base import Entries
+from torch_denkf.modules._call import Entries
 
 __all__ = ["Smoother"]
 

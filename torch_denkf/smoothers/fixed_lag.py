@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import options_of
 from torch_denkf.modules import GatedAnalysis, ResampledTransition
-from torch_denkf.modules._base import named_modules_of
 from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules._running import named_modules_of
 from torch_denkf.modules.past import EnsemblePast, LaggedAnalysis, LaggedBelief, WithEnsemblePast
 from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, MomentsPast, WithMomentsPast
 

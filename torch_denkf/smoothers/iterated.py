@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.modules import NoisyTransition, as_process_noise
-from torch_denkf.modules._base import check_module
+from torch_denkf.modules._running import check_module
 from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
 
 __all__ = ["IEnKS"]

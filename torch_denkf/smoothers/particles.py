@@ -12,8 +12,9 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters._structure import previous_key
 from torch_denkf.functional import backward_smooth, cholesky, weighted_mean
 from torch_denkf.modules import NoisyTransition, ResampledTransition
-from torch_denkf.modules._base import Call, Entries, run_module
+from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.modules._running import run_module
 from torch_denkf.modules.past import moments_of
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.fixed_lag import kind_of
