@@ -1,4 +1,4 @@
-"""dm_control's cartpole, swung up from noisy readings of position and angle; filters that learn it or know it."""
+"""dm_control's cartpole, swung up from noisy readings; filters that learn it or know it."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ TRACK = 1.8  # m from the middle
 class NoisyCartpole(LinearGaussianEnv):
     """Many carts at once. The state is the cart's position, cosine and sine of the pole's angle, and two velocities.
 
-    Physics, reward and start are those of ``dm_control.suite.cartpole.swingup``. The first three entries of the state
-    (m, 1, 1) are read with noise, the velocities (m/s, rad/s) are not. In each physics step the motor gets the action
-    ``[*B, 1]`` and N(0, 0.3^2), within [-1, 1]. The reward is the sum over an action's physics steps.
+    Physics, reward and start are those of ``dm_control.suite.cartpole.swingup``. Entries of the state (m, 1, 1, m/s,
+    rad/s) are read with noise: the first three, or with the velocities all five, which dm_control's own observation
+    has. In each physics step the motor gets the action ``[*B, 1]`` and N(0, 0.3^2), within [-1, 1]. The reward is the
+    sum over an action's physics steps.
 
     Args:
         count: carts.
@@ -37,18 +38,25 @@ class NoisyCartpole(LinearGaussianEnv):
         missing: share of the readings that do not come.
         seed: of the environment's own generator.
         action_noise: standard deviation of what is added to an action, in each physics step.
+        read: entries of the state that are read, the first so many: 3 or 5.
     """
 
     def __init__(
-        self, count: int, noise: float, missing: float = 0.0, seed: int = 0, action_noise: float = ACTION_NOISE
+        self,
+        count: int,
+        noise: float,
+        missing: float = 0.0,
+        seed: int = 0,
+        action_noise: float = ACTION_NOISE,
+        read: int = 3,
     ):
         # Readings, masks and the time limit are a linear system's; motion and reward are not.
         one = torch.eye(5)
         super().__init__(
             one,
-            one[:3],
+            one[:read],
             [0.0] * 5,
-            [noise] * 3,
+            [noise] * read,
             control=one[:, 3:4],
             missing=missing,
             max_steps=STEPS,
@@ -144,15 +152,15 @@ class Physics(m.SubModel):
         return state.view_as(ensemble)
 
 
-def exact_filter(noise: float, members: int = 32) -> DEnKF:
+def exact_filter(noise: float, members: int = 32, read: int = 3) -> DEnKF:
     """A filter that knows the world, and the noise of its readings."""
-    return _filter(Physics(), m.ConstantNoise([noise] * 3, in_key="observation"), members)
+    return _filter(Physics(), m.ConstantNoise([noise] * read, in_key="observation"), members)
 
 
-def unlearned_filter(members: int) -> DEnKF:
+def unlearned_filter(members: int, read: int = 3) -> DEnKF:
     """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
     q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
-    r = m.ConstantNoise([0.2] * 3, trainable=True, in_key="observation")
+    r = m.ConstantNoise([0.2] * read, trainable=True, in_key="observation")
     return _filter(m.NoisyTransition(Push(), q, dims=[3, 4], before=True), r, members)
 
 
@@ -160,7 +168,7 @@ def _filter(transition: m.SubModel, noise: m.ConstantNoise, members: int) -> DEn
     return DEnKF(
         transition=transition,
         sensor=None,
-        observation=m.Select([0, 1, 2]),
+        observation=m.Select(range(noise.log_variance.numel())),
         noise=noise,
         analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
         initial=m.GaussianPrior(START, [0.02] * 5, ensemble_size=members),

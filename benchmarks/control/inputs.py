@@ -15,10 +15,10 @@ class Seen(Transform):
     All that a filter reads in a step, without NaN.
 
     Args:
-        scale: what a reading is divided by.
+        scale: what a reading is divided by, a number or ``[O]``.
     """
 
-    def __init__(self, scale: float = 1.0):
+    def __init__(self, scale: Tensor | float = 1.0):
         super().__init__(in_keys=["observation", "observed"], out_keys=["seen"])
         self.scale = scale
 

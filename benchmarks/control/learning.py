@@ -31,8 +31,7 @@ class Learning:
         noise_lr: learning rate of the noises' logarithms; that of the rest is 1e-2.
         pieces: windows that an episode is cut into, if more than one; otherwise windows begin anywhere in it.
             With ``window=None`` one.
-        within: pieces in which a reading's components are larger than these are left out; one for each component, or
-            one for all.
+        within: pieces in which the first entry of a reading is larger are left out.
         guess: whether the readings' noise begins at the value that :func:`between` finds in the first episodes, and not
             at the filter's own.
 
@@ -46,7 +45,7 @@ class Learning:
     further: int = 10
     noise_lr: float = 3e-2
     pieces: int = 1
-    within: tuple[float, ...] = (math.inf,)
+    within: float = math.inf
     guess: bool = False
 
     def __post_init__(self):
@@ -100,7 +99,7 @@ class Learner:
                 own.copy_(torch.where(found.isnan(), own, found))  # NaN where no two neighbouring readings came
         if self.settings.pieces > 1:
             data = data[:, : self.settings.pieces * self.length].reshape(-1, self.length)
-            data = data[(data["observation"].abs() <= torch.tensor(self.settings.within)).all(-1).all(-1)]
+            data = data[(data["observation"][..., 0].abs() <= self.settings.within).all(-1)]
         if len(data):  # of a batch, all pieces may be left out
             self.episodes.extend(data)
 

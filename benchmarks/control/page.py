@@ -22,6 +22,7 @@ TITLES = {
     "hike": "Mountain hike",
     "pendulum": "Pendulum without velocity",
     "cartpole": "Cartpole swing-up without velocities",
+    "cartpole-full": "Cartpole swing-up, velocities read too",
 }
 PLANNED = Budget()
 COLUMNS = Columns(

@@ -65,7 +65,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
     if filter is not None:
         env.append_transform(DEnKFTransform(filter, store_ensemble=ENSEMBLE in arm.keys or arm.end_to_end))
     if "seen" in arm.keys:
-        env.append_transform(Seen(task.scale[0]))
+        env.append_transform(Seen(torch.tensor(task.scale[: env.observation_spec["observation"].shape[-1]])))
     if arm.stack > 1:
         env.append_transform(CatFrames(arm.stack, dim=-1, in_keys=["seen"], out_keys=["stack"]))
     return env

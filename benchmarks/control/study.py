@@ -20,11 +20,13 @@ CELLS = {  # noise of readings, and missing share; those that say most come firs
     "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
     "cartpole": [(0.1, 0.0), (0.3, 0.0)],
+    "cartpole-full": [(0.1, 0.0)],
 }
 READERS = {
     "hike": ("Kalman", *BELIEFS, *MEMORIES),
     "pendulum": (*BELIEFS, "belief mean, taught", "belief mean, end to end", *MEMORIES),
     "cartpole": ("belief mean", "LSTM", "physics"),
+    "cartpole-full": ("belief mean", "LSTM", "physics", "last reading"),
 }  # in the order in which they run; what reads the truth is the same in all cells, and runs in that of the least noise
 FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells
 MORE_CELLS = 2  # the others run in a task's first cells,
@@ -101,6 +103,7 @@ def main() -> None:
         for task in ("hike", "pendulum"):
             CELLS[task], READERS[task] = [(0.0, 0.0)], ("four readings", "LSTM", "ensemble")
         READERS["cartpole"] = ("four readings", "LSTM", "belief mean, spread", "physics")
+        READERS["cartpole-full"] = ("last reading", "belief mean")
     if study.known is not None:
         keep(study, study.known)
     todo = [job for seed in range(study.seeds) for job in jobs(study, seed, budget)]
