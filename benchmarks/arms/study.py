@@ -39,12 +39,12 @@ class Study:
     tasks: some_of(ARMS) = tuple(ARMS)
     sources: some_of(SOURCES) = ("encoders",)
     demos: int = 100  # episodes of 200 steps to learn the motion from
-    pictures: int = 6000  # of single poses, to learn the sensor from
+    pictures: int = 24000  # of single poses, to learn the sensor from
     films: int = 40  # episodes of 60 steps with pictures, to measure the sensor's errors on
     episodes: int = 40  # to test on
     steps: int = 200  # of a test episode
     motion_updates: int = 8000
-    sensor_updates: int = 1500
+    sensor_updates: int = 6000
     seed: int = 0
     out: Path = Path("runs/dm_control_arms")  # a run that was broken off goes on from here
     smoke: bool = False  # some seconds, to see that it runs
