@@ -76,14 +76,15 @@ def test_the_filter_that_knows_the_world_errs_as_it_believes():
     assert (errors / belief["belief", "var"][:, 20:].mean((0, 1)) - 1).abs().max() < 0.6
 
 
-def test_readings_know_nothing_of_velocities():
-    env = cartpole.NoisyCartpole(2, 0.0)
-    row = env.reset()
-    row["state"][1] = row["state"][0]
-    row["state"][1, 3:] += 5
-    reading = row["state"] @ env.H.mT
-    assert reading[0].equal(reading[1])
-    assert env.observation_spec["observation"].shape == (2, 3)
+def test_readings_know_nothing_of_velocities_unless_these_are_read():
+    row = cartpole.NoisyCartpole(2, 0.0).reset()
+    state = row["state"][:1] + torch.tensor([[0.0] * 5, [0.0, 0.0, 0.0, 5.0, 5.0]])
+    for task, read in (("cartpole", 3), ("cartpole-full", 5)):
+        env = TASKS[task].world(2, 0.0, 0.0, 0)
+        reading = state @ env.H.mT
+        assert reading[0].equal(reading[1]) == (read == 3)
+        assert reading[1].equal(state[1, :read])
+        assert env.observation_spec["observation"].shape == (2, read)
 
 
 def still_filter(members=8):
@@ -282,11 +283,14 @@ def test_an_update_follows_so_many_steps():
     assert agent.loss.target_entropy.item() == -1.0  # minus the number of actions
 
 
-@pytest.mark.parametrize("arm", ["belief mean", "four readings", "physics"])
-def test_a_run_is_tested_where_it_was_trained_and_where_it_was_not(arm, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "arm"),
+    [*(("cartpole", arm) for arm in ("belief mean", "four readings", "physics")), ("cartpole-full", "physics")],
+)
+def test_a_run_is_tested_where_it_was_trained_and_where_it_was_not(name, arm, monkeypatch):
     """Of each test the world's noise, and the filter's."""
-    task, tested = TASKS["cartpole"], []
-    monkeypatch.setitem(TASKS, "cartpole", replace(task, settings=replace(task.settings, every=500)))
+    task, tested = TASKS[name], []
+    monkeypatch.setitem(TASKS, name, replace(task, settings=replace(task.settings, every=500)))
 
     def noted(env, policy, steps, kind):
         if kind == ExplorationType.DETERMINISTIC:
@@ -296,16 +300,17 @@ def test_a_run_is_tested_where_it_was_trained_and_where_it_was_not(arm, monkeypa
 
     monkeypatch.setattr(protocol, "rollout", noted)
     budget = Budget(env_steps=2000, tests=1, episodes=2, members=4, updates=0.02)
-    names = [row["cell"] for row in run("cartpole", (0.1, 0.0), arm, 0, budget)]
+    names = [row["cell"] for row in run(name, (0.1, 0.0), arm, 0, budget)]
     left = ["noise 0.3, not trained, R as learned"] * (arm != "four readings")
     assert names == ["noise 0.1", "noise 0.3, not trained", *left]
     assert [one[0] for one in tested] == pytest.approx([0.1, 0.3, 0.3][: len(names)])
     if left:
         (_, learned), (_, told_of), (_, as_learned) = tested
-        torch.testing.assert_close(told_of, torch.full((3,), 0.3))
+        read = 5 if name == "cartpole-full" else 3
+        torch.testing.assert_close(told_of, torch.full((read,), 0.3))
         assert as_learned.equal(learned)
         if arm == "physics":
-            torch.testing.assert_close(learned, torch.full((3,), 0.1))
+            torch.testing.assert_close(learned, torch.full((read,), 0.1))
 
 
 def test_the_page_says_what_is_lost():
