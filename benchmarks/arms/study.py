@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from benchmarks.arms.filters import make_filter, train_motion, train_sensor
 from benchmarks.arms.page import COLUMNS, SOURCES, page
 from benchmarks.arms.sensor import JointSensor
 from benchmarks.common.arguments import some_of
-from benchmarks.common.jobs import once, read_rows
+from benchmarks.common.jobs import once, read_rows, same_settings
 from benchmarks.common.tables import report
 from torch_denkf.filters import DEnKF
 from torch_denkf.transforms import DEnKFTransform
@@ -156,7 +156,11 @@ def rows_of(task: str, source: str, study: Study) -> list[dict]:
 
 
 def run_study(study: Study) -> None:
-    """Runs what is not there, and leaves ``table.csv`` and ``table.md`` in the study's folder."""
+    """Runs what is not there, and leaves ``table.csv`` and ``table.md`` in the study's folder.
+
+    Raises:
+        SystemExit: if the folder was begun with other settings, or if dm_control cannot show an arm.
+    """
     if study.smoke:
         with tempfile.TemporaryDirectory() as folder:
             tiny = {"demos": 4, "pictures": 40, "films": 2, "episodes": 2, "steps": 24}
@@ -164,6 +168,8 @@ def run_study(study: Study) -> None:
             run_study(replace(study, smoke=False, out=Path(folder), **tiny, **updates))
         print("A smoke run: it ran, and its figures say nothing.")
         return
+    which = {"tasks", "sources", "out", "smoke"}
+    same_settings(study.out, {name: value for name, value in asdict(study).items() if name not in which})
     for task in study.tasks:
         for source in study.sources:
             once(study.out / "parts" / f"{task}-{source}.json", partial(rows_of, task, source, study))

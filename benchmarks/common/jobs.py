@@ -14,11 +14,26 @@ from torch_denkf._files import write_text
 from torch_denkf._workers import follow_parent
 
 
-def once(file: Path, rows: Callable[[], list[dict]]) -> None:
-    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+def once(file: Path, rows: Callable[[], list[dict] | dict]) -> None:
+    """Computes rows, say, and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
     if file.exists():
         return
     write_text(file, json.dumps(rows()))
+
+
+def same_settings(out: Path, settings: dict) -> None:
+    """Leaves settings in ``out/settings.json``; a study that goes on there needs the same.
+
+    Raises:
+        SystemExit: if others are there; names them.
+    """
+    file, settings = out / "settings.json", json.loads(json.dumps(settings, default=str))
+    once(file, lambda: settings)
+    there = json.loads(file.read_text())
+    other = [name for name in {**settings, **there} if settings.get(name) != there.get(name)]
+    if other:
+        named = ", ".join(f"{name}={there.get(name)!r} (now {settings.get(name)!r})" for name in other)
+        raise SystemExit(f"{out} was begun with {named}. Give another --out, or the same settings.")
 
 
 def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: str) -> None:

@@ -35,11 +35,19 @@ class Columns:
                 writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items() if v == v})
 
     def read(self, file: Path) -> list[dict]:
-        """Rows as :meth:`write` wrote them; what is empty is left out."""
+        """Rows as :meth:`write` wrote them; what is empty is left out.
+
+        Raises:
+            ValueError: if the file has other columns.
+        """
         with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
+            reader = csv.DictReader(stream)
+            rows = list(reader)
+        if list(reader.fieldnames or []) != list(self.names):
+            found = ", ".join(reader.fieldnames or []) or "no columns"
+            raise ValueError(f"{file} has {found}, not the columns {', '.join(self.names)}")
         kinds = {**dict.fromkeys(self.names, float), **dict.fromkeys(self.text, str), **dict.fromkeys(self.whole, int)}
-        return [{key: kinds[key](value) for key, value in row.items() if value != ""} for row in rows]
+        return [{key: kinds[key](value) for key, value in row.items() if value} for row in rows]
 
 
 def pick(rows: Iterable[dict], **wanted) -> list[dict]:

@@ -99,14 +99,14 @@ class Learner:
                 own.copy_(torch.where(found.isnan(), own, found))  # NaN where no two neighbouring readings came
         if self.settings.pieces > 1:
             data = data[:, : self.settings.pieces * self.length].reshape(-1, self.length)
-            data = data[(data["observation"][..., 0].abs() <= self.settings.within).all(-1)]
+            data = data[~(data["observation"][..., 0].abs() > self.settings.within).any(-1)]  # NaN where none came
         if len(data):  # of a batch, all pieces may be left out
             self.episodes.extend(data)
 
     def update(self, updates: int) -> float:
-        """Makes some updates; the last one's loss."""
+        """Makes some updates; the last one's loss. Without episodes none."""
         value = torch.zeros(())
-        for _ in range(updates):
+        for _ in range(updates if len(self.episodes) else 0):
             episodes = self.episodes.sample()
             length = self.length or episodes.shape[1]
             start = torch.randint(episodes.shape[1] - length + 1, ())

@@ -56,17 +56,21 @@ def last(rows: Sequence[dict]) -> list[dict]:
 
 
 def returns(rows: Sequence[dict], task: str, cell: str, arm: str) -> list[float]:
-    """The final returns, by seed; of what reads the truth those of another cell where it ran in that one alone."""
+    """The final returns; of what reads the truth those of another cell where it ran in that one alone."""
+    return list(_ends(rows, task, cell, arm).values())
+
+
+def _ends(rows: Sequence[dict], task: str, cell: str, arm: str) -> dict[int, float]:
+    """The final returns of :func:`returns`, by seed."""
     chosen = pick(rows, task=task, cell=cell, arm=arm)
     if arm == "truth" and not chosen and NOT_TRAINED not in cell:
         chosen = [row for row in pick(rows, task=task, arm=arm) if NOT_TRAINED not in row["cell"]]
-    return [row["return"] for row in last(chosen)]
+    return {row["seed"]: row["return"] for row in last(chosen)}
 
 
 def ahead(rows: Sequence[dict], task: str, cell: str, arm: str, other: str) -> list[float]:
     """How much more an arm returns than another, with each seed that both have."""
-    ends = (last(pick(rows, task=task, cell=cell, arm=name)) for name in (arm, other))
-    own, others = ({row["seed"]: row["return"] for row in end} for end in ends)
+    own, others = (_ends(rows, task, cell, name) for name in (arm, other))
     return [value - others[seed] for seed, value in own.items() if seed in others]
 
 
@@ -139,7 +143,8 @@ def page(rows: Sequence[dict], budget: Budget = PLANNED) -> str:
         for cell in cells(rows, task, trained=True):
             lines.append(line(cell, *(reached(rows, task, cell, arm) for arm in learning)))
         lines += ["", "Seconds of one core for a run, median over cells and seeds.", "", *head(*names)]
-        ends = [last(pick(rows, task=task, arm=arm)) for arm in names]
+        trained = [row for row in rows if NOT_TRAINED not in row["cell"]]
+        ends = [last(pick(trained, task=task, arm=arm)) for arm in names]
         lines += [line(*(f"{np.median([row['wall_s'] for row in end]):.0f}" for end in ends)), ""]
     planned = budget == PLANNED and all(whole(rows, task) for task in {row["task"] for row in rows})
     size = f"Each test is of {budget.episodes} episodes, in which" if planned or budget != PLANNED else "In a test"
@@ -164,10 +169,11 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     title = f"Percent of the return with {home} that is lost, with the same seeds. A negative loss is a gain."
     lines = ["", title, "", *head("cell", *names)]
     for cell in away:
-        before, after = ([np.array(returns(rows, task, one, arm)) for arm in names] for one in (home, cell))
-        lines.append(
-            line(cell, *(_text(100 * (1 - b / a)) if len(b) else "" for a, b in zip(before, after, strict=True)))
-        )
+        before, after = ([_ends(rows, task, one, arm) for arm in names] for one in (home, cell))
+        shares = [
+            [100 * (1 - b[seed] / a[seed]) for seed in b if seed in a] for a, b in zip(before, after, strict=True)
+        ]
+        lines.append(line(cell, *map(_text, shares)))
     return lines
 
 

@@ -44,6 +44,25 @@ class Budget:
     every: int | None = None
 
 
+def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
+    """How many batches of episodes a run has, and after which of them it is tested."""
+    batches = max(1, (budget.env_steps or task.env_steps) // (task.count * task.steps))
+    return batches, [
+        n for n in range(1, batches + 1) if n * budget.tests // batches > (n - 1) * budget.tests // batches
+    ]
+
+
+def planned_tests(task_name: str, cell: tuple[float, float], arm_name: str, budget: Budget) -> list[tuple[str, int]]:
+    """Of each row of a run the cell's name, and the environment steps."""
+    task, name = TASKS[task_name], cell_name(cell)
+    batches, tested = batches_of(task, budget)
+    rows = [(name, number) for number in tested]
+    if task.shift not in (None, cell[0]):
+        after = (SHIFTED, LEFT) if ARMS[arm_name].filter else (SHIFTED,)
+        rows += [(text.format(task.shift), batches) for text in after]
+    return [(name, number * task.count * task.steps) for name, number in rows]
+
+
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
     """Whole episodes ``[B, T]``."""
     with torch.no_grad(), set_exploration_type(kind):
@@ -78,8 +97,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     task, arm, spent = TASKS[task_name], ARMS[arm_name], 0.0
     begun = time.process_time()
     filter, learner = None, None
-    batch = task.count * task.steps
-    batches = max(1, (budget.env_steps or task.env_steps) // batch)
+    batches, tested = batches_of(task, budget)
     if arm.filter == "exact":
         filter = task.exact(cell[0])
     elif arm.filter:
@@ -106,7 +124,8 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
     def test(name: str, env: EnvBase) -> None:
         reward = rollout(env, agent.policy, task.steps, ExplorationType.DETERMINISTIC)["next", "reward"]
         returned = reward.sum((1, 2)).mean().item()
-        entries = {"arm": arm_name, "seed": seed, "env_steps": (number + 1) * batch, "return": returned}
+        steps = (number + 1) * task.count * task.steps
+        entries = {"arm": arm_name, "seed": seed, "env_steps": steps, "return": returned}
         rows.append({"task": task_name, "cell": name, **entries, "wall_s": spent})
 
     for number in range(batches):
@@ -120,7 +139,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
                 agent.refilter(filter)
         if not (random and agent.ON_POLICY):
             agent.update(data)
-        if (number + 1) * budget.tests // batches > number * budget.tests // batches:
+        if number + 1 in tested:
             spent += time.process_time() - begun
             test(cell_name(cell), tests)
             begun = time.process_time()

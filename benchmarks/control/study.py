@@ -12,7 +12,9 @@ from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import write_page
 from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, cell_name, run
+from benchmarks.control.run import Budget, cell_name, planned_tests, run
+from benchmarks.control.shift import LEFT, SHIFTED
+from benchmarks.control.tasks import TASKS
 
 BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
 MEMORIES = ("last reading", "four readings", "LSTM", "GRU")
@@ -31,6 +33,7 @@ READERS = {
 FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells
 MORE_CELLS = 2  # the others run in a task's first cells,
 ONCE = ("belief mean, end to end",)  # and these, which take long, in its first cell
+SEEDS = range(100)  # that the tables know; the search has others
 
 
 @dataclass(frozen=True)
@@ -69,18 +72,38 @@ def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
                 yield partial(once, part(study, task, cell, arm, seed), partial(run, task, cell, arm, seed, budget))
 
 
-def keep(study: Study, table: Path) -> None:
-    """Leaves the rows of a table where their runs would have left them.
+def keep(study: Study, table: Path, budget: Budget) -> None:
+    """Leaves the rows of a table where their runs would have left them; what has run is not overwritten.
 
-    A run's rows under another noise, after its training, name that noise: they are of a task's first cell.
+    Raises:
+        SystemExit: if the rows are not those of whole runs of this study; names the run.
     """
-    runs: dict[Path, list[dict]] = {}
-    for row in COLUMNS.read(table):
-        cells = CELLS[row["task"]]
-        cell = {cell_name(cell): cell for cell in cells}.get(row["cell"], cells[0])
-        runs.setdefault(part(study, row["task"], cell, row["arm"], row["seed"]), []).append(row)
-    for file, rows in runs.items():
-        once(file, partial(list, rows))
+    try:
+        rows = COLUMNS.read(table)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"--known {table} is no table of this study: {error}") from error
+    if not rows:
+        raise SystemExit(f"--known {table} holds no rows.")
+    runs: dict[tuple, list[dict]] = {}
+    for row in rows:
+        if set(row) != set(COLUMNS.names):
+            raise SystemExit(f"--known {table}: something is missing in the row {row}.")
+        runs.setdefault((row["task"], _trained(row["task"], row["cell"]), row["arm"], row["seed"]), []).append(row)
+    for (task, cell, arm, seed), found in runs.items():
+        run = f"--known {table}: {task}, {found[0]['cell']}, {arm}, seed {seed}"
+        if cell is None or arm not in arms_of(task, cell) or seed not in SEEDS:
+            raise SystemExit(f"{run} is no run of this study: see CELLS and READERS in benchmarks/control/study.py.")
+        if sorted((row["cell"], row["env_steps"]) for row in found) != sorted(planned_tests(task, cell, arm, budget)):
+            raise SystemExit(f"{run} is not whole, or is there twice: its tests are not those of a run. Leave it out.")
+        once(part(study, task, cell, arm, seed), partial(list, found))
+
+
+def _trained(task: str, name: str) -> tuple[float, float] | None:
+    """The cell that a row's run was trained in: its own, or the task's first if its readings got noisier afterwards."""
+    cells = {cell_name(cell): cell for cell in CELLS.get(task, [])}
+    if cells and TASKS[task].shift is not None:
+        cells |= dict.fromkeys([SHIFTED.format(TASKS[task].shift), LEFT.format(TASKS[task].shift)], CELLS[task][0])
+    return cells.get(name)
 
 
 def complete(study: Study) -> list[dict]:
@@ -88,7 +111,7 @@ def complete(study: Study) -> list[dict]:
     files = []
     for task in study.tasks:
         for cell in CELLS[task]:
-            for seed in range(100):
+            for seed in SEEDS:
                 found = [part(study, task, cell, arm, seed) for arm in arms_of(task, cell)]
                 files += found if all(file.exists() for file in found) else []
     return sorted(read_rows(files), key=COLUMNS.order)
@@ -97,6 +120,8 @@ def complete(study: Study) -> list[dict]:
 def main() -> None:
     """Runs the study; one that was broken off goes on."""
     study, budget = parse(Study), Budget()
+    if study.smoke and study.known is not None:
+        raise SystemExit("--smoke makes runs of its own and knows of no others: leave --known out.")
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
         budget = Budget(env_steps=2 * 16 * 200, tests=1, episodes=2, members=4, updates=0.02, every=200)
@@ -105,13 +130,14 @@ def main() -> None:
         READERS["cartpole"] = ("four readings", "LSTM", "belief mean, spread", "physics")
         READERS["cartpole-full"] = ("last reading", "belief mean")
     if study.known is not None:
-        keep(study, study.known)
+        keep(study, study.known, budget)
     todo = [job for seed in range(study.seeds) for job in jobs(study, seed, budget)]
     side_by_side(todo, study.processes, "runs")
     rows = complete(study)
     if not rows:
         raise SystemExit(f"{study.out} holds no cell of which all arms have run.")
     COLUMNS.write(rows, study.out / "control.csv")
+    rows = COLUMNS.read(study.out / "control.csv")  # the page says what its table says, to the last digit
     draw(rows, study.out / "control.png")
     write_page(page(rows, budget), study.out / "control.md")
     if study.smoke:

@@ -326,3 +326,8 @@ def test_the_page_says_what_is_lost():
     assert "Percent of the return with noise 0.1 that is lost, with the same seeds." in text
     assert "| noise 0.3, not trained | 7.5 [5.0, 10.0] | 7.5 [5.0, 10.0] |" in text
     assert "control.png" not in text
+    few = [row for row in rows if "not trained" not in row["cell"] or row["seed"] == 1]
+    few += [{**row, "cell": "noise 0.3", "return": 720.0} for row in rows if row["cell"] == "noise 0.1" and row["seed"]]
+    text = page(few)
+    assert "| noise 0.3, not trained | 10.0 | 10.0 |" in text
+    assert "| noise 0.3 | 20.0 | 20.0 |" in text

@@ -3,7 +3,6 @@
 import json
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -304,26 +303,6 @@ def test_arms_of_cells(task):
         assert {"belief mean", "LSTM"} <= set(arms_of(task, cell)) <= set(study.FEW)
     least = (0.1, 0) if task.startswith("cartpole") else (0, 0)
     assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell)] == [least]
-
-
-def test_known_rows_are_not_run_again(tmp_path):
-    """The committed table stands for its runs: each has its rows again, and what it says does not change."""
-    table = Path(study.__file__).parent / "results" / "control.csv"
-    found = Study(out=tmp_path)
-    lines = table.read_text().splitlines()
-    few = [lines[0], *(line for line in lines[1:] if line.split(",")[-4] == "0" or line.startswith("cartpole"))]
-    (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
-    study.keep(found, tmp_path / "few.csv")
-    made = {job.args[0] for seed in range(5) for job in jobs(found, seed, Budget()) if job.args[0].exists()}
-    assert made == set((tmp_path / "parts").rglob("*.json"))
-    assert all(job.args[0].exists() for job in jobs(found, 0, Budget()))
-    study.COLUMNS.write(complete(found), tmp_path / "again.csv")
-    assert (tmp_path / "again.csv").read_text() == (tmp_path / "few.csv").read_text()
-    one = json.loads(part(found, "cartpole", (0.1, 0.0), "LSTM", 3).read_text())
-    assert {row["cell"] for row in one} == {"noise 0.1", SHIFTED.format(0.3)}  # an LSTM has no R
-    part(found, "hike", (0.4, 0.0), "LSTM", 0).write_text("[]")
-    study.keep(found, tmp_path / "few.csv")
-    assert part(found, "hike", (0.4, 0.0), "LSTM", 0).read_text() == "[]"  # what has run is not overwritten
 
 
 def test_a_seed_counts_where_all_arms_have_run(tmp_path):
