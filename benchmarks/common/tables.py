@@ -42,9 +42,9 @@ class Columns:
         """
         with file.open(newline="") as stream:
             reader = csv.DictReader(stream)
-            rows = list(reader)
-        if list(reader.fieldnames or []) != list(self.names):
-            found = ", ".join(reader.fieldnames or []) or "no columns"
+            rows, columns = list(reader), list(reader.fieldnames or [])
+        if columns != list(self.names):
+            found = ", ".join(columns) or "no columns"
             raise ValueError(f"{file} has {found}, not the columns {', '.join(self.names)}")
         kinds = {**dict.fromkeys(self.names, float), **dict.fromkeys(self.text, str), **dict.fromkeys(self.whole, int)}
         return [{key: kinds[key](value) for key, value in row.items() if value} for row in rows]

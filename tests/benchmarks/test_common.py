@@ -9,8 +9,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from benchmarks.arms.study import Study as Arms
+from benchmarks.arms.study import run_study
 from benchmarks.common.arguments import parse, run_one
-from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.jobs import once, read_rows, same_settings, side_by_side
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.kitti.study import Study as KITTI
 from benchmarks.ur5.study import Study as UR5
@@ -106,6 +108,33 @@ def test_shared_rows_are_the_first_files(tmp_path):
         (tmp_path / f"{name}.json").write_text(json.dumps(rows))
     found = read_rows(sorted(tmp_path.glob("*.json")), lambda row: row["filter"] if row["filter"] == "floor" else None)
     assert [row["value"] for row in found] == [1, 10, 2]
+
+
+def test_a_folder_has_the_settings_it_was_begun_with(tmp_path):
+    """The same again, tuples and paths among them, is no change; what changed is named, and what is there stays."""
+    same_settings(tmp_path, {"seed": 0, "size": (1, 2), "root": Path("a")})
+    same_settings(tmp_path, {"seed": 0, "size": (1, 2), "root": Path("a")})
+    with pytest.raises(SystemExit, match=r"begun with seed=0 \(now 1\)\. Give another --out"):
+        same_settings(tmp_path, {"seed": 1, "size": (1, 2), "root": Path("a")})
+    with pytest.raises(SystemExit, match=r"root='a' \(now None\)"):
+        same_settings(tmp_path, {"seed": 0, "size": (1, 2)})
+
+
+def test_the_arms_study_does_not_answer_for_another_seed(tmp_path):
+    """Nor for other settings: what a folder holds is of those that it was begun with; further tasks may come."""
+    run_study(Arms(out=tmp_path, tasks=(), seed=0))
+    run_study(Arms(out=tmp_path, tasks=(), seed=0, sources=("pixels",)))
+    for other in ({"seed": 1}, {"demos": 8}):
+        with pytest.raises(SystemExit, match=next(iter(other))):
+            run_study(Arms(out=tmp_path, tasks=(), **other))
+
+
+def test_another_tables_file_is_refused(tmp_path):
+    columns = Columns(("name", "seed"), text=["name"], whole=["seed"], order=lambda row: row["seed"])
+    for text in ("", "name\na\n", "name,seed,more\na,1,2\n"):
+        (tmp_path / "table.csv").write_text(text)
+        with pytest.raises(ValueError, match=r"table\.csv has .*not the columns name, seed"):
+            columns.read(tmp_path / "table.csv")
 
 
 def test_rows_survive_their_file_sorted_and_with_five_digits(tmp_path):

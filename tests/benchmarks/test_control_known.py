@@ -37,15 +37,15 @@ def known(tmp_path, lines):
     return len(list(tmp_path.rglob("*.json")))
 
 
-def lines_of(task, cell, arm, budget=Budget()):
+def lines_of(task, cell, arm):
     """Rows of a run with seed 0, as the table has them."""
-    return [f'{task},"{name}",{arm},0,{steps},1.0,2.0' for name, steps in planned_tests(task, cell, arm, budget)]
+    return [f'{task},"{name}",{arm},0,{steps},1.0,2.0' for name, steps in planned_tests(task, cell, arm, Budget())]
 
 
 def test_rows_of_whole_runs_alone_are_known(tmp_path):
     """Half a run, two of one, a cell, arm, seed or column that the study has not: refused, and named."""
     pole, hike = lines_of("cartpole", (0.1, 0.0), "physics"), lines_of("hike", (0.4, 0.0), "LSTM")
-    assert len(pole) == 7 and len(hike) == 5
+    assert (len(pole), len(hike)) == (7, 5)
     refused = {
         "LSTM, seed 0 is not whole": hike[:4],
         "physics, seed 0 is not whole": pole[:5],
