@@ -103,7 +103,8 @@ def test_what_is_filtered_once_more_is_what_was_filtered_in_the_environment():
     data = rollout(env, None, 30, ExplorationType.RANDOM)
     again = data.clone()
     for key in ("mean", "var"):
-        again["belief", key].zero_(), again["next", "belief", key].zero_()
+        for place in (("belief", key), ("next", "belief", key)):
+            again.set(place, torch.zeros_like(data[place]))
     again = refiltered(filter, again)
     for key in ("mean", "var"):
         torch.testing.assert_close(again["belief", key], data["belief", key], atol=1e-4, rtol=1e-3)
