@@ -68,7 +68,7 @@ class ArmTransition(m.SubModel):
         joints = self.arm.joints
         state, push, bias = ensemble.tensor_split((3 * joints, 4 * joints), -1)
         angles, velocity = self.arm.split(state)
-        velocity = velocity.clamp(-self.fastest, self.fastest)
+        velocity = velocity.clamp(-self.fastest, self.fastest)  # an analysis may have made a member faster
         acting = action.to(angles.dtype).unsqueeze(-2) + nn.functional.pad(push, (0, self.arm.actions - joints))
         mean, std = self.faster(state, acting)
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
