@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import torch
@@ -17,10 +16,8 @@ from torch_denkf.training import Stage, train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT, CREEP = 0.02, 0.002  # noise of an angle beside that of the accelerations, rad: after a way of 1 rad, and a step
-PUSH, LASTS = 0.005, 100  # standard deviation of an action that nobody ordered, and the steps in which it fades to 1/e
-LENGTH = 0.1  # rad: a motion after which a picture is read with other errors
-WHITE = 1.5  # standard deviation of a reading's white part, in those of its error
+DRIFT, CREEP = 0.005, 0.0015  # noise of an angle beside that of the accelerations, rad: after a way of 1 rad, and a step
+LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 
 
@@ -28,9 +25,6 @@ class ArmTransition(m.SubModel):
     """Learned accelerations and their noise; old and new velocity turn the angle, whose cosine and sine are the state.
 
     An arm at rest that is held against gravity stays where it is: what the network says of it is taken away.
-
-    In the state follows a *push* for each joint, in full actions: what acts on the arm beside the action, such as a
-    ball in its hand or the floor under its fingers. It fades slowly, and the network takes it for a part of the action.
 
     With ``bias`` the errors of a sensor follow in the state, of standard deviations ``bias``. A picture of an arm at
     rest is read with the same error again and again, and with another one when the arm has moved: the errors fade
@@ -66,19 +60,17 @@ class ArmTransition(m.SubModel):
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
         joints = self.arm.joints
-        state, push, bias = ensemble.tensor_split((3 * joints, 4 * joints), -1)
+        state, bias = ensemble.tensor_split((3 * joints,), -1)
         angles, velocity = self.arm.split(state)
         velocity = velocity.clamp(-self.fastest, self.fastest)  # an analysis may have made a member faster
-        acting = action.to(angles.dtype).unsqueeze(-2) + nn.functional.pad(push, (0, self.arm.actions - joints))
-        mean, std = self.faster(state, acting)
+        action = action.to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)
+        mean, std = self.faster(state, action)
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
         ways = self.arm.dt * velocity.abs()
         # Without the creep an arm at rest would be believed for ever.
         drift = (DRIFT**2 * ways + CREEP**2).sqrt() * torch.randn_like(ways)
         turned = angles + self.arm.dt * torch.lerp(velocity, after, self.lead) + drift
-        kept = math.exp(-1 / LASTS)
-        push = kept * push + (1 - kept**2) ** 0.5 * PUSH * torch.randn_like(push)
-        moved = torch.cat([self.arm.join(turned, after), push], -1)
+        moved = self.arm.join(turned, after)
         if self.bias is None:
             return moved
         new = -torch.expm1(-2 * ways.norm(dim=-1, keepdim=True) / LENGTH)  # share of a bias's variance
@@ -87,7 +79,7 @@ class ArmTransition(m.SubModel):
 
 
 def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error: Tensor | None) -> DEnKF:
-    """State [cos, sin, velocity, push] of each joint; encoders read cosines and sines, a sensor of pictures places.
+    """State [cos, sin, velocity] of each joint; encoders read cosines and sines, a sensor of pictures places.
 
     Args:
         arm: the arm.
@@ -107,14 +99,13 @@ def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error:
     if sensor is not None:
         key, first = sensor.out_keys[0], torch.cat([arm.places(angles[:, 0]).flatten(-2), velocity[:, 0]], -1)
     mean, std = first.mean(0), first.std(0).clamp_min(1e-3)  # arms begin at rest
-    mean, std = nn.functional.pad(mean, (0, arm.joints)), nn.functional.pad(std, (0, arm.joints), value=PUSH)
     start = {"mean": mean, "std": std, "ensemble_size": MEMBERS}
     if sensor is None:
         observation: m.SubModel = m.Select(range(size))
         noise = m.ConstantNoise([NOISE] * size, in_key=key)
         initial = m.FromSensor(range(size), sensor_key=key, **start)
     else:
-        observation, noise = JointPlaces(arm), m.ConstantNoise(WHITE * error, in_key=key)
+        observation, noise = JointPlaces(arm), m.ConstantNoise(error, in_key=key)
         initial = FromPlaces(arm, bias=error, **start)
     analysis = m.EnsembleAnalysis("etkf", sensor_key=key)
     return DEnKF(

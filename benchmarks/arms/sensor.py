@@ -86,7 +86,7 @@ class JointSensor(m.SubModel):
 
 
 class JointPlaces(m.SubModel):
-    """Where the links of members ``[*B, E, 4 J + 2 J]`` end, and what the sensor adds to it: its biases."""
+    """Where the links of members ``[*B, E, 3 J + 2 J]`` end, and what the sensor adds to it: its biases."""
 
     def __init__(self, arm: Arm):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
@@ -94,7 +94,7 @@ class JointPlaces(m.SubModel):
 
     def compute(self, ensemble: Tensor) -> Tensor:
         places = self.arm.places(self.arm.split(ensemble)[0]).flatten(-2)
-        return places + ensemble[..., 4 * self.arm.joints :]
+        return places + ensemble[..., 3 * self.arm.joints :]
 
 
 class FromPlaces(m.FromSensor):
@@ -108,7 +108,7 @@ class FromPlaces(m.FromSensor):
 
     def _members(self, center, std, noise, batch_size):
         reading, rest = super()._members(center, std, noise, batch_size)[0].tensor_split((2 * self.arm.joints,), -1)
-        velocity, push, bias = rest.tensor_split((self.arm.joints, 2 * self.arm.joints), -1)
+        velocity, bias = rest.tensor_split((self.arm.joints,), -1)
         angles = self.arm.angles((reading - bias).unflatten(-1, (-1, 2)))
-        ensemble = torch.cat([self.arm.join(angles, velocity), push, bias], -1)
+        ensemble = torch.cat([self.arm.join(angles, velocity), bias], -1)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
