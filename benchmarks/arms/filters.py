@@ -16,7 +16,10 @@ from torch_denkf.training import Stage, train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT, CREEP = 0.005, 0.0015  # noise of an angle beside that of the accelerations, rad: after a way of 1 rad, and a step
+DRIFT, CREEP = (
+    0.005,
+    0.0015,
+)  # noise of an angle beside that of the accelerations, rad: after a way of 1 rad, and a step
 LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 

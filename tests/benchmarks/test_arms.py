@@ -7,7 +7,7 @@ from tensordict import TensorDict
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
 from benchmarks.arms.arms import ARMS, NOISE, SIDE, Average, Encoders, HoldAngles, make_env, make_one, wrap
-from benchmarks.arms.filters import CREEP, DRIFT, LASTS, LENGTH, PUSH, ArmTransition, make_filter, train_motion
+from benchmarks.arms.filters import CREEP, DRIFT, LENGTH, ArmTransition, make_filter, train_motion
 from benchmarks.arms.page import COLUMNS, difference, page
 from benchmarks.arms.sensor import CELLS, FromPlaces, JointPlaces, JointSensor
 from benchmarks.arms.study import collect, scores
@@ -145,11 +145,6 @@ def transition(arm, bias=None):
     return ArmTransition(arm, one, 50 * one, one, one, bias)
 
 
-def without_push(arm, state):
-    """A member in which nothing acts on the arm beside the action."""
-    return torch.nn.functional.pad(state, (0, arm.joints))
-
-
 def test_the_forecast_turns_by_the_new_velocity():
     arm = ARMS["reacher"]
     move = transition(arm)
@@ -157,7 +152,7 @@ def test_the_forecast_turns_by_the_new_velocity():
     action = torch.tensor([0.2, -0.1])
     with torch.no_grad():
         mean, std = move.faster(state[0], action)
-        angles, velocity = arm.split(move.compute(without_push(arm, state), action))
+        angles, velocity = arm.split(move.compute(state, action))
     assert torch.allclose((velocity - torch.tensor([1.0, 2.0])).mean(0), mean, atol=float(5 * std.max() / 4000**0.5))
     turned = angles - torch.tensor([0.3, -0.5]) - arm.dt * velocity
     drift = [(DRIFT**2 * arm.dt * speed + CREEP**2) ** 0.5 for speed in (1, 2)]
@@ -175,32 +170,6 @@ def test_an_arm_that_is_held_stays_at_rest():
     assert pushed.abs().max() > 1e-3
 
 
-def test_a_push_acts_as_a_part_of_the_action_and_fades():
-    """It is as large in a hundred steps' time as now, and has forgotten all but a share of 1/e."""
-    arm = ARMS["manipulator"]
-    move, push = transition(arm), PUSH * torch.tensor([1.0, -1.0, 0.5, 2.0])
-
-    class Motors(torch.nn.Module):
-        """Velocities change by the action, with the least noise."""
-
-        def forward(self, features):
-            return torch.cat([features[..., -5:-1], torch.full_like(features[..., :4], -30.0)], -1)
-
-    move.module = Motors()
-    angles, velocity = torch.tensor([0.3, -0.5, 0.2, 0.1]), torch.tensor([0.2, 0.0, -0.4, 0.3])
-    state, action = arm.join(angles, velocity), torch.tensor([0.1, 0.0, -0.1, 0.2, 0.0])
-    after = move.compute(torch.cat([state, push]).expand(4000, -1), action)
-    expected = velocity + action[:4] + push - arm.hold(angles)
-    torch.testing.assert_close(arm.split(after)[1].mean(0), expected, atol=5 * 0.002 / 4000**0.5, rtol=0)
-    members = torch.cat([state.expand(20000, -1), PUSH * torch.randn(20000, 4)], -1)
-    later = members
-    for _ in range(LASTS):
-        later = torch.cat([state.expand(20000, -1), move.compute(later, action)[:, 12:]], -1)
-    first, last = members[:, 12:], later[:, 12:]
-    assert last.std(0).tolist() == pytest.approx([PUSH] * 4, rel=0.03)
-    assert ((last * first).mean(0) / first.square().mean(0)).tolist() == pytest.approx([2.718281828**-1] * 4, abs=0.03)
-
-
 def test_no_member_gets_faster_than_any_arm_was():
     """Beyond, the network would claim ever larger noises, and the members' velocities would grow without end."""
     arm = ARMS["reacher"]
@@ -209,7 +178,7 @@ def test_no_member_gets_faster_than_any_arm_was():
     with torch.no_grad():
         at_the_limit = move.faster(arm.join(angles, torch.tensor([50.0, -50.0])), action)
         beyond = move.faster(arm.join(angles, torch.tensor([1e4, -1e9])), action)
-        after = move.compute(without_push(arm, arm.join(angles, torch.tensor([1e4, -1e9]))).expand(8, -1), action)
+        after = move.compute(arm.join(angles, torch.tensor([1e4, -1e9])).expand(8, -1), action)
     for limit, value in zip(at_the_limit, beyond, strict=True):
         assert value.equal(limit)
     assert arm.split(after)[1].abs().max() == 50
@@ -230,8 +199,7 @@ def test_biases_fade_with_the_way_and_not_with_time():
     bias = 0.1 * torch.randn(20000, 4)
     for state, way in ((moving, 0.02 * 5), (resting, 0.02 * 1e-4)):
         with torch.no_grad():
-            members = torch.cat([without_push(arm, state).expand(20000, -1), bias], -1)
-            later = move.compute(members, torch.zeros(2))[:, 8:]
+            later = move.compute(torch.cat([state.expand(20000, -1), bias], -1), torch.zeros(2))[:, 6:]
         kept = (later * bias).mean(0) / bias.square().mean(0)
         assert kept.tolist() == pytest.approx([2.718281828 ** (-way / LENGTH)] * 4, abs=0.02)
         assert later.std(0).tolist() == pytest.approx([0.1] * 4, rel=0.03)
@@ -239,7 +207,7 @@ def test_biases_fade_with_the_way_and_not_with_time():
 
 def test_the_first_belief_shares_a_reading_between_places_and_biases():
     arm = ARMS["reacher"]
-    mean, std, bias = torch.zeros(8), torch.tensor([1.0, 1.0, 1.0, 1.0, 0.1, 0.2, 0.01, 0.02]), torch.full((4,), 0.003)
+    mean, std, bias = torch.zeros(6), torch.tensor([1.0, 1.0, 1.0, 1.0, 0.1, 0.2]), torch.full((4,), 0.003)
     start = FromPlaces(arm, mean=mean, std=std, bias=bias, ensemble_size=20000)
     angles = torch.tensor([0.3, 0.5])
     reading = arm.places(angles).flatten(-2)
@@ -248,7 +216,6 @@ def test_the_first_belief_shares_a_reading_between_places_and_biases():
     found, velocity = arm.split(ensemble)
     assert found.mean(0).tolist() == pytest.approx(angles.tolist(), abs=0.003)
     assert velocity.std(0).tolist() == pytest.approx([0.1, 0.2], rel=0.03)
-    assert ensemble[:, 6:8].std(0).tolist() == pytest.approx([0.01, 0.02], rel=0.03)  # pushes
     # Of the first link's direction: noise and bias across it, over its length.
     assert found[:, 0].std().item() == pytest.approx(0.005 / 0.12, rel=0.03)
     # What is read is place plus bias; the first place is on a circle, though, and so is compared across the link.

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
 from benchmarks.arms.arms import ARMS, NOISE
-from benchmarks.arms.filters import CREEP, DRIFT, PUSH, WHITE, ArmTransition, make_filter
+from benchmarks.arms.filters import CREEP, DRIFT, ArmTransition, make_filter
 from benchmarks.arms.sensor import JointSensor
 
 REACHER = ARMS["reacher"]
@@ -41,16 +41,16 @@ def white_noise(denkf, key):
 def test_the_filter_of_encoders_knows_their_noise_and_begins_at_rest():
     denkf = make_filter(REACHER, wandering(), None, None)
     assert white_noise(denkf, "reading") == pytest.approx([NOISE] * 4)
-    assert denkf.initial.std[4:].tolist() == pytest.approx([1e-3] * 2 + [PUSH] * 2)
-    assert denkf.initial.mean[4:].tolist() == [0.0] * 4
+    assert denkf.initial.std[4:].tolist() == pytest.approx([1e-3] * 2)
+    assert denkf.initial.mean[4:].tolist() == [0.0] * 2
 
 
 def test_the_filter_of_pictures_knows_their_errors_and_begins_at_rest():
     error = torch.tensor([0.01, 0.02, 0.03, 0.04])
     denkf = make_filter(REACHER, wandering(), JointSensor(REACHER), error)
-    assert white_noise(denkf, ("sensor", "reading")) == pytest.approx((WHITE * error).tolist())
-    assert denkf.initial.std[4:].tolist() == pytest.approx([1e-3] * 2 + [PUSH] * 2 + error.tolist())
-    assert denkf.initial.mean[4:].tolist() == [0.0] * 8
+    assert white_noise(denkf, ("sensor", "reading")) == pytest.approx(error.tolist())
+    assert denkf.initial.std[4:].tolist() == pytest.approx([1e-3] * 2 + error.tolist())
+    assert denkf.initial.mean[4:].tolist() == [0.0] * 6
     assert denkf["transition"].bias.equal(error)
 
 

@@ -8,7 +8,7 @@ pytest.importorskip("dm_control", reason="dm_control is not installed: pip insta
 
 from benchmarks.arms import study
 from benchmarks.arms.arms import ARMS, make_env, wrap
-from benchmarks.arms.filters import WHITE, make_filter
+from benchmarks.arms.filters import make_filter
 from benchmarks.arms.page import difference
 from benchmarks.arms.sensor import JointSensor
 from benchmarks.arms.study import Study, collect, compare, scores, trained
@@ -74,7 +74,7 @@ def test_the_filter_learns_how_much_the_sensor_errs(monkeypatch, tmp_path):
     assert denkf["transition"].bias.tolist() == pytest.approx(deviation.tolist(), rel=1e-3)
     assert denkf.initial.std[-4:].tolist() == pytest.approx(deviation.tolist(), rel=1e-3)
     noise = denkf["noise"](TensorDict({("sensor", "reading"): torch.zeros(4)}))["sensor", "noise"]
-    assert noise.sqrt().tolist() == pytest.approx((WHITE * deviation).tolist(), rel=1e-3)
+    assert noise.sqrt().tolist() == pytest.approx(deviation.tolist(), rel=1e-3)
 
 
 def test_the_reading_of_a_reset_is_always_there():
