@@ -35,6 +35,7 @@ class Arm:
     damping: float  # action a rad/s
     torques: tuple[float, ...]  # of full actions, N m
     view: float  # from the root, in the middle of a picture, to its side, m
+    creep: float  # noise of an angle in a step, for what the motion does not know: floor, things in the hand; rad
     ahead: float = 0.0  # direction of the links where all angles are 0, rad
     weights: tuple[float, ...] = (0.0, 0.0)  # torque of each link and of what it carries, when it lies flat, N m
 
@@ -107,7 +108,7 @@ class Arm:
 
 
 ARMS = {
-    "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3, (0.05, 0.05), 0.3065),
+    "reacher": Arm("reacher", "easy", (0.12, 0.12), 0.02, 2, 3.0, 0.3, (0.05, 0.05), 0.3065, 0.0005),
     "manipulator": Arm(
         domain="manipulator",
         task="bring_ball",
@@ -118,6 +119,7 @@ ARMS = {
         damping=0.15,
         torques=(12.0, 8.0, 4.0, 2.0),
         view=0.5587,
+        creep=0.003,
         ahead=torch.pi / 2,
         weights=(0.3833, 0.1662, 0.0617, 0.0145),
     ),

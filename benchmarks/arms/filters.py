@@ -16,10 +16,7 @@ from torch_denkf.training import Stage, train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT, CREEP = (
-    0.005,
-    0.0015,
-)  # noise of an angle beside that of the accelerations, rad: after a way of 1 rad, and a step
+DRIFT = 0.005  # noise of an angle after a way of 1 rad, beside those of the accelerations and of a step, rad
 LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
 FASTER = 1.25  # than any joint was seen to turn: no member is
 
@@ -71,7 +68,7 @@ class ArmTransition(m.SubModel):
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
         ways = self.arm.dt * velocity.abs()
         # Without the creep an arm at rest would be believed for ever.
-        drift = (DRIFT**2 * ways + CREEP**2).sqrt() * torch.randn_like(ways)
+        drift = (DRIFT**2 * ways + self.arm.creep**2).sqrt() * torch.randn_like(ways)
         turned = angles + self.arm.dt * torch.lerp(velocity, after, self.lead) + drift
         moved = self.arm.join(turned, after)
         if self.bias is None:

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
 from benchmarks.arms.arms import ARMS, NOISE, SIDE, Average, Encoders, HoldAngles, make_env, make_one, wrap
-from benchmarks.arms.filters import CREEP, DRIFT, LENGTH, ArmTransition, make_filter, train_motion
+from benchmarks.arms.filters import DRIFT, LENGTH, ArmTransition, make_filter, train_motion
 from benchmarks.arms.page import COLUMNS, difference, page
 from benchmarks.arms.sensor import CELLS, FromPlaces, JointPlaces, JointSensor
 from benchmarks.arms.study import collect, scores
@@ -155,7 +155,7 @@ def test_the_forecast_turns_by_the_new_velocity():
         angles, velocity = arm.split(move.compute(state, action))
     assert torch.allclose((velocity - torch.tensor([1.0, 2.0])).mean(0), mean, atol=float(5 * std.max() / 4000**0.5))
     turned = angles - torch.tensor([0.3, -0.5]) - arm.dt * velocity
-    drift = [(DRIFT**2 * arm.dt * speed + CREEP**2) ** 0.5 for speed in (1, 2)]
+    drift = [(DRIFT**2 * arm.dt * speed + arm.creep**2) ** 0.5 for speed in (1, 2)]
     assert turned.std(0).tolist() == pytest.approx(drift, rel=0.06)  # the drift alone
 
 

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm-control 'mujoco<4'")
 
 from benchmarks.arms.arms import ARMS, NOISE
-from benchmarks.arms.filters import CREEP, DRIFT, ArmTransition, make_filter
+from benchmarks.arms.filters import DRIFT, ArmTransition, make_filter
 from benchmarks.arms.sensor import JointSensor
 
 REACHER = ARMS["reacher"]
@@ -83,5 +83,5 @@ def test_no_angle_turns_further_than_the_fastest_arm_would():
     with torch.no_grad():
         turned, after = arm.split(move.compute(members, torch.zeros(5)))
     assert after.abs().max() <= 1
-    drift = (DRIFT**2 * arm.dt + CREEP**2) ** 0.5
+    drift = (DRIFT**2 * arm.dt + arm.creep**2) ** 0.5
     assert turned.abs().max() < arm.dt + 5 * drift
