@@ -204,9 +204,10 @@ def draw(rows: Sequence[dict], file: Path) -> None:
                 continue
             points = sorted((noise, *summary(found)) for noise, found in chosen)
             noise, center, low, high = np.array(points).T
+            color = f"C{list(ARMS).index('Kalman' if arm == 'physics' else arm)}"  # no task has both
             style = "--" if arm in ("truth", "Kalman", "physics") else "-"
-            axis.plot(noise, center, style, marker="o", markersize=3, color=f"C{list(ARMS).index(arm)}", label=arm)
-            axis.fill_between(noise, low, high, color=f"C{list(ARMS).index(arm)}", alpha=0.12, linewidth=0)
+            axis.plot(noise, center, style, marker="o", markersize=3, color=color, label=arm)
+            axis.fill_between(noise, low, high, color=color, alpha=0.12, linewidth=0)
         axis.set(title=TITLES[task], xlabel="standard deviation of a reading", ylabel="return of an episode")
         axis.legend(fontsize=8)
     save(figure, file)

@@ -52,12 +52,17 @@ def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
     ]
 
 
+def shifts(task: Task, cell: tuple[float, float]) -> bool:
+    """Whether the readings get noisier after the training in a cell."""
+    return task.shift is not None and cell[0] == task.shift_from
+
+
 def planned_tests(task_name: str, cell: tuple[float, float], arm_name: str, budget: Budget) -> list[tuple[str, int]]:
     """Of each row of a run the cell's name, and the environment steps."""
     task, name = TASKS[task_name], cell_name(cell)
     batches, tested = batches_of(task, budget)
     rows = [(name, number) for number in tested]
-    if task.shift not in (None, cell[0]):
+    if shifts(task, cell):
         after = (SHIFTED, LEFT) if ARMS[arm_name].filter else (SHIFTED,)
         rows += [(text.format(task.shift), batches) for text in after]
     return [(name, number * task.count * task.steps) for name, number in rows]
@@ -143,7 +148,7 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
             spent += time.process_time() - begun
             test(cell_name(cell), tests)
             begun = time.process_time()
-    if task.shift not in (None, cell[0]):
+    if shifts(task, cell):
         shifted = make_env(task, arm, budget.episodes, (task.shift, cell[1]), 2 * seed + 1, filter)
         if arm.memory:
             shifted.append_transform(get_primers_from_module(agent.policy))

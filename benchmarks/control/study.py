@@ -12,7 +12,7 @@ from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import write_page
 from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, cell_name, planned_tests, run
+from benchmarks.control.run import Budget, cell_name, planned_tests, run, shifts
 from benchmarks.control.shift import LEFT, SHIFTED
 from benchmarks.control.tasks import TASKS
 
@@ -99,21 +99,27 @@ def keep(study: Study, table: Path, budget: Budget) -> None:
 
 
 def _trained(task: str, name: str) -> tuple[float, float] | None:
-    """The cell that a row's run was trained in: its own, or the task's first if its readings got noisier afterwards."""
+    """The cell that a row's run was trained in: its own, or another if its readings got noisier afterwards."""
     cells = {cell_name(cell): cell for cell in CELLS.get(task, [])}
-    if cells and TASKS[task].shift is not None:
-        cells |= dict.fromkeys([SHIFTED.format(TASKS[task].shift), LEFT.format(TASKS[task].shift)], CELLS[task][0])
+    for cell in CELLS.get(task, []):
+        if shifts(TASKS[task], cell):
+            cells |= dict.fromkeys([SHIFTED.format(TASKS[task].shift), LEFT.format(TASKS[task].shift)], cell)
     return cells.get(name)
 
 
 def complete(study: Study) -> list[dict]:
-    """The rows of seeds with which all arms of a cell have run."""
-    files = []
+    """The rows of seeds with which all arms of a cell have run; says of others what they lack."""
+    files: list[Path] = []
     for task in study.tasks:
         for cell in CELLS[task]:
             for seed in SEEDS:
-                found = [part(study, task, cell, arm, seed) for arm in arms_of(task, cell)]
-                files += found if all(file.exists() for file in found) else []
+                found = {arm: part(study, task, cell, arm, seed) for arm in arms_of(task, cell)}
+                absent = [arm for arm, file in found.items() if not file.exists()]
+                files += [] if absent else found.values()
+                if 0 < len(absent) < len(found):
+                    print(
+                        f"Left out of the tables: {task}, {cell_name(cell)}, seed {seed}. Not run: {', '.join(absent)}."
+                    )
     return sorted(read_rows(files), key=COLUMNS.order)
 
 

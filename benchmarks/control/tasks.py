@@ -31,7 +31,8 @@ class Task:
         learning: of the filter.
         agent: PPO or SAC.
         env_steps: of a run, with those of random actions.
-        shift: noise of the readings in a second test, after all training; ``None`` for none.
+        shift: noise of the readings in a second test, after all training with ``shift_from``; ``None`` for none.
+        shift_from: the noise that the readings have before.
     """
 
     world: Callable[[int, float, float, int], EnvBase]
@@ -47,6 +48,7 @@ class Task:
     agent: type[ppo.PPO] | type[sac.SAC] = ppo.PPO
     env_steps: int = 100_000
     shift: float | None = None
+    shift_from: float = 0.1
 
 
 TASKS = {

@@ -73,6 +73,10 @@ def test_a_run_has_the_tests_that_were_planned():
     for task, cell, arm in (("hike", (0.4, 0.0), "last reading"), ("cartpole", (0.1, 0.0), "physics")):
         rows = run(task, cell, arm, 0, budget)
         assert [(row["cell"], row["env_steps"]) for row in rows] == planned_tests(task, cell, arm, budget)
+    further = planned_tests(
+        "cartpole-full", (0.2, 0.0), "physics", Budget()
+    )  # two cells would share the second test's name
+    assert {name for name, _ in further} == {"noise 0.2"}
 
 
 def test_a_smoke_run_knows_of_no_others(monkeypatch):
