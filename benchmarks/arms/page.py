@@ -49,7 +49,8 @@ def page(rows: Sequence[dict]) -> str:
     """The tables of all tasks and sources that there are rows of."""
     cases = [(task, source) for task in ARMS for source in SOURCES if pick(rows, task=task, source=source)]
     shown = dict.fromkeys((row["task"], row["source"], row["missing"]) for row in sorted(rows, key=COLUMNS.order))
-    lines = head("task", "missing", "angles, deg", "tip to goal, cm", "velocities, rad/s", "effort")
+    said = "Belief minus readings, in the same episodes: mean, its 95 % interval, and its share of the readings' mean."
+    lines = [said, "", *head("task", "missing", "angles, deg", "tip to goal, cm", "velocities, rad/s", "effort")]
     for task, source, missing in shown:
         case = {"task": task, "source": source, "missing": missing}
         names = ("angle", "tip", "velocity", "effort")
