@@ -59,8 +59,7 @@ class ArmTransition(m.SubModel):
         return self.change * (mean[0] - mean[1]), self.change * (0.002 + nn.functional.softplus(noise[0] - 1.5))
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        joints = self.arm.joints
-        state, bias = ensemble.tensor_split((3 * joints,), -1)
+        state, bias = ensemble.tensor_split((3 * self.arm.joints,), -1)
         angles, velocity = self.arm.split(state)
         velocity = velocity.clamp(-self.fastest, self.fastest)  # an analysis may have made a member faster
         action = action.to(angles.dtype).unsqueeze(-2).expand(*angles.shape[:-1], -1)

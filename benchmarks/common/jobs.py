@@ -14,8 +14,8 @@ from torch_denkf._files import write_text
 from torch_denkf._workers import follow_parent
 
 
-def once(file: Path, rows: Callable[[], list[dict] | dict]) -> None:
-    """Computes rows, say, and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+def once(file: Path, rows: Callable[[], list[dict]]) -> None:
+    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
     if file.exists():
         return
     write_text(file, json.dumps(rows()))
@@ -28,7 +28,8 @@ def same_settings(out: Path, settings: dict) -> None:
         SystemExit: if others are there; names them.
     """
     file, settings = out / "settings.json", json.loads(json.dumps(settings, default=str))
-    once(file, lambda: settings)
+    if not file.exists():
+        write_text(file, json.dumps(settings))
     there = json.loads(file.read_text())
     other = [name for name in {**settings, **there} if settings.get(name) != there.get(name)]
     if other:

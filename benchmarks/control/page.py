@@ -169,10 +169,10 @@ def lost(rows: Sequence[dict], task: str) -> list[str]:
     title = f"Percent of the return with {home} that is lost, with the same seeds. A negative loss is a gain."
     lines = ["", title, "", *head("cell", *names)]
     for cell in away:
-        before, after = ([_ends(rows, task, one, arm) for arm in names] for one in (home, cell))
-        shares = [
-            [100 * (1 - b[seed] / a[seed]) for seed in b if seed in a] for a, b in zip(before, after, strict=True)
-        ]
+        shares = []
+        for arm in names:
+            before, after = (_ends(rows, task, one, arm) for one in (home, cell))
+            shares.append([100 * (1 - value / before[seed]) for seed, value in after.items() if seed in before])
         lines.append(line(cell, *map(_text, shares)))
     return lines
 

@@ -47,24 +47,26 @@ class Budget:
 def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
     """How many batches of episodes a run has, and after which of them it is tested."""
     batches = max(1, (budget.env_steps or task.env_steps) // (task.count * task.steps))
-    return batches, [
-        n for n in range(1, batches + 1) if n * budget.tests // batches > (n - 1) * budget.tests // batches
-    ]
+    return batches, [number for number in range(1, batches + 1) if number * budget.tests % batches < budget.tests]
 
 
-def shifts(task: Task, cell: tuple[float, float]) -> bool:
-    """Whether the readings get noisier after the training in a cell."""
-    return task.shift is not None and cell[0] == task.shift_from
+def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
+    """Names of the tests in which the readings are noisier than in the training: with the filter told, and with not.
+
+    None of a cell after whose training the readings stay as they are.
+    """
+    if task.shift is None or cell[0] != task.shift_from:
+        return []
+    return [text.format(cell_name((task.shift, cell[1]))) for text in (SHIFTED, LEFT)]
 
 
 def planned_tests(task_name: str, cell: tuple[float, float], arm_name: str, budget: Budget) -> list[tuple[str, int]]:
     """Of each row of a run the cell's name, and the environment steps."""
-    task, name = TASKS[task_name], cell_name(cell)
+    task = TASKS[task_name]
     batches, tested = batches_of(task, budget)
-    rows = [(name, number) for number in tested]
-    if shifts(task, cell):
-        after = (SHIFTED, LEFT) if ARMS[arm_name].filter else (SHIFTED,)
-        rows += [(text.format(task.shift), batches) for text in after]
+    rows = [(cell_name(cell), number) for number in tested]
+    after = shifted_names(task, cell)[: 2 if ARMS[arm_name].filter else 1]
+    rows += [(name, batches) for name in after]
     return [(name, number * task.count * task.steps) for name, number in rows]
 
 
@@ -148,14 +150,14 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
             spent += time.process_time() - begun
             test(cell_name(cell), tests)
             begun = time.process_time()
-    if shifts(task, cell):
+    if names := shifted_names(task, cell):
         shifted = make_env(task, arm, budget.episodes, (task.shift, cell[1]), 2 * seed + 1, filter)
         if arm.memory:
             shifted.append_transform(get_primers_from_module(agent.policy))
         with told(filter, task.shift):
-            test(SHIFTED.format(task.shift), shifted)
+            test(names[0], shifted)
         if filter is not None:
-            test(LEFT.format(task.shift), shifted)
+            test(names[1], shifted)
     return rows
 
 

@@ -11,7 +11,7 @@ import torch
 from torch_denkf.filters import Filter
 
 NOT_TRAINED = "not trained"
-SHIFTED = f"noise {{:g}}, {NOT_TRAINED}"
+SHIFTED = f"{{}}, {NOT_TRAINED}"
 LEFT = f"{SHIFTED}, R as learned"
 
 

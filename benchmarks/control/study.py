@@ -12,8 +12,7 @@ from benchmarks.common.arguments import parse, some_of
 from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import write_page
 from benchmarks.control.page import COLUMNS, draw, page
-from benchmarks.control.run import Budget, cell_name, planned_tests, run, shifts
-from benchmarks.control.shift import LEFT, SHIFTED
+from benchmarks.control.run import Budget, cell_name, planned_tests, run, shifted_names
 from benchmarks.control.tasks import TASKS
 
 BELIEFS = ("belief mean", "belief mean, spread", "ensemble")
@@ -100,11 +99,10 @@ def keep(study: Study, table: Path, budget: Budget) -> None:
 
 def _trained(task: str, name: str) -> tuple[float, float] | None:
     """The cell that a row's run was trained in: its own, or another if its readings got noisier afterwards."""
-    cells = {cell_name(cell): cell for cell in CELLS.get(task, [])}
     for cell in CELLS.get(task, []):
-        if shifts(TASKS[task], cell):
-            cells |= dict.fromkeys([SHIFTED.format(TASKS[task].shift), LEFT.format(TASKS[task].shift)], cell)
-    return cells.get(name)
+        if name in (cell_name(cell), *shifted_names(TASKS[task], cell)):
+            return cell
+    return None
 
 
 def complete(study: Study) -> list[dict]:
@@ -117,9 +115,8 @@ def complete(study: Study) -> list[dict]:
                 absent = [arm for arm, file in found.items() if not file.exists()]
                 files += [] if absent else found.values()
                 if 0 < len(absent) < len(found):
-                    print(
-                        f"Left out of the tables: {task}, {cell_name(cell)}, seed {seed}. Not run: {', '.join(absent)}."
-                    )
+                    where = f"{task}, {cell_name(cell)}, seed {seed}"
+                    print(f"Left out of the tables: {where}. Not run: {', '.join(absent)}.")
     return sorted(read_rows(files), key=COLUMNS.order)
 
 

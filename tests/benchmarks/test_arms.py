@@ -181,6 +181,10 @@ def test_no_member_gets_faster_than_any_arm_was():
         after = move.compute(arm.join(angles, torch.tensor([1e4, -1e9])).expand(8, -1), action)
     for limit, value in zip(at_the_limit, beyond, strict=True):
         assert value.equal(limit)
+    mean, std = at_the_limit  # all begin the step at the limit
+    least = 50 - mean.abs().max() - 5 * std.max()
+    for speed in (arm.split(after)[1] * torch.tensor([1.0, -1.0])).unbind(-1):
+        assert least < speed.min() <= speed.max() <= 50
     assert arm.split(after)[1].abs().max() == 50
 
 

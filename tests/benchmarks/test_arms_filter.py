@@ -68,7 +68,7 @@ def test_an_angle_turns_by_the_share_of_the_change_that_leads():
     move = ArmTransition(REACHER, one, 50 * one, one, lead)
     move.module = Says(slice(6, 8))  # actions
     angles, velocity = torch.tensor([0.3, -0.5]), torch.tensor([1.0, 2.0])
-    members = torch.nn.functional.pad(REACHER.join(angles, velocity), (0, 2)).expand(4000, -1)
+    members = REACHER.join(angles, velocity).expand(4000, -1)
     turned, after = REACHER.split(move.compute(members, torch.tensor([10.0, -10.0])))
     assert after.mean(0).tolist() == pytest.approx([11.0, -8.0], abs=1e-3)
     steps = [REACHER.dt * (1 + 0.5 * 10), REACHER.dt * (2 - 0.25 * 10)]
@@ -79,7 +79,7 @@ def test_no_angle_turns_further_than_the_fastest_arm_would():
     """Not even of a member that the analysis made faster than that."""
     arm, one = ARMS["manipulator"], torch.ones(4)
     move = ArmTransition(arm, one, one, one, 0.8 * one)
-    members = torch.nn.functional.pad(arm.join(0 * one, 100 * one), (0, 4)).expand(64, -1)
+    members = arm.join(0 * one, 100 * one).expand(64, -1)
     with torch.no_grad():
         turned, after = arm.split(move.compute(members, torch.zeros(5)))
     assert after.abs().max() <= 1

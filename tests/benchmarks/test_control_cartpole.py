@@ -159,6 +159,7 @@ def test_a_filter_learns_the_cartpole_from_readings_alone():
     task = TASKS["cartpole"]
     learner = Learner(filter, task.prior, 32, task.learning)
     learner.add(rollout(cartpole.NoisyCartpole(32, 0.1), None, cartpole.STEPS, ExplorationType.RANDOM))
+    assert learner.episodes[:]["observation"][..., 0].abs().max() <= task.learning.within  # the ends of the track
     learner.update(100)
     noise = filter["noise"].log_variance.div(2).exp()
     torch.testing.assert_close(noise, torch.full((3,), 0.1), rtol=0.1, atol=0)

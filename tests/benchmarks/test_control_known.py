@@ -25,7 +25,7 @@ def test_known_rows_are_not_run_again(tmp_path):
     study.COLUMNS.write(complete(found), tmp_path / "again.csv")
     assert (tmp_path / "again.csv").read_text() == (tmp_path / "few.csv").read_text()
     one = json.loads(part(found, "cartpole", (0.1, 0.0), "LSTM", 3).read_text())
-    assert {row["cell"] for row in one} == {"noise 0.1", SHIFTED.format(0.3)}  # an LSTM has no R
+    assert {row["cell"] for row in one} == {"noise 0.1", SHIFTED.format("noise 0.3")}  # an LSTM has no R
     part(found, "hike", (0.4, 0.0), "LSTM", 0).write_text("[]")
     study.keep(found, tmp_path / "few.csv", Budget())
     assert part(found, "hike", (0.4, 0.0), "LSTM", 0).read_text() == "[]"  # what has run is not overwritten
@@ -73,10 +73,17 @@ def test_a_run_has_the_tests_that_were_planned():
     for task, cell, arm in (("hike", (0.4, 0.0), "last reading"), ("cartpole", (0.1, 0.0), "physics")):
         rows = run(task, cell, arm, 0, budget)
         assert [(row["cell"], row["env_steps"]) for row in rows] == planned_tests(task, cell, arm, budget)
-    further = planned_tests(
-        "cartpole-full", (0.2, 0.0), "physics", Budget()
-    )  # two cells would share the second test's name
-    assert {name for name, _ in further} == {"noise 0.2"}
+
+
+def test_no_two_cells_share_the_name_of_a_test(monkeypatch):
+    """Not even where the noise rises after the training in both; each row is found to be of its own cell."""
+    cells = [(0.1, 0.0), (0.1, 0.3), (0.2, 0.0)]
+    monkeypatch.setitem(study.CELLS, "cartpole-full", cells)
+    names = [{name for name, _ in planned_tests("cartpole-full", cell, "physics", Budget())} for cell in cells]
+    assert [len(each) for each in names] == [3, 3, 1]
+    assert len(set.union(*names)) == 7
+    for cell, each in zip(cells, names, strict=True):
+        assert {study._trained("cartpole-full", name) for name in each} == {cell}
 
 
 def test_a_smoke_run_knows_of_no_others(monkeypatch):

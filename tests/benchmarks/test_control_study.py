@@ -363,14 +363,14 @@ def test_the_truth_of_another_cell_brings_no_seeds(tmp_path):
 
 def test_what_reads_the_truth_is_not_there_where_a_filter_keeps_its_r():
     """The truth has rows of both noises, but none of "R as learned": it has no R."""
-    cells = {"noise 0.1": 800.0, SHIFTED.format(0.3): 700.0, LEFT.format(0.3): 600.0}
+    cells = {"noise 0.1": 800.0, SHIFTED.format("noise 0.3"): 700.0, LEFT.format("noise 0.3"): 600.0}
     rows = [
         {"task": "cartpole", "cell": cell, "arm": arm, "seed": seed, "env_steps": 9, "return": value, "wall_s": 1.0}
         for cell, value in cells.items()
         for arm in ("belief mean", "LSTM", "truth")
         for seed in range(2)
-        if arm == "belief mean" or cell != LEFT.format(0.3)
+        if arm == "belief mean" or cell != LEFT.format("noise 0.3")
     ]
     lines = page(rows).splitlines()
-    (left,) = [line for line in lines if line.startswith(f"| {LEFT.format(0.3)} |") and "25.0" in line]
+    (left,) = [line for line in lines if line.startswith(f"| {LEFT.format('noise 0.3')} |") and "25.0" in line]
     assert [part.split()[:1] for part in left.split("|")[2:-1]] == [[], ["25.0"], []]
