@@ -105,15 +105,14 @@ class Steps(NamedTuple):
             What transition and update write.
         """
         structure, start = self.structure, {} if start is None else start
-        written = self.run([structure.transition], entries, call)
         entries = dict(entries)
         if reset is not None:
-            for key in structure.carry:
-                start_value = start[key]
-                if key in structure.forecast_of:
-                    forecast_key = structure.forecast_of[key]
-                    written[forecast_key] = where_rows(reset, start_value, written[forecast_key])
-                entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
+            # Before the transition, too: its gradient would be NaN where the episode before diverged.
+            entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
+        written = self.run([structure.transition], entries, call)
+        if reset is not None:
+            for key, forecast_key in structure.forecast_of.items():
+                written[forecast_key] = where_rows(reset, start[key], written[forecast_key])
         return self._update(entries, written, call, reset, start, missing)
 
     def first(
