@@ -15,8 +15,8 @@ __all__ = ["Checked", "check_arguments", "check_key"]
 class Checked:
     """A class whose constructor is told by its annotations what it takes.
 
-    An argument that is annotated as a key, a list of keys, a flag, a function or a module is one; an argument of another
-    name is refused. Numbers and tensors are checked by the constructors, which know their limits.
+    An argument that is annotated as a key, a list of keys, a flag or a function is one; an argument of another name is
+    refused. Numbers and tensors are checked by the constructors, which know their limits.
 
     Example:
         >>> class Reader(Checked):
@@ -88,8 +88,17 @@ def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
             annotation = str(parameter.annotation)
             kind = getattr(function, "__globals__", {}).get(annotation.removeprefix("Unpack[").removesuffix("]"))
             open_ended = not annotation.startswith("Unpack[") or kind is None
-            options = {} if open_ended else dict(_fields(kind))
+            options = _of_bases(owner) if open_ended else dict(_fields(kind))
     return signature.replace(parameters=parameters), options, open_ended
+
+
+def _of_bases(owner: type) -> dict[str, str]:
+    """What the next class takes, to which ``**kwargs`` are handed on, by name."""
+    for base in owner.__mro__[1:]:
+        if "__init__" in base.__dict__ and issubclass(base, Checked):
+            signature, options, _ = _signature(base)
+            return {name: str(one.annotation) for name, one in signature.parameters.items()} | options
+    return {}
 
 
 def _fields(kind: type) -> Iterator[tuple[str, str]]:
@@ -101,7 +110,7 @@ def _fields(kind: type) -> Iterator[tuple[str, str]]:
 def _check(owner: str, name: str, value: Any, annotation: str) -> None:
     optional = annotation.endswith(" | None")
     kind = annotation.removesuffix(" | None")
-    if (value is None and optional) or kind not in _KINDS and not kind.startswith("Callable["):
+    if (value is None and optional) or (kind not in _KINDS and not kind.startswith("Callable[")):
         return
     fits, words = _KINDS.get(kind, _FUNCTION)
     if kind == "str" and not name.endswith(("_key", "_prefix", "prefix")):

@@ -5,6 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs import TransformedEnv
 
 from tests.filters.factories import linear_denkf
 from tests.filters.test_contract import FILTERS, every_filter, readings
@@ -24,7 +25,6 @@ from torch_denkf.modules import (
     SubModel,
 )
 from torch_denkf.transforms import DEnKFTransform
-from torchrl.envs import TransformedEnv
 
 
 def memories(*tensors):

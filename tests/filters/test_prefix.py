@@ -1,4 +1,4 @@
-"""A name in front of all that a filter writes: two filters side by side, and one behind the other. Oracle: each alone."""
+"""A name in front of all that a filter writes: two filters side by side, one behind the other. Oracle: each alone."""
 
 import pytest
 import torch

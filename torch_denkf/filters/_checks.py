@@ -21,7 +21,6 @@ __all__ = [
     "AbsurdReading",
     "check_inputs",
     "refuse_absurd_readings",
-    "refuse_group_readings",
     "refuse_non_finite",
     "refuse_single_readings",
     "refuse_two_precisions",
@@ -61,7 +60,6 @@ def check_inputs(
                 "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
                 "part of the policy."
             )
-    refuse_group_readings(structure, entries, tensordict.batch_size)
     missing = [
         key
         for key in (*structure.needed, *structure.required_controls)
@@ -84,8 +82,9 @@ def refuse_unguarded(filter: Filter) -> None:
     structure, name = filter.structure, type(filter).__name__
     for place, module in structure.unmasked:
         raise ValueError(
-            f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads no "
-            'mask that could hide one: name it in optional_keys=["observed"], and say self.observed_key = "observed".'
+            f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads "
+            'no mask that could hide one: name it in optional_keys=["observed"], and say self.observed_key = '
+            '"observed".'
         )
     guarded = {key for guard in structure.guards for key in (*guard.whole, *guard.components)}
     for key in structure.readings:
@@ -95,21 +94,6 @@ def refuse_unguarded(filter: Filter) -> None:
                 f"{name} is to reject readings that cannot be true, and {', '.join(readers)} does not say which entry "
                 f'is the mask of {key!r}: self.observed_key = "observed", for example.'
             )
-
-
-def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Sequence[int]) -> None:
-    """Raises a ``ValueError`` where a raw reading has dimensions that neither the batch nor an ensemble has."""
-    size = len(batch_size)
-    members = next((entries[key].shape[-2] for key in structure.carry if key[-1] == "ensemble" and key in entries), None)
-    for key in structure.plain:
-        value = entries.get(key)
-        if value is None or value.ndim <= size + 1 or (value.ndim == size + 2 and value.shape[-2] == members):
-            continue
-        raise ValueError(
-            f"The reading {key!r} is {list(value.shape)}, and the batch is {list(batch_size)}: {value.ndim - size - 1} "
-            "dimension(s) too many. Readings of several robots need a belief for each: filter a tensordict whose batch "
-            "holds the robots, such as tensordict['agents'] of a group. Readings of one robot side by side: flatten(-2)."
-        )
 
 
 def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, reject: bool) -> None:

@@ -21,7 +21,7 @@ from torch_denkf.filters._entries import own, write
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._said import mark_carried, say_eager, say_foreign, say_ignored_mask, say_up_to_date
 from torch_denkf.filters._slices import starts_of
-from torch_denkf.filters._steps import blank
+from torch_denkf.filters._steps import blank, where_rows
 from torch_denkf.filters._structure import KNOWN, previous_key, submodels
 from torch_denkf.filters._summaries import summaries
 from torch_denkf.modules._call import Call, Entries
@@ -100,6 +100,7 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
         written = steps.frames(entries, call)
         entries.update(written)
         start = filter.initial_belief(entries, call)
+        entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
         written.update(steps.advance(entries, call, reset, start))
         blank(steps, written, reset)
     if filter.check_finite and not torch.compiler.is_compiling():
@@ -135,7 +136,7 @@ def initial_belief(filter: Filter, entries: Entries, call: Call) -> Entries:
     """See :meth:`Filter.initial_belief`."""
     belief = filter.structure.belief
     hidden = {key: value for key, value in entries.items() if key not in belief}
-    return own(summaries(run_module(filter.initial, hidden, call.part("initial")), belief), entries.values())
+    return own(summaries(filter, run_module(filter.initial, hidden, call.part("initial"))), entries.values())
 
 
 def first_belief(

@@ -37,7 +37,7 @@ def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[Nest
             raise ValueError(
                 f"Episodes of this environment end in {groups[0]} alone, and torchrl then keeps what stands outside of "
                 f"that group, as {key!r} would: the belief would go on from the episode before. Give the environment a "
-                'done of its own, at the root; or, where the group has the batch size of the environment, give the '
+                "done of its own, at the root; or, where the group has the batch size of the environment, give the "
                 f"filter the name of the group, prefix={groups[0][0]!r}."
             )
 
@@ -90,8 +90,8 @@ class LastAction(TensorDictPrimer):
         taken = [key for key in self._carried if key in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(
-                f"The environment carries {taken[0]!r} already, for another filter of the policy: both would start from "
-                'one belief. Give one of them a name of its own, prefix="imu" for example.'
+                f"The environment carries {taken[0]!r} already, for another filter of the policy: both would start "
+                'from one belief. Give one of them a name of its own, prefix="imu" for example.'
             )
         return super().transform_observation_spec(observation_spec)
 

@@ -140,7 +140,7 @@ def say_foreign(filter: Filter, belief: torch.Tensor) -> None:
             filter,
             "foreign",
             f"{type(filter).__name__} in a policy starts its step from a belief that another filter wrote. Where both "
-            "are in one policy, give one of them a name of its own, prefix=\"imu\" for example.",
+            'are in one policy, give one of them a name of its own, prefix="imu" for example.',
         )
 
 

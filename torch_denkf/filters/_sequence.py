@@ -86,7 +86,9 @@ def stepped(filter: Filter, tensordict: TensorDictBase) -> Tensor:
     first[..., 0] = True
     new = first if new is None else first | new.reshape(size)
     if all(tensordict.get(filter.outer(previous_key(key)), None) is not None for key in filter.structure.carry):
-        known = tensordict.get(filter.outer(KNOWN), None)  # a policy's data: every element with a belief before it is a step
+        known = tensordict.get(
+            filter.outer(KNOWN), None
+        )  # a policy's data: every element with a belief before it is a step
         return torch.ones_like(new) if known is None else known.reshape(size)
     return ~new
 
@@ -123,7 +125,7 @@ def filter_rows(
         begins, resumes = _beginnings(structure, entries, new, size)
         fresh = begins
     if stored:  # these have seen their frame
-        starts = summaries({key: entries[key] for key in structure.carry}, structure.belief, entries)
+        starts = summaries(filter, {key: entries[key] for key in structure.carry}, entries)
     elif begins is None:  # where only the first element starts, only its initial belief is needed
         head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
         starts = filter.initial_belief(head, call._replace(batch_size=torch.Size((*size[:-1], 1))))

@@ -185,7 +185,8 @@ def _sorted(
 ) -> tuple[list[Placed], list[Placed]]:
     """The modules that read frames alone; and the others, the transition first.
 
-    A module that depends on the action and not on the belief, such as a reading's noise, runs behind the transition.
+    A module that depends on the action and not on the belief, such as a reading's noise, runs behind the transition. So
+    does one that carries entries of its own alone, such as a count.
     """
     frames: list[Placed] = []
     driven: list[Placed] = []
@@ -193,7 +194,9 @@ def _sorted(
     on_action, on_belief = set(controls), set(carry)
     for place, module in modules:
         read = {*chain(*reads(module))}
-        if not on_belief.isdisjoint(read):
+        if not steps and not on_belief.isdisjoint(read) and set(writes(module)) <= set(carry):
+            driven.append((place, module))
+        elif not on_belief.isdisjoint(read):
             steps.append((place, module))
             on_belief.update(writes(module))
         elif not on_action.isdisjoint(read):
@@ -201,7 +204,9 @@ def _sorted(
             on_action.update(writes(module))
         else:
             frames.append((place, module))
-    made = {key: place for place, module in driven for key in writes(module)}
+    if not steps:
+        raise ValueError(f"No module forecasts {list(carry)}: each that reads the belief writes over it.")
+    made = {key: place for place, module in driven for key in writes(module) if key not in carry}
     for key in chain(*reads(steps[0][1])):
         if key in made:
             raise ValueError(
@@ -217,9 +222,9 @@ def _refuse_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules:
         both = [key for key in writes(module) if key in read and key not in carry]
         if both:
             raise ValueError(
-                f"{place!r} ({type(module).__name__}) writes {both[0]!r}, which the filter also reads from outside: the "
-                "next step would take what this one wrote for a new reading. Write it under another key, and let the "
-                "modules behind it read that one; or carry it from step to step: let the initial belief write it."
+                f"{place!r} ({type(module).__name__}) writes {both[0]!r}, which the filter also reads from outside: "
+                "the next step would take what this one wrote for a new reading. Write it under another key, and let "
+                "the modules behind it read that one; or carry it from step to step: let the initial belief write it."
             )
 
 

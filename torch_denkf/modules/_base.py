@@ -128,6 +128,10 @@ class SubModel(Checked, TensorDictModule):
         """The modules inside that may draw noise of their own, by name."""
         return {}
 
+    def of_carry(self, entries: Entries) -> Entries:
+        """Of an initial belief: what else of the belief follows from the entries that are carried on, by key."""
+        return {}
+
     def on_entries(self, entries: Entries, call: Call) -> Entries:
         """What the sub-model writes where ``entries`` are; changes nothing.
 

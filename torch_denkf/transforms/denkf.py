@@ -17,9 +17,9 @@ from torch_denkf._arguments import Checked
 from torch_denkf.filters import Filter, Monitored
 from torch_denkf.filters._checks import refuse_unguarded
 from torch_denkf.filters._entries import own
-from torch_denkf.filters._primer import refuse_resets_of_groups
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
+from torch_denkf.filters._primer import refuse_resets_of_groups
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters._steps import where_rows
@@ -220,11 +220,9 @@ class DEnKFTransform(Checked, Transform):
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
         if given and all(value is not None for value in given.values()):
             mask = self._reset_mask(tensordict)
-            for key in self.filter.belief_keys:
-                value = given.get(key, tensordict.get(key, None))
-                if value is not None:
-                    start.set(key, value.clone() if mask is None else where_rows(mask, start.get(key), value))
-            start = self.filter.summarise(start)
+            for key, value in given.items():
+                start.set(key, value.clone() if mask is None else where_rows(mask, start.get(key), value))
+            start = self.filter.summarise(start.exclude(*(key for key in self.filter.belief_keys if key not in given)))
         if self.check_finite:
             entries = self.filter.entries_of(start, one_step=True)
             self._assert_finite(entries, used=self.filter.update_at_reset)
