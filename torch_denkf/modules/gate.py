@@ -216,12 +216,19 @@ class GatedAnalysis(InPlaceOf):
     def on_entries(self, entries, call):
         """The belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
-        entries = self._with_mask(self._with_noise(entries, call), call)
+        plain = self._with_mask(self._with_noise(entries, call), call)
+        if self.of_ensemble:
+            plain = self.module.aligned(plain)
         if self.adapt_noise:
-            entries = self._noisier(entries, log_noise.exp())
+            plain = self._noisier(plain, log_noise.exp())
+        entries, inflation = plain, torch.ones_like(log_inflation)
         if self.adapt_inflation:
-            entries = self._wider(entries, log_inflation.exp())
-        out = self.module.on_entries(entries, call)
+            mask = plain.get(self.observed_key)
+            inflation = log_inflation.exp()
+            if mask is not None:  # without a reading there is nothing to make up for, and factors would pile up
+                inflation = torch.where(mask.any(-1, keepdim=True), inflation, 1)
+            entries = self._wider(plain, inflation)
+        out = self._analyse(entries, call)
         nis, innovation = (out[self.info_key, name] for name in ("nis", "innovation"))
         check_observation_dim(self.observation_dim, innovation, f"the gate {self.gate_key!r}")
         part, freedom = self._parts(entries, nis, innovation)
@@ -244,10 +251,11 @@ class GatedAnalysis(InPlaceOf):
                 terms = torch.where(opens[..., None, :, None], 0, terms)
                 shut = torch.where(rejected, shut + 1, torch.where(seen, 0, shut))
                 reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
-                out = self._without(self._wider(entries, reach), call, rejected)
                 seen = seen & ~rejected  # an outlier is no measure of the noise
+                wider = torch.where(seen.any(-1, keepdim=True), inflation * reach, 1)
+                out = self._without(self._wider(plain, wider), call, rejected)
             else:
-                out = self.module.on_entries(self._noisier(entries, factor), call)
+                out = self._analyse(self._noisier(entries, factor), call)
         else:
             factor = torch.ones_like(part)
         if self.adapt_noise:
@@ -269,6 +277,10 @@ class GatedAnalysis(InPlaceOf):
         nis, innovation = (by_key[self.info_key, name] for name in ("nis", "innovation"))
         none = nis.new_zeros(*nis.shape[:-1], self.parts_count)
         return (*out, *values[inner : len(self.in_keys)], none + 1, nis, innovation, none)
+
+    def _analyse(self, entries: Entries, call: Call) -> Entries:
+        """What the analysis writes; the angles of an ensemble's entries are on one turn already."""
+        return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
         """The entries with the random numbers that both runs share, and the variances that a Kalman analysis holds."""
@@ -321,8 +333,8 @@ class GatedAnalysis(InPlaceOf):
         if self.by_component:
             mask = entries.get(self.observed_key)
             kept = ~rejected if mask is None else mask & ~rejected
-            return self.module.on_entries({**entries, self.observed_key: kept}, call)
-        out = self.module.on_entries(entries, call)
+            return self._analyse({**entries, self.observed_key: kept}, call)
+        out = self._analyse(entries, call)
         values = self.module.without_reading(*(entries[key] for key in self.module.in_keys))
         none = dict(zip(map(unravel_key, self.module.out_keys), values, strict=True))
         return {key: torch.where(expand_as_right(rejected, value), none[key], value) for key, value in out.items()}

@@ -11,7 +11,6 @@ import torch
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import (
     Neighbours,
-    align_angles,
     ensemble_mean,
     ensemble_var,
     letkf,
@@ -21,6 +20,7 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules._tensors import mean_of_members
 
 __all__ = ["LocalEnsembleAnalysis"]
 
@@ -141,7 +141,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        predicted, observation = self._aligned(predicted, observation, observed)
+        observation = mean_of_members(observation, predicted.shape[:-2])
         ensemble = self._analyse(forecast, predicted, observation, variance, observed, noise, 1)
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
@@ -159,17 +159,12 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
         Each component learns from the observations near it now. What moves far in L steps needs a larger radius.
         """
-        predicted, observation = self._aligned(predicted, observation, observed)
+        observation = mean_of_members(observation, predicted.shape[:-2])
         lag, flat = past.shape[-2], past.flatten(-2)
         moved = self._analyse(flat, predicted, observation, variance, observed, noise, lag)
         if observed is not None:
             moved = torch.where(observed.any(-1)[..., None, None], moved, flat)
         return moved.unflatten(-1, past.shape[-2:])
-
-    def _aligned(self, predicted, observation, observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """The predicted observations, and one observation on their side of the circle."""
-        predicted, observation = align_angles(predicted, observation, self.angles, observed)
-        return predicted, observation.mean(-2) if observation.ndim == predicted.ndim else observation
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
         """The analysis of ``copies`` states side by side, rotated."""
