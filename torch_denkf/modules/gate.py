@@ -38,13 +38,14 @@ class GateOptions(TypedDict, total=False):
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
-        patience: after so many rejected steps in a row the gate opens: the forecast is spread until it reaches the
-            reading, and the window is emptied. 50 by default.
+        patience: after so many rejected steps in a row the gate opens: the forecast, and the past states that are
+            carried beside it, are spread until they reach the reading, and the window is emptied. 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
         adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
             steps that are remembered; 0 by default, for none.
         adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
-            likewise. Innovations tell that something is too small, not what: use one of the two.
+            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
+            is too small, not what: use one of the two.
         gate_key: prefix of the state, ``"gate"`` by default.
     """
 
@@ -253,7 +254,7 @@ class GatedAnalysis(InPlaceOf):
                 reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
                 seen = seen & ~rejected  # an outlier is no measure of the noise
                 wider = torch.where(seen.any(-1, keepdim=True), inflation * reach, 1)
-                out = self._without(self._wider(plain, wider), call, rejected)
+                out = self._without(self._with_past(self._wider(plain, wider), reach), call, rejected)
             else:
                 out = self._analyse(self._noisier(entries, factor), call)
         else:
@@ -327,6 +328,15 @@ class GatedAnalysis(InPlaceOf):
             return {**entries, key: entries[key] * factor.unsqueeze(-1)}
         keys = self.module.in_keys[:2]  # states, and what is predicted of them
         return {**entries, **{key: spread_about_mean(entries[key], factor.sqrt()) for key in keys}}
+
+    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
+        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+        if not isinstance(self.module, LaggedAnalysis):
+            return entries
+        key = self.module.in_keys[-1]
+        past = entries[key]
+        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
+        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
         """What the analysis writes without what is rejected ``[*B, K]``."""
