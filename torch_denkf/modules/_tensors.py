@@ -16,6 +16,7 @@ __all__ = [
     "as_vector",
     "check_dims",
     "mean_of_members",
+    "refuse_trained",
     "register_constant",
     "register_location",
     "register_scale",
@@ -50,6 +51,18 @@ def register_constant(
         module.register_parameter(name, nn.Parameter(tensor.clone()))
     else:
         module.register_buffer(name, tensor)
+
+
+def refuse_trained(name: str, value: Any, why: str) -> None:
+    """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
+
+    Raises:
+        ValueError: if it does; ``name`` is the argument's.
+    """
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(
+            f"{name} asks for a gradient and would never be trained: {why}. Detach it, and choose it on validation data"
+        )
 
 
 def register_location(module: nn.Module, name: str, value: Tensor | Sequence | float | None) -> None:

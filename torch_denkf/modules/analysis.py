@@ -20,7 +20,7 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._tensors import check_dims
+from torch_denkf.modules._tensors import check_dims, refuse_trained
 
 __all__ = ["EnsembleAnalysis"]
 
@@ -45,7 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     Raises:
         ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and
-            factors of ``taper`` that are not finite.
+            factors of ``taper`` that are not finite or ask for a gradient.
         KeyError: if an entry is missing.
 
     Example:
@@ -87,6 +87,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
                 check_values(name.replace("_", "'s "), factors)
+                refuse_trained("taper", factors, "its factors are constants")
             self.register_buffer(name, factors, persistent=False)
 
     @property

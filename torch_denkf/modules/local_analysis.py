@@ -20,9 +20,11 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._tensors import mean_of_members
+from torch_denkf.modules._tensors import mean_of_members, refuse_trained
 
 __all__ = ["LocalEnsembleAnalysis"]
+
+_CHOSEN_ONCE = "which observations count, and how much, is found once"
 
 
 class LocalEnsembleAnalysis(EnsembleUpdate):
@@ -51,7 +53,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             be NaN, readings and variances alike.
 
     Raises:
-        ValueError: if a taper is not a matrix, or the sizes do not fit.
+        ValueError: if a taper is not a matrix or asks for a gradient, or the sizes do not fit.
         KeyError: if an entry is missing.
 
     Source:
@@ -89,6 +91,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
+        refuse_trained("near", near.taper, _CHOSEN_ONCE)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile
@@ -108,13 +111,15 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         Args:
             states: places of the components, ``[S, D]``, in any unit.
             observations: places of the observations, ``[O, D]``.
-            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii.
+            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii. It is a constant:
+                which observations are near is found once.
             period: ``[D]``, circumferences of those coordinates that are circles, ``inf`` for the others.
             **kwargs: passed on to the constructor.
 
         Raises:
-            ValueError: if the radius is not positive.
+            ValueError: if the radius is not positive, or asks for a gradient.
         """
+        refuse_trained("radius", radius, _CHOSEN_ONCE)
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
