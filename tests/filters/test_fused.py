@@ -13,6 +13,7 @@ from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, l
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter, FusedFilter, FusedSensor, Refiltering
 from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.functional import wrap_angles
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
@@ -21,6 +22,7 @@ from torch_denkf.modules import (
     EKFTransition,
     EnsembleAnalysis,
     GaussianPrior,
+    JoinedReading,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
@@ -194,6 +196,50 @@ def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kin
     assert_close(out["belief", "mean"][:, 6:], alone["belief", "mean"], rtol=0, atol=0)
     assert (alone["info", "second", "nis"][:, :DELAY] == 0).all()
     assert (alone["info", "second", "nis"][:, DELAY:] > 0).all()
+
+
+def moved_and_read(steps, late, reading, *, mean, cov, noise):
+    """A prior after so many steps, with one reading of the second sensor that was taken ``late`` steps before."""
+    F, Q, H, R = linear_system()
+    for step in range(steps + 1):
+        mean, cov = (F @ mean, F @ cov @ F.mT + noise * Q) if step else (mean, cov)
+        if step == steps - late:
+            gain = cov @ H[1:].mT / (H[1:] @ cov @ H[1:].mT + R[1])
+            mean, cov = mean + gain @ (reading - H[1:] @ mean), cov - gain @ H[1:] @ cov
+    return mean, cov
+
+
+@pytest.mark.parametrize("update_at_reset", [False, True])
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
+    """Of every step of the episode; not of one before, not of one to come, not of one beyond the lag."""
+    members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
+    if kind == "Kalman":
+        motion, initial = LinearTransition(F, Q), MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.rand(2)))
+        prior = {"mean": initial.mean, "cov": initial.cov, "noise": 1.0}
+    else:
+        motion, initial = NoisyLinear(F), FixedEnsemble(members)
+        prior = {"mean": members.mean(0), "cov": members.mT.cov(), "noise": 0.0}
+    delay = 3
+    own = sensors(delay=delay, late="late")
+    filter = FusedFilter(motion, own, initial=initial, update_at_reset=update_at_reset)
+    used = []
+    for steps in range(not update_at_reset, 6):
+        for late in range(-1, delay + 2):
+            frames = TensorDict({"first": torch.zeros(steps + 1, 1)}, [steps + 1])
+            frames["second"] = torch.full_like(frames["first"], 4.0)
+            frames["first_observed"] = torch.zeros(steps + 1, 1, dtype=torch.bool)
+            frames["second_observed"] = frames["first_observed"].index_fill(0, torch.tensor([steps]), True)
+            frames["late"] = torch.full((steps + 1, 1), late)
+            belief = filter.sequence(frames)[-1]
+            counts = 0 <= late <= min(steps, delay)
+            mean, cov = moved_and_read(steps, late if counts else -1, torch.tensor([4.0]), **prior)
+            assert_close(belief["belief", "mean"], mean, rtol=0, atol=1e-10)
+            assert_close(belief["belief", "var"], cov.diagonal(), rtol=0, atol=1e-10)
+            assert (belief["info", "second", "nis"] > 0).item() == counts
+            assert belief["smoothed", "age"].item() == min(steps, delay)
+            used.append(counts)
+    assert sum(used) == (18 if update_at_reset else 17)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -465,6 +511,15 @@ def test_angles_side_by_side(float64):
         means.append(kf.sequence(frames.copy())["belief", "mean"])
     assert_close(means[0], means[1], rtol=0, atol=1e-10)
     assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
+
+
+def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
+    samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
+    numbers = torch.tensor([[1.0], [2.0], [6.0]])
+    td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
+    found = JoinedReading(["a", "b"], ["qa", "qb"], [(), (0,)], reading_key="c", noise_key="qc")(td)["c"]
+    assert_close(found[0], torch.tensor(3.0))
+    assert_close(wrap_angles(found[1:] - torch.pi - 0.1, [0]), torch.zeros(1), rtol=0, atol=1e-12)
 
 
 def test_covariances_of_readings_side_by_side(float64):
