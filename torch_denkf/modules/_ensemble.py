@@ -110,10 +110,10 @@ class EnsembleUpdate(SubModel):
         """
         if not self.angles:
             return entries
-        _, predicted, reading, _ = self.in_keys
-        values = (self.required(entries, key) for key in (predicted, reading))
-        aligned = align_angles(*values, self.angles, entries.get(self.observed_key))
-        return {**entries, **dict(zip((predicted, reading), aligned, strict=True))}
+        keys = self.in_keys[1:3]
+        predicted, reading = (self.required(entries, key) for key in keys)
+        aligned = align_angles(predicted, reading, self.angles, entries.get(self.observed_key))
+        return {**entries, **dict(zip(keys, aligned, strict=True))}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
         """The belief and the diagnostics of entries as :meth:`aligned` gives them."""
