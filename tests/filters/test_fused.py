@@ -1,5 +1,8 @@
 """Several sensors in one filter: one Kalman filter of all readings in their order is the oracle."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,15 +11,18 @@ from torch.testing import assert_close
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
-from torch_denkf.filters import EKF, DEnKF, Filter, FusedFilter, FusedSensor
+from torch_denkf.filters import EKF, DEnKF, Filter, FusedFilter, FusedSensor, Refiltering
 from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.functional import wrap_angles
 from torch_denkf.modules import (
     CholeskyNoise,
     ConstantNoise,
     DiagonalNoise,
+    EKFAnalysis,
     EKFTransition,
     EnsembleAnalysis,
     GaussianPrior,
+    JoinedReading,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
@@ -25,6 +31,7 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     StochasticMLP,
+    UKFAnalysis,
     UKFTransition,
     VectorSensor,
 )
@@ -49,16 +56,17 @@ def sensors(**second):
     }
 
 
-def fused(kind, *, joint=False, lag=None, members=None, noisy=True, **second):
+def fused(kind, *, joint=False, lag=None, members=None, noisy=True, analysis=None, **second):
     F, Q, _, _ = linear_system()
+    options = {"joint": joint, "lag": lag, "analysis": analysis}
     if kind == "ensemble":
         motion = NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None)
-        return FusedFilter(motion, sensors(**second), initial=FixedEnsemble(members), joint=joint, lag=lag)
+        return FusedFilter(motion, sensors(**second), initial=FixedEnsemble(members), **options)
     motion = LinearTransition(F, Q)
     if kind != "Kalman":
         motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), known_noise())
     initial = MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.tensor([1.0, 2.0])))
-    return FusedFilter(motion, sensors(**second), initial=initial, joint=joint, lag=lag)
+    return FusedFilter(motion, sensors(**second), initial=initial, **options)
 
 
 def readings():
@@ -190,6 +198,50 @@ def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kin
     assert (alone["info", "second", "nis"][:, DELAY:] > 0).all()
 
 
+def moved_and_read(steps, late, reading, *, mean, cov, noise):
+    """A prior after so many steps, with one reading of the second sensor that was taken ``late`` steps before."""
+    F, Q, H, R = linear_system()
+    for step in range(steps + 1):
+        mean, cov = (F @ mean, F @ cov @ F.mT + noise * Q) if step else (mean, cov)
+        if step == steps - late:
+            gain = cov @ H[1:].mT / (H[1:] @ cov @ H[1:].mT + R[1])
+            mean, cov = mean + gain @ (reading - H[1:] @ mean), cov - gain @ H[1:] @ cov
+    return mean, cov
+
+
+@pytest.mark.parametrize("update_at_reset", [False, True])
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
+    """Of every step of the episode; not of one before, not of one to come, not of one beyond the lag."""
+    members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
+    if kind == "Kalman":
+        motion, initial = LinearTransition(F, Q), MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.rand(2)))
+        prior = {"mean": initial.mean, "cov": initial.cov, "noise": 1.0}
+    else:
+        motion, initial = NoisyLinear(F), FixedEnsemble(members)
+        prior = {"mean": members.mean(0), "cov": members.mT.cov(), "noise": 0.0}
+    delay = 3
+    own = sensors(delay=delay, late="late")
+    filter = FusedFilter(motion, own, initial=initial, update_at_reset=update_at_reset)
+    used = []
+    for steps in range(not update_at_reset, 6):
+        for late in range(-1, delay + 2):
+            frames = TensorDict({"first": torch.zeros(steps + 1, 1)}, [steps + 1])
+            frames["second"] = torch.full_like(frames["first"], 4.0)
+            frames["first_observed"] = torch.zeros(steps + 1, 1, dtype=torch.bool)
+            frames["second_observed"] = frames["first_observed"].index_fill(0, torch.tensor([steps]), True)
+            frames["late"] = torch.full((steps + 1, 1), late)
+            belief = filter.sequence(frames)[-1]
+            counts = 0 <= late <= min(steps, delay)
+            mean, cov = moved_and_read(steps, late if counts else -1, torch.tensor([4.0]), **prior)
+            assert_close(belief["belief", "mean"], mean, rtol=0, atol=1e-10)
+            assert_close(belief["belief", "var"], cov.diagonal(), rtol=0, atol=1e-10)
+            assert (belief["info", "second", "nis"] > 0).item() == counts
+            assert belief["smoothed", "age"].item() == min(steps, delay)
+            used.append(counts)
+    assert sum(used) == (18 if update_at_reset else 17)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_state_a_lag_ago_is_that_of_the_smoother(float64, kind):
     frames = readings()
@@ -197,6 +249,90 @@ def test_the_state_a_lag_ago_is_that_of_the_smoother(float64, kind):
     out = fused(kind, lag=4, joint=True).sequence(frames.copy())
     for name in ("mean", "cov", "var", "age"):
         assert_close(out["smoothed", name], expected["smoothed", name], rtol=0, atol=1e-10)
+
+
+SPREAD = {
+    "Kalman": partial(EKFAnalysis, inflation=1.3),
+    "UKF": partial(UKFAnalysis, inflation=1.3),
+    "ensemble": partial(EnsembleAnalysis, "etkf", inflation=1.3),
+}
+
+
+def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
+    """A Kalman filter by hand, one sensor after the other, each followed by inflation: beliefs and forecasts."""
+    F, Q, H, R = linear_system()
+    means, covs = [mean.expand(B, 2)], [cov.expand(B, 2, 2)]
+    moved = []
+    for row in frames.unbind(1)[1:]:
+        mean, cov = means[-1] @ F.mT, F @ covs[-1] @ F.mT + noise * Q
+        moved.append((mean, cov))
+        for index, name in enumerate(("first", "second")):
+            h, seen = H[index], row[f"{name}_observed"]
+            gain = (cov @ h) / (h @ cov @ h.unsqueeze(-1) + R[index])
+            new = mean + gain * (row[name] - mean @ h.unsqueeze(-1))
+            shrunk = cov - gain.unsqueeze(-1) * (h @ cov).unsqueeze(-2)
+            mean = torch.where(seen, new, mean)
+            cov = torch.where(seen.unsqueeze(-1), factor**2 * shrunk, cov)
+        means.append(mean)
+        covs.append(cov)
+    return means, covs, moved
+
+
+def test_inflation_is_that_of_readings_in_their_order_when_they_are_filtered_again(float64):
+    frames, late = readings(), PATTERNS["out of order"]
+    lately = {"late": ("second", "second_observed")}
+    out = Refiltering(fused("Kalman", analysis=SPREAD["Kalman"]), lately, DELAY).sequence(arriving(frames, late))
+    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
+    for now in range(T):
+        means, covs, _ = inflated(arrived(frames, late, now), 1.3, **start)
+        assert_close(out["belief", "mean"][:, now], means[-1], rtol=0, atol=1e-10)
+        assert_close(out["belief", "cov"][:, now], covs[-1], rtol=0, atol=1e-10)
+
+
+def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):
+    """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
+    frames, lag, F = readings(), 3, linear_system()[0]
+    out = FixedLag(fused("Kalman", analysis=SPREAD["Kalman"]), lag).sequence(frames.copy())
+    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
+    means, covs, moved = inflated(frames, 1.3, **start)
+    mean, cov = means[-1], covs[-1]
+    for step in range(T - 2, T - 2 - lag, -1):
+        gain = covs[step] @ F.mT @ torch.linalg.inv(moved[step][1])
+        mean = means[step] + (gain @ (mean - moved[step][0]).unsqueeze(-1)).squeeze(-1)
+        cov = covs[step] + gain @ (cov - moved[step][1]) @ gain.mT
+    assert_close(out["belief", "cov"][:, -1], covs[-1], rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "mean"][:, -1], mean, rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "cov"][:, -1], cov, rtol=0, atol=1e-10)
+
+
+def test_an_ensemble_with_a_lag_inflates_its_present_alone(float64):
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    frames, given = readings(), {"members": members, "noisy": False, "analysis": SPREAD["ensemble"]}
+    out = fused("ensemble", lag=3, **given).sequence(frames.copy())
+    means, covs, _ = inflated(frames, 1.3, noise=0.0, mean=members.mean(0), cov=members.mT.cov())
+    assert_close(out["belief", "mean"], torch.stack(means, 1), rtol=0, atol=1e-10)
+    variances = torch.stack(covs, 1).diagonal(dim1=-2, dim2=-1)
+    assert_close(out["belief", "var"], variances, rtol=1e-9, atol=1e-10)
+    expected = FixedLag(fused("ensemble", **given), 3).sequence(frames.copy())
+    assert_close(out["smoothed", "ensemble"], expected["smoothed", "ensemble"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_inflation_that_would_spread_the_past_is_refused(joint):
+    members = torch.randn(7, 2)
+    for kind, analysis in SPREAD.items():
+        with pytest.raises(ValueError, match=r"inflation or relaxation of .* let Refiltering make them again"):
+            fused(kind, members=members, joint=joint, analysis=analysis, delay=DELAY)
+        if kind != "ensemble":
+            with pytest.raises(ValueError, match=r"inflation or relaxation of .* put FixedLag\(filter, lag\) around"):
+                fused(kind, joint=joint, analysis=analysis, lag=DELAY)
+    relaxed = partial(EnsembleAnalysis, "etkf", relaxation=0.5)
+    with pytest.raises(ValueError, match="inflation or relaxation"):
+        fused("ensemble", members=members, joint=joint, analysis=relaxed, delay=DELAY)
+    own = sensors(delay=DELAY)
+    own["first"] = replace(own["first"], analysis=SPREAD["ensemble"])  # in time, and not inflated for the late one
+    with pytest.raises(ValueError, match="inflation or relaxation of 'first'"):
+        FusedFilter(NoisyLinear(linear_system()[0]), own, initial=FixedEnsemble(members))
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
@@ -375,6 +511,15 @@ def test_angles_side_by_side(float64):
         means.append(kf.sequence(frames.copy())["belief", "mean"])
     assert_close(means[0], means[1], rtol=0, atol=1e-10)
     assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
+
+
+def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
+    samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
+    numbers = torch.tensor([[1.0], [2.0], [6.0]])
+    td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
+    found = JoinedReading(["a", "b"], ["qa", "qb"], [(), (0,)], reading_key="c", noise_key="qc")(td)["c"]
+    assert_close(found[0], torch.tensor(3.0))
+    assert_close(wrap_angles(found[1:] - torch.pi - 0.1, [0]), torch.zeros(1), rtol=0, atol=1e-12)
 
 
 def test_covariances_of_readings_side_by_side(float64):

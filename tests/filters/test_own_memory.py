@@ -162,7 +162,7 @@ def test_one_matrix_for_all_is_four_matrices():
 
 def test_a_parameter_that_would_not_be_trained_is_refused():
     learned = nn.Parameter(torch.eye(2))
-    with pytest.raises(TypeError, match="matrix requires a gradient, and would be copied into a constant"):
+    with pytest.raises(ValueError, match="matrix asks for a gradient and would never be trained"):
         LinearObservation(learned)
     transition = LinearTransition(learned, torch.eye(2), trainable=True)
     assert isinstance(transition.matrix, nn.Parameter)

@@ -14,6 +14,7 @@ from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianPrior,
     LearnedTransition,
+    MappedNoise,
     MomentPrior,
     NoisePerSecond,
     Select,
@@ -118,6 +119,14 @@ def test_noise_per_second_adds_up_over_steps_of_any_length(float64):
     out = car.sequence(frames)
     assert_close(out["belief", "mean"][-1, 0], torch.tensor(10.0))
     assert_close(out["belief", "var"][-1, 3:], torch.tensor([0.25, 0.01]))
+
+
+def test_a_covariance_per_second_grows_with_the_seconds(float64):
+    root = torch.tensor([[0.5, 0.0], [0.2, 0.1]])
+    walk = ConstantNoise([1.0, 1.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    td = TensorDict({"dt": torch.tensor([[0.0], [0.2], [3.0]]), "belief": {"mean": torch.zeros(3, 2)}}, [3])
+    found = NoisePerSecond(MappedNoise(walk, root))(td)["forecast", "noise"]
+    assert_close(found, torch.tensor([0.0, 0.2, 3.0]).reshape(3, 1, 1) * (root @ root.mT))
 
 
 def test_the_drift_is_learned(float64):

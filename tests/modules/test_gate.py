@@ -1,6 +1,7 @@
 """Gated analyses: inert ones change nothing; the others against closed forms and simulated systems."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from tests.filters.gaussian_for_tests import linear_filter
 from torch_denkf import DEnKFTransform, LinearGaussianEnv
 from torch_denkf.filters import Gated, KalmanFilter, LSTMFilter, Monitored
 from torch_denkf.functional import adapt, chi_square_quantile, disbelief
-from torch_denkf.modules import GatedAnalysis, InnovationMonitor, MonitoredSensor
+from torch_denkf.modules import EnsembleAnalysis, GatedAnalysis, InnovationMonitor, KalmanAnalysis, MonitoredSensor
+from torch_denkf.modules._calibration import chi_square_table
 
 FILTERS = {
     "etkf": lambda: linear_denkf("etkf", noisy=True),
@@ -279,6 +281,128 @@ def test_calibration_holds_what_clean_data_show():
     share = gated.sequence(fresh.clone())["gate", "factor"].isinf().double().mean()
     assert naive > 0.1
     assert share < 0.015
+
+
+def gate_of(kind, dim=1, **options):
+    """A gate around the update of a forecast N(0, 1) by readings with noise 1, and that forecast."""
+    if kind == "ensemble":
+        members = torch.randn(5 * dim, dim).double()
+        members = members - members.mean(0)
+        members = members @ torch.linalg.inv(torch.linalg.cholesky(members.mT.cov().reshape(dim, dim))).mT
+        forecast = {"ensemble": members, "observation": members}
+        analysis = EnsembleAnalysis("etkf", sensor_key="reading")
+    else:
+        forecast = {"mean": torch.zeros(dim).double(), "cov": torch.eye(dim).double()}
+        analysis = KalmanAnalysis(torch.eye(dim).double(), None, observation_key="reading")
+    gate = GatedAnalysis(analysis, dim, **options).double()
+    td = TensorDict({"forecast": forecast, "sensor": {"noise": torch.ones(dim).double()}})
+    for key, value in zip(gate.state_keys, gate.initial_state([], dtype=torch.float64), strict=True):
+        td[key] = value
+    return gate, td
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_an_adapted_factor_multiplies_the_forecasts_variance(kind):
+    gate, td = gate_of(kind, rate=0.0, adapt_inflation=0.1)
+    td["gate", "log_inflation"] += math.log(4.0)
+    out = gate(td.set("reading", torch.tensor([2.0]).double()))
+    assert out["belief", "mean"].item() == pytest.approx(2.0 * 4 / 5)
+    assert out["belief", "var"].item() == pytest.approx(4 / 5)
+    assert out["gate", "log_inflation"].item() == pytest.approx(math.log(4.0) + 0.1 * (2.0**2 / 5 - 1))
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_a_gate_that_opens_spreads_the_forecast_by_the_innovation_of_each_component(kind):
+    """Three components: q = |y|^2 / 2, of which each explains a third."""
+    reading = torch.tensor([9.0, -6.0, 12.0]).double()
+    reach = reading.square().sum().item() / 2 / 3
+    gate, td = gate_of(kind, 3, response="reject", window=1, patience=2)
+    td["gate", "shut"] += 2
+    out = gate(td.set("reading", reading))
+    assert out["gate", "factor"].item() == 1
+    torch.testing.assert_close(out["belief", "mean"], reading * reach / (reach + 1))
+    torch.testing.assert_close(out["belief", "var"], torch.full((3,), reach / (reach + 1)).double())
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_adapted_spread_is_never_below_the_forecasts_own(kind):
+    """Innovations that are far too small: the factor stays one, and the belief is that without a gate."""
+    gate, td = gate_of(kind, rate=0.0, adapt_inflation=0.5)
+    plain = gate.module(td.copy().set("reading", torch.tensor([0.1]).double()))
+    for _ in range(3):
+        td = gate(td.set("reading", torch.tensor([0.1]).double()))
+        assert td["gate", "log_inflation"].item() == 0
+        assert torch.equal(td["belief", "var"], plain["belief", "var"])
+
+
+def test_what_was_rejected_is_believed_again_when_it_fits_well():
+    """6.0 lies below the limit, 10.8, and above that of a reading whose forerunner was rejected, 3.8."""
+    gate, td = gate_of("Kalman", response="reject", window=1, rate=1e-3)
+    factors = []
+    for q in (6.0, 20.0, 6.0, 2.0, 6.0):
+        td = gate(td.set("reading", torch.tensor([math.sqrt(2 * q)]).double()))
+        factors.append(td["gate", "factor"].item())
+    assert factors == [1.0, math.inf, math.inf, 1.0, 1.0]
+
+
+def test_a_gap_without_readings_does_not_begin_the_patience_anew():
+    gate, td = gate_of("Kalman", response="reject", window=1, patience=3)
+    td["reading"], shut = torch.tensor([50.0]).double(), []
+    for observed in (True, True, False, True, True):
+        td = gate(td.set("observed", torch.tensor([observed])))
+        shut.append(td["gate", "shut"].item())
+    assert shut == [1, 2, 2, 3, 0]
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_a_rejected_reading_is_no_measure_of_the_noise(kind):
+    gate, td = gate_of(kind, response="reject", window=1, adapt_noise=0.1)
+    found = []
+    for value in (1.0, 50.0, -50.0):
+        td = gate(td.set("reading", torch.tensor([value]).double()))
+        found.append(td["gate", "log_noise"].item())
+    assert found == pytest.approx([0.1 * (1 / 2 - 1)] * 3)
+
+
+def test_by_component_the_given_mask_counts_beside_what_is_rejected():
+    gate, td = gate_of("ensemble", 3, response="reject", window=1, by_component=True)
+    td["reading"] = torch.tensor([1.0, 40.0, 2.0]).double()
+    given, kept = torch.tensor([True, True, False]), torch.tensor([True, False, False])
+    out = gate(td.copy().set("observed", given))
+    assert out["gate", "factor"].tolist() == [1.0, math.inf, 1.0]
+    expected = gate.module(td.copy().set("observed", kept))
+    torch.testing.assert_close(out["belief", "ensemble"], expected["belief", "ensemble"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "by_component"), [*((name, False) for name in FILTERS), ("etkf", True)])
+@pytest.mark.parametrize("response", ["reject", "huber"])
+def test_with_an_adapted_spread_a_hidden_or_rejected_reading_is_as_good_as_none(name, by_component, response):
+    """The spread is adapted where a reading is used: without one it would grow from step to step, without end."""
+    gated = Gated(FILTERS[name](), DIM, adapt_inflation=0.3, response=response, window=1, by_component=by_component)
+    row, outs = run(gated, data(steps=20))[:, -1], {}
+    row["gate", "log_inflation"].fill_(1.0)
+    for kind in ("none", "hidden", *(["rejected"] if response == "reject" else [])):
+        step = row.clone()
+        step["observation"] = 1e3 + step["observation"].to(step["belief", "mean"].dtype)
+        step["observed"] = torch.full((3, 1), kind == "rejected")
+        torch.manual_seed(5)
+        outs[kind] = gated.predict(step) if kind == "none" else gated.step(step)
+        for key in ("mean", "var"):
+            torch.testing.assert_close(outs[kind]["belief", key], outs["none"]["belief", key])
+    assert response != "reject" or outs["rejected"]["gate", "factor"].isinf().all()
+
+
+@pytest.mark.parametrize("response", RESPONSES)
+def test_gates_are_open_while_they_are_calibrated(response):
+    """The oracle is the filter without a gate: its innovations are what is calibrated to."""
+    clean = data(runs=20, steps=60, dtype=torch.float32)
+    plain = run(linear_kalman(), clean)["info", "nis"].flatten().double()
+    gated = Gated(linear_kalman(), response=response, window=1, rate=0.2)  # it would act in every fifth step
+    assert (run(gated, clean)["gate", "factor"] > 1).any()
+    gated.calibrate([clean])
+    expected = chi_square_table(plain[plain > 0], DIM).to(gated.gates[0].tables.dtype)
+    torch.testing.assert_close(gated.gates[0].tables[0], expected)
+    assert gated.gates[0].rate == 0.2
 
 
 def test_functions_refuse_and_hold():

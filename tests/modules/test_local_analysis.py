@@ -6,7 +6,13 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import DEnKF
-from torch_denkf.functional import Neighbours, gaspari_cohn, relax_to_prior_spread
+from torch_denkf.functional import (
+    Neighbours,
+    gaspari_cohn,
+    neighbours,
+    neighbours_of_taper,
+    relax_to_prior_spread,
+)
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -226,3 +232,20 @@ def test_errors_name_what_is_wrong():
         LocalEnsembleAnalysis(torch.ones(3, S))(inputs())
     with pytest.raises(KeyError, match="sensor"):
         LocalEnsembleAnalysis(torch.ones(S, S))(inputs().exclude("sensor"))
+
+
+def test_what_would_never_be_trained_is_refused_by_name(float64):
+    """A radius, a taper and the places that it follows from are constants: no gradient step would move them."""
+    radius, taper = nn.Parameter(torch.tensor(2.0)), torch.rand(S, S, requires_grad=True)
+    with pytest.raises(ValueError, match=r"radius asks for a gradient .* Detach it"):
+        LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
+    with torch.no_grad(), pytest.raises(ValueError, match="radius asks"):
+        LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
+    for near in (taper, neighbours_of_taper(taper), neighbours(PLACES.clone().requires_grad_(), PLACES, 2.0)):
+        with pytest.raises(ValueError, match="near asks for a gradient"):
+            LocalEnsembleAnalysis(near)
+    with pytest.raises(ValueError, match="taper asks for a gradient"):
+        EnsembleAnalysis("sakov", taper=(torch.ones(S, S), taper))
+    td = inputs()
+    found = LocalEnsembleAnalysis.around(PLACES, PLACES, radius.detach())(td.clone())["belief", "ensemble"]
+    assert found.equal(LocalEnsembleAnalysis.around(PLACES, PLACES, 2.0)(td.clone())["belief", "ensemble"])

@@ -74,6 +74,27 @@ def test_long_windows_make_the_whiteness_normal():
     assert within_binomial_error((p < 0.05).double().mean().item(), 0.05, len(p))
 
 
+@pytest.mark.parametrize(("whiteness", "noise", "tests"), [(False, False, 4), (True, False, 6), (True, True, 7)])
+def test_all_tests_of_all_sensors_share_the_false_alarms_equally(whiteness, noise, tests):
+    """Window and sum of two sensors; whiteness, where it may raise the alarm; a noise that one of them claims."""
+    rate = 0.012
+    sensors = {name: MonitoredSensor(("info", name), 1) for name in ("gps", "wheel")}
+    if noise:
+        sensors["gps"] = sensors["gps"]._replace(noise_key=("sensor", "noise"))
+    watch = InnovationMonitor(sensors, false_alarm_rate=rate, whiteness=whiteness).double()
+    for limit in (watch.p_limit, watch.whiteness_limit):
+        assert limit.tolist() == pytest.approx([rate / tests] * 2)
+    assert watch.cusum_limit.tolist() == pytest.approx([cusum_threshold(tests / rate)] * 2)
+
+
+def test_with_whiteness_alarms_of_single_steps_come_at_their_rate_too():
+    """Of a window of two steps: the sum of both is exact, the correlation of two has wider tails than a normal."""
+    rate = 0.03
+    watch = monitor(window=2, false_alarm_rate=rate, whiteness=True)
+    p = Monitored(kalman(), watch).sequence(simulate(4000, 21))["monitor", "gps", "p_value"][:, 2::2]
+    assert within_binomial_error((p < watch.p_limit).double().mean().item(), rate / 3, p.numel())
+
+
 def test_alarms_of_the_sum_come_after_its_run_length():
     rate = 0.01
     watch = monitor(false_alarm_rate=rate)
@@ -156,8 +177,10 @@ def test_what_is_not_observed_changes_nothing():
     data = simulate(3, 40)
     data["observed"] = torch.ones(3, 40, 1, dtype=torch.bool)
     data["observed"][:, 20:30] = False
+    data["observation"][:, 15:20] += 1.5
     data["observation"][:, 20:30] = torch.nan
     out = Monitored(kalman(), monitor()).sequence(data)["monitor"]
+    assert (out["gps", "cusum"][:, 19] > 1).all(), "what could fall"
     for key in (("gps", "p_value"), ("gps", "cusum"), ("gps", "terms"), "alarm"):
         assert torch.equal(out[key][:, 19:29], out[key][:, 20:30]), key
     assert out["gps", "p_value"].isfinite().all()

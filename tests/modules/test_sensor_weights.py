@@ -13,6 +13,7 @@ from torch_denkf.filters import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianPrior,
+    LearnedObservation,
     LearnedTransition,
     LinearObservation,
     LinearTransition,
@@ -85,6 +86,36 @@ def test_the_network_sees_innovations_in_standard_deviations(float64):
     assert_close(innovations["first"], (rows["first"][:, -1] - mean @ H[:1].mT) / spread.sqrt(), rtol=0, atol=1e-9)
     assert (innovations["second"] == 0).all()
     assert observed.tolist() == [[True, False]] * 3
+
+
+class Folded(nn.Module):
+    """An angle between -pi and pi."""
+
+    def forward(self, angle):
+        return torch.atan2(angle.sin(), angle.cos())
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+@pytest.mark.parametrize("samples", [False, True])
+def test_an_innovation_of_angles_is_the_shorter_way_round(float64, kind, samples):
+    """The members lie on both sides of pi, with a mean of 3.1; the reading, -3.0, is 0.183 further round."""
+    members = 0.2 * torch.randn(9, 1)
+    members = members - members.mean() + 3.1
+    assert (members.max(), members.min()) > (torch.pi, 0)
+    network, one = Constant(1.0), torch.eye(1)
+    compass = {"compass": FusedSensor(LearnedObservation(Folded()), [0.3], angles=[0])}
+    if kind == "Kalman":
+        motion, initial = LinearTransition(one, 0 * one), MomentPrior(members.mean(0), members.var(0).diag())
+    else:
+        motion, initial = NoisyLinear(one), FixedEnsemble(members)
+    reading = torch.tensor([-3.0])
+    if samples:
+        reading = Folded()(reading + 0.3 * torch.linspace(-1, 1, 9).unsqueeze(-1))
+        assert reading.max() > 3
+    filter = FusedFilter(motion, compass, initial=initial, weights=network)
+    filter.sequence(TensorDict({"compass": torch.stack([reading] * 2)}, [2]))
+    expected = (2 * torch.pi - 6.1) / (members.var() + 0.09).sqrt()
+    assert_close(network.given[0]["compass"], expected.expand(1), rtol=0, atol=1e-9)
 
 
 def test_a_late_reading_is_judged_by_what_is_believed_of_its_time(float64):

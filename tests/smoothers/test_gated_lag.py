@@ -5,9 +5,18 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import linear_denkf, linear_system
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
+from tests.filters.test_fused import fused
 from torch_denkf.filters import FusedFilter, FusedSensor, Gated
-from torch_denkf.modules import GatedAnalysis, GateOptions, GaussianPrior, LearnedTransition, LinearObservation
+from torch_denkf.modules import (
+    GatedAnalysis,
+    GateOptions,
+    GaussianPrior,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+)
 from torch_denkf.smoothers import EnKS, FixedLag
 
 WRONG = (7, 8, 13)
@@ -114,3 +123,38 @@ def test_a_smoother_of_a_gated_filter_leaves_out_what_the_gate_rejects(float64):
     smoothed, out = EnKS(gated, lag=4)(off(readings())), gated.sequence(off(readings()))
     expected = EnKS(linear_denkf(), lag=4)(hidden(readings(), out))
     assert_close(smoothed["smoothed", "mean"], expected["smoothed", "mean"], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_gate_opens_to_readings_of_an_ensemble_as_to_those_of_a_kalman_filter(float64, delay):
+    """Without noise the motion leaves members the covariance of a Kalman filter, that of earlier states included."""
+    F, _, H, R = linear_system()
+    members = torch.randn(9, 2)
+    sensors = {"late": FusedSensor(LinearObservation(H), R.sqrt(), delay=delay)}
+    prior = MomentPrior(members.mean(0), members.mT.cov())
+    filters = {
+        "ensemble": FusedFilter(NoisyLinear(F), sensors, initial=FixedEnsemble(members), lag=3),
+        "Kalman": FusedFilter(LinearTransition(F, torch.zeros(2, 2)), sensors, initial=prior, lag=3),
+    }
+    frames = TensorDict({"late": 0.3 * torch.randn(2, 24, 2)}, [2, 24])
+    frames["late"][:, 8:] += 30.0  # the state is elsewhere, which the filter holds for impossible
+    options = {"response": "reject", "window": 1, "patience": 4}
+    out = {name: Gated(filter, **options).sequence(frames.copy()) for name, filter in filters.items()}
+    for key in (("belief", "mean"), ("belief", "var"), ("smoothed", "mean"), ("smoothed", "var"), ("gate", "factor")):
+        assert_close(out["ensemble"][key], out["Kalman"][key], rtol=1e-8, atol=1e-8)
+    shut = out["Kalman"]["gate", "shut"]
+    assert (shut.amax(1) == 4).all()
+    assert (shut.diff(dim=1) == -4).any(1).all(), "it opens"
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_adapted_spread_is_refused_where_the_past_is_observed(float64, kind):
+    """It is inflation; around a filter without a past it is that of readings in their order."""
+    with pytest.raises(ValueError, match="Refiltering"):
+        Gated(fused(kind, delay=3, members=torch.randn(7, 2)), adapt_inflation=0.1)
+    if kind == "Kalman":
+        with pytest.raises(ValueError, match="FixedLag"):
+            Gated(fused(kind, lag=3), adapt_inflation=0.1)
+    else:
+        Gated(fused(kind, lag=3, members=torch.randn(7, 2)), adapt_inflation=0.1)
+    Gated(fused(kind, delay=3, members=torch.randn(7, 2)), adapt_noise=0.1)

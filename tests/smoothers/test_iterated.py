@@ -48,6 +48,16 @@ def test_without_process_noise_it_is_the_kalman_smoother(float64, iterations):
     assert_equal(out, expected, [("smoothed", "age")])
 
 
+def test_of_samples_the_mean_is_the_reading(float64):
+    frames = drive(3, 7)
+    expected = linear(6, initial=linear_denkf("etkf").initial).sequence(frames.copy())
+    spread = torch.randn(3, 7, 6, 2)
+    frames["observation"] = frames["observation"].unsqueeze(-2) + spread - spread.mean(-2, keepdim=True)
+    out = linear(6, initial=linear_denkf("etkf").initial).sequence(frames)
+    for key in (("belief", "ensemble"), ("smoothed", "ensemble"), ("info", "innovation"), ("info", "nis")):
+        assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+
+
 def test_with_process_noise_many_members_are_the_kalman_smoother(float64):
     frames, size = drive(2, 6), 500
     expected = FixedLag(linear_kalman(), 1).sequence(frames.copy())

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.vision.plane_for_tests import pair
 from torch_denkf.vision import fit_two_view, track_corners, two_view_motion
 from torch_denkf.vision.exposure import same_exposure
 
@@ -131,3 +132,18 @@ def test_a_hidden_part_of_an_enlarged_image_is_the_same_part():
     nothing = np.ones(small.shape, bool)
     assert not two_view_motion(small, small, calibration, hidden=nothing).any()
     assert two_view_motion(small, small, calibration, hidden=~nothing)[-1] > 0.5
+
+
+@pytest.mark.parametrize("doubled", [1, 2])
+def test_a_small_image_is_as_good_as_itself_enlarged(doubled):
+    """Where the optical axis is in the enlarged image is read off an enlarged ramp: pixels are not where they were."""
+    height, width, focal, center = 30, 104, 110.0 / doubled, (50.3, 14.2)
+    small = large = pair((height, width), (focal, focal, *center), distance=1.0, turn=0.02)
+    ramps = [np.tile(np.arange(size, dtype=np.float32), (2, 1)) for size in (width, height)]
+    for _ in range(doubled):
+        large = [cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for image in large]
+        ramps = [cv2.resize(ramp, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR) for ramp in ramps]
+    moved = [np.interp(at, ramp[0], np.arange(ramp.shape[1])) for at, ramp in zip(center, ramps, strict=True)]
+    told = two_view_motion(*large, (2**doubled * focal, 2**doubled * focal, *moved))
+    np.testing.assert_allclose(two_view_motion(*small, (focal, focal, *center)), told, atol=1e-5)
+    assert told[0] == pytest.approx(0.02, abs=1e-3)

@@ -111,8 +111,12 @@ def test_two_distances_that_agree_are_no_sign():
     assert torch.allclose(signs[:, FLOW_SIGNS.index("road")], torch.full((3,), 0.1))
 
 
-def test_behind_a_hole_in_a_wall_the_flow_is_known():
-    """All is equally far: the inverse distance is one number, and turn and focus tell the rest."""
+@pytest.mark.parametrize("hole", [np.s_[15:45, 60:110], np.s_[5:60, 30:180]])
+def test_behind_a_hole_in_a_wall_the_flow_is_known(hole):
+    """All is equally far: the inverse distance is one number, and turn and focus tell the rest.
+
+    What hides the wall stands still before the camera. Where it is larger than what is seen, it would be the motion.
+    """
     camera = CanonicalCamera(120.0)
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     x = (columns - (camera.width - 1) / 2) / camera.focal
@@ -121,7 +125,7 @@ def test_behind_a_hole_in_a_wall_the_flow_is_known():
     turned = np.dstack([left * (1 + x * x) + up * x * y, left * x * y + up * (1 + y * y)])
     true = (turned + 0.1 * np.dstack([x - 0.02, y + 0.01])).astype(np.float32)
     hidden = np.zeros(x.shape, bool)
-    hidden[15:45, 60:110] = True
+    hidden[hole] = True
     seen = np.where(hidden[..., None], 0.0, true).astype(np.float32)
     empty = np.zeros(x.shape, np.uint8)
     found, mismatch = continue_flow(seen, coarse_flow(seen, empty, empty, camera), hidden, camera)

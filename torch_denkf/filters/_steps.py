@@ -208,7 +208,8 @@ def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Se
     )
     for key in structure.plain:
         value = entries.get(key)
-        if value is None or value.ndim <= size + 1 or (value.ndim == size + 2 and value.shape[-2] == members):
+        samples = key[-1] == "ensemble" or (value is not None and value.shape[-2:-1] == (members,))
+        if value is None or value.ndim <= size + 1 + samples:
             continue
         raise ValueError(
             f"The reading {key!r} is {list(value.shape)}, and the batch is {list(batch_size)}: {value.ndim - size - 1} "

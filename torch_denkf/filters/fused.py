@@ -32,7 +32,8 @@ from torch_denkf.modules import (
     WithJointMoments,
     as_process_noise,
 )
-from torch_denkf.modules._gaussian import GaussianTransition
+from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
 from torch_denkf.modules._running import check_module, writes
 
 __all__ = ["FusedFilter"]
@@ -52,6 +53,11 @@ class FusedFilter(Filter):
     ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
     is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
     belongs to the time before the episode is not observed.
+
+    An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
+    A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
+    are refused, and so they are with the lag of a mean and a covariance. :class:`Refiltering` and
+    :class:`~torch_denkf.smoothers.FixedLag` take them.
 
     Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
@@ -76,8 +82,8 @@ class FusedFilter(Filter):
             ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
-        ValueError: if there is no sensor, a delay is negative or beyond the lag, or process noise is missing or given
-            twice.
+        ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
+            twice, or an analysis inflates or relaxes where that is refused.
         TypeError: for particles, sensors that are no dict, or an analysis that cannot correct earlier states.
 
     Example:
@@ -139,7 +145,9 @@ class FusedFilter(Filter):
         if weights is not None:
             modules.update(build.weighted(prefix, sensors, wired, weights))
         last = "fused" if gaussian and lag else "belief"
-        modules.update((build.joint if joint else build.in_turn)(prefix, last, sensors, wired))
+        updates = (build.joint if joint else build.in_turn)(prefix, last, sensors, wired)
+        _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
+        modules.update(updates)
         if lag:
             modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief()
         super().__init__(modules, initial=initial, **kwargs)
@@ -151,6 +159,26 @@ def _is_gaussian(initial: TensorDictModuleBase) -> bool:
     if ("belief", "log_weight") in written:
         raise TypeError("FusedFilter has no particles; give ParticleFilter one likelihood of all readings.")
     return ("belief", "ensemble") not in written
+
+
+def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
+    """Raises where an update would spread other states than the present one that is read."""
+    if late:
+        why = "belongs to the step at which a reading is taken, and with delay= others have been made since"
+        cure = "Leave delay= out and let Refiltering make them again"
+    elif joint_past:
+        why = "would spread the past anew with each reading: with lag= it is one Gaussian with the present"
+        cure = "Leave lag= out and put FixedLag(filter, lag) around the filter"
+    else:
+        return
+    for name, update in updates.items():
+        for part in update.modules():
+            inflates = isinstance(part, EnsembleUpdate | GaussianAnalysis) and part.inflation != 1
+            if inflates or (isinstance(part, EnsembleUpdate) and part.relaxation):
+                raise ValueError(
+                    f"The inflation or relaxation of {name!r} {why}. {cure}, or say by process_noise what the motion "
+                    "does not know."
+                )
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Unpack
 
+import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
@@ -16,6 +17,7 @@ from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
 from torch_denkf.modules._running import check_module, named_modules_of
+from torch_denkf.modules.fused import StateObservation
 
 __all__ = ["Gated", "Monitored"]
 
@@ -106,7 +108,8 @@ class Gated(Filter):
 
     Raises:
         TypeError: if the filter has no analysis that can be gated.
-        ValueError: if the number of components is not known, or an option is out of range.
+        ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is asked
+            of a filter that observes states of the past, a :class:`FusedFilter` with a delay.
 
     Example:
         >>> import torch
@@ -129,6 +132,12 @@ class Gated(Filter):
         **options: Unpack[GateOptions],
     ):
         _check_filter("Gated", filter)
+        if options.get("adapt_inflation") and any(_with_past(part) for part in filter.modules()):
+            raise ValueError(
+                "adapt_inflation spreads the forecast of the step at which a reading is taken. A FusedFilter with "
+                "delay=, or with lag= of a mean and a covariance, observes the past, too. Leave them out and put "
+                "Refiltering(Gated(filter), ...) or FixedLag(Gated(filter), lag) around; or use adapt_noise."
+            )
         modules = OrderedDict(named_modules_of(filter))
         found = [name for name, module in modules.items() if any(_analyses(module))]
         count = sum(1 for name in found for _ in _analyses(modules[name]))
@@ -176,6 +185,11 @@ class Gated(Filter):
             gate.rate = rate
             gate.calibrate(outputs, **options)
         return self
+
+
+def _with_past(part: torch.nn.Module) -> bool:
+    """Whether a module observes states of the past, or present and past as one."""
+    return isinstance(part, StateObservation) and part.state_dim is not None
 
 
 def _check_filter(name: str, filter: object) -> None:

@@ -9,7 +9,9 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_number
+from torch_denkf.functional import align_angles
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
@@ -94,3 +96,25 @@ class EnsembleUpdate(SubModel):
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
         self.observed_key = unravel_key(observed_key)
+
+    def on_entries(self, entries, call):
+        """The belief and the diagnostics."""
+        return self.on_aligned(self.aligned(entries), call)
+
+    def aligned(self, entries: Entries) -> Entries:
+        """The entries with all angles on one turn, see :func:`~torch_denkf.functional.align_angles`.
+
+        Predictions and the reading can then be averaged, spread and subtracted like other numbers. Who changes them in
+        front of the analysis does so here, and hands them to :meth:`on_aligned`: another alignment would fold a spread
+        that is wider than a turn.
+        """
+        if not self.angles:
+            return entries
+        keys = self.in_keys[1:3]
+        predicted, reading = (self.required(entries, key) for key in keys)
+        aligned = align_angles(predicted, reading, self.angles, entries.get(self.observed_key))
+        return {**entries, **dict(zip(keys, aligned, strict=True))}
+
+    def on_aligned(self, entries: Entries, call: Call) -> Entries:
+        """The belief and the diagnostics of entries as :meth:`aligned` gives them."""
+        return super().on_entries(entries, call)

@@ -18,6 +18,7 @@ __all__ = [
     "check_dims",
     "mask_of",
     "mean_of_members",
+    "refuse_trained",
     "register_constant",
     "register_location",
     "register_scale",
@@ -29,19 +30,15 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
     """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
 
     Raises:
-        TypeError: if it is neither a tensor nor numbers, or requires a gradient, which would get lost; ``name`` is the
-            argument's.
+        TypeError: if it is neither a tensor nor numbers; ``name`` is the argument's.
+        ValueError: if it asks for a gradient, which would get lost.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
         (torch.float32, torch.float64)
     """
     if isinstance(value, Tensor):
-        if value.requires_grad:
-            raise TypeError(
-                f"{name} requires a gradient, and would be copied into a constant, which learns nothing: pass "
-                f"{name}.detach(); where it is to be learned, trainable=True, or a module that learns it"
-            )
+        refuse_trained(name, value, "it is copied into a constant")
         return value.detach().to(value.dtype if value.is_floating_point() else torch.get_default_dtype(), copy=True)
     try:
         return torch.as_tensor(value, dtype=torch.get_default_dtype()).clone()
@@ -59,6 +56,19 @@ def register_constant(
         module.register_parameter(name, nn.Parameter(tensor))
     else:
         module.register_buffer(name, tensor)
+
+
+def refuse_trained(name: str, value: Any, why: str) -> None:
+    """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
+
+    Raises:
+        ValueError: if it does; ``name`` is the argument's.
+    """
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(
+            f"{name} asks for a gradient and would never be trained: {why}. Detach it, and choose it on validation data; "
+            "where there is trainable=True, or a module that learns it, take that"
+        )
 
 
 def register_location(module: nn.Module, name: str, value: Tensor | Sequence | float | None) -> None:

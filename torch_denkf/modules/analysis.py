@@ -11,7 +11,6 @@ from tensordict import unravel_key
 from torch_denkf._checks import check_values
 from torch_denkf.functional import (
     Analysis,
-    align_angles,
     analyse,
     ensemble_cov,
     ensemble_mean,
@@ -46,7 +45,7 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     Raises:
         ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and
-            factors of ``taper`` that are not finite.
+            factors of ``taper`` that are not finite or ask for a gradient.
         KeyError: if an entry is missing.
 
     Example:
@@ -88,7 +87,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
                 check_values(name.replace("_", "'s "), factors)
-            self.register_buffer(name, None if factors is None else as_floating(factors, name), persistent=False)
+            self.register_buffer(name, None if factors is None else as_floating(factors, "taper"), persistent=False)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -124,7 +123,6 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        predicted, observation = align_angles(predicted, observation, self.angles, observed)
         taper = self.state_taper
         ensemble, innovation, nis, log_likelihood = self._analyse(
             forecast, predicted, observation, variance, observed, noise, taper
@@ -162,7 +160,6 @@ class EnsembleAnalysis(EnsembleUpdate):
         Returns:
             The updated past, ``[*B, E, L, S]``.
         """
-        predicted, observation = align_angles(predicted, observation, self.angles, observed)
         lag, dim = past.shape[-2:]
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)

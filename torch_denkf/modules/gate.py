@@ -38,13 +38,14 @@ class GateOptions(TypedDict, total=False):
         rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
             acts.
         freedom: of Student's t; 4 by default.
-        patience: after so many rejected steps in a row the gate opens: the forecast is spread until it reaches the
-            reading, and the window is emptied. 50 by default.
+        patience: after so many rejected steps in a row the gate opens: the forecast, and the past states that are
+            carried beside it, are spread until they reach the reading, and the window is emptied. 50 by default.
         by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
         adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
             steps that are remembered; 0 by default, for none.
         adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
-            likewise. Innovations tell that something is too small, not what: use one of the two.
+            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
+            is too small, not what: use one of the two.
         gate_key: prefix of the state, ``"gate"`` by default.
     """
 
@@ -216,12 +217,19 @@ class GatedAnalysis(InPlaceOf):
     def on_entries(self, entries, call):
         """The belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
-        entries = self._with_mask(self._with_noise(entries, call), call)
+        plain = self._with_mask(self._with_noise(entries, call), call)
+        if self.of_ensemble:
+            plain = self.module.aligned(plain)
         if self.adapt_noise:
-            entries = self._noisier(entries, log_noise.exp())
+            plain = self._noisier(plain, log_noise.exp())
+        entries, inflation = plain, torch.ones_like(log_inflation)
         if self.adapt_inflation:
-            entries = self._wider(entries, log_inflation.exp())
-        out = self.module.on_entries(entries, call)
+            mask = plain.get(self.observed_key)
+            inflation = log_inflation.exp()
+            if mask is not None:  # without a reading there is nothing to make up for, and factors would pile up
+                inflation = torch.where(mask.any(-1, keepdim=True), inflation, 1)
+            entries = self._wider(plain, inflation)
+        out = self._analyse(entries, call)
         nis, innovation = (out[self.info_key, name] for name in ("nis", "innovation"))
         check_observation_dim(self.observation_dim, innovation, f"the gate {self.gate_key!r}")
         part, freedom = self._parts(entries, nis, innovation)
@@ -244,10 +252,11 @@ class GatedAnalysis(InPlaceOf):
                 terms = torch.where(opens[..., None, :, None], 0, terms)
                 shut = torch.where(rejected, shut + 1, torch.where(seen, 0, shut))
                 reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
-                out = self._without(self._wider(entries, reach), call, rejected)
                 seen = seen & ~rejected  # an outlier is no measure of the noise
+                wider = torch.where(seen.any(-1, keepdim=True), inflation * reach, 1)
+                out = self._without(self._with_past(self._wider(plain, wider), reach), call, rejected)
             else:
-                out = self.module.on_entries(self._noisier(entries, factor), call)
+                out = self._analyse(self._noisier(entries, factor), call)
         else:
             factor = torch.ones_like(part)
         if self.adapt_noise:
@@ -269,6 +278,10 @@ class GatedAnalysis(InPlaceOf):
         nis, innovation = (by_key[self.info_key, name] for name in ("nis", "innovation"))
         none = nis.new_zeros(*nis.shape[:-1], self.parts_count)
         return (*out, *values[inner : len(self.in_keys)], none + 1, nis, innovation, none)
+
+    def _analyse(self, entries: Entries, call: Call) -> Entries:
+        """What the analysis writes; the angles of an ensemble's entries are on one turn already."""
+        return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
         """The entries with the random numbers that both runs share, and the variances that a Kalman analysis holds."""
@@ -316,13 +329,22 @@ class GatedAnalysis(InPlaceOf):
         keys = self.module.in_keys[:2]  # states, and what is predicted of them
         return {**entries, **{key: spread_about_mean(entries[key], factor.sqrt()) for key in keys}}
 
+    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
+        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+        if not isinstance(self.module, LaggedAnalysis):
+            return entries
+        key = self.module.in_keys[-1]
+        past = entries[key]
+        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
+        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
         """What the analysis writes without what is rejected ``[*B, K]``."""
         if self.by_component:
             mask = entries.get(self.observed_key)
             kept = ~rejected if mask is None else mask & ~rejected
-            return self.module.on_entries({**entries, self.observed_key: kept}, call)
-        out = self.module.on_entries(entries, call)
+            return self._analyse({**entries, self.observed_key: kept}, call)
+        out = self._analyse(entries, call)
         values = self.module.without_reading(*(entries[key] for key in self.module.in_keys))
         none = dict(zip(map(unravel_key, self.module.out_keys), values, strict=True))
         return {key: torch.where(expand_as_right(rejected, value), none[key], value) for key, value in out.items()}

@@ -11,7 +11,6 @@ import torch
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import (
     Neighbours,
-    align_angles,
     ensemble_mean,
     ensemble_var,
     letkf,
@@ -21,8 +20,11 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules._tensors import mean_of_members, refuse_trained
 
 __all__ = ["LocalEnsembleAnalysis"]
+
+_CHOSEN_ONCE = "which observations count, and how much, is found once"
 
 
 class LocalEnsembleAnalysis(EnsembleUpdate):
@@ -51,7 +53,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             be NaN, readings and variances alike.
 
     Raises:
-        ValueError: if a taper is not a matrix, or the sizes do not fit.
+        ValueError: if a taper is not a matrix or asks for a gradient, or the sizes do not fit.
         KeyError: if an entry is missing.
 
     Source:
@@ -89,6 +91,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
+        refuse_trained("near", near.taper, _CHOSEN_ONCE)
         self.register_buffer("index", near.index, persistent=False)
         self.register_buffer("taper", near.taper, persistent=False)
         self.tile = tile
@@ -108,13 +111,15 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         Args:
             states: places of the components, ``[S, D]``, in any unit.
             observations: places of the observations, ``[O, D]``.
-            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii.
+            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii. It is a constant:
+                which observations are near is found once.
             period: ``[D]``, circumferences of those coordinates that are circles, ``inf`` for the others.
             **kwargs: passed on to the constructor.
 
         Raises:
-            ValueError: if the radius is not positive.
+            ValueError: if the radius is not positive, or asks for a gradient.
         """
+        refuse_trained("radius", radius, _CHOSEN_ONCE)
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
         return cls(neighbours(states, observations, radius, period=period), **kwargs)
 
@@ -141,7 +146,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        predicted, observation = self._aligned(predicted, observation, observed)
+        observation = mean_of_members(observation, predicted.shape[:-2])
         ensemble = self._analyse(forecast, predicted, observation, variance, observed, noise, 1)
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
@@ -159,17 +164,12 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
         Each component learns from the observations near it now. What moves far in L steps needs a larger radius.
         """
-        predicted, observation = self._aligned(predicted, observation, observed)
+        observation = mean_of_members(observation, predicted.shape[:-2])
         lag, flat = past.shape[-2], past.flatten(-2)
         moved = self._analyse(flat, predicted, observation, variance, observed, noise, lag)
         if observed is not None:
             moved = torch.where(observed.any(-1)[..., None, None], moved, flat)
         return moved.unflatten(-1, past.shape[-2:])
-
-    def _aligned(self, predicted, observation, observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """The predicted observations, and one observation on their side of the circle."""
-        predicted, observation = align_angles(predicted, observation, self.angles, observed)
-        return predicted, observation.mean(-2) if observation.ndim == predicted.ndim else observation
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
         """The analysis of ``copies`` states side by side, rotated."""

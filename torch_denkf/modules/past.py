@@ -206,6 +206,18 @@ class LaggedAnalysis(InPlaceOf):
         past = values[len(self.module.in_keys)]
         return *self.module.without_reading(*values), past
 
+    def on_entries(self, entries, call):
+        """The belief, the diagnostics, and the past."""
+        return self.on_aligned(self.aligned(entries), call)
+
+    def aligned(self, entries):
+        """See :meth:`EnsembleAnalysis.aligned`."""
+        return self.module.aligned(entries)
+
+    def on_aligned(self, entries, call):
+        """See :meth:`EnsembleAnalysis.on_aligned`."""
+        return super().on_entries(entries, call)
+
     def compute(self, forecast, predicted, observation, variance, past, observed=None, *, noise):
         """The belief, the diagnostics, and the past."""
         out = self.module.compute(forecast, predicted, observation, variance, observed, noise=noise)

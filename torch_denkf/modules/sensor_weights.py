@@ -10,15 +10,10 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import (
-    ensemble_mean,
-    ensemble_var,
-    mean_observation,
-    semidefinite_root,
-    wrap_angles,
-)
+from torch_denkf.functional import align_angles, ensemble_mean, ensemble_var, semidefinite_root
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import reads
+from torch_denkf.modules._tensors import mean_of_members
 from torch_denkf.modules.fused import StateObservation
 
 __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]
@@ -190,16 +185,14 @@ class SensorWeights(SubModel):
             reading = self.required(entries, self.readings[name])
             noise = self.required(entries, self.noises[name])
             variance = noise if noise.ndim == size + 1 else noise.diagonal(dim1=-2, dim2=-1)
-            if reading.ndim > size + 1:
-                reading = mean_observation(reading, self.angles[name])
             predicted, observed = model.seen(entries, call._replace(sample=False).part(name))
-            mean = ensemble_mean(predicted)
-            innovation = wrap_angles(reading - mean, self.angles[name])
+            predicted, reading = align_angles(predicted, reading, self.angles[name], observed)
+            reading, mean = mean_of_members(reading, call.batch_size), ensemble_mean(predicted)
             observed = (
                 torch.ones_like(reading, dtype=torch.bool) if observed is None else observed.expand(reading.shape)
             )
             spread = (ensemble_var(predicted, mean) + torch.where(observed, variance, 1)).sqrt()
-            innovations[name] = torch.where(observed, innovation, 0) / spread
+            innovations[name] = torch.where(observed, reading - mean, 0) / spread
             seen.append(observed.any(-1))
         features = {name: self.required(entries, key) for name, key in self.features.items()}
         return self.by_key(self.module["network"](innovations, torch.stack(seen, -1), features).split(1, -1))

@@ -1,0 +1,380 @@
+"""All angles turned by half a circle: the same belief, turned by half a circle, of every module that knows of angles.
+
+Headings near zero wrap nowhere. Turned by pi, readings and predictions lie on both sides of the cut at +-pi.
+"""
+
+import ast
+import importlib
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+import torch_denkf
+from tests.filters.factories import FixedEnsemble, NoisyLinear
+from torch_denkf.filters import (
+    EKF,
+    UKF,
+    BackpropKF,
+    DEnKF,
+    FusedFilter,
+    FusedSensor,
+    Gated,
+    KalmanFilter,
+    ParticleFilter,
+)
+from torch_denkf.functional import Neighbours
+from torch_denkf.modules import (
+    ConstantNoise,
+    EKFTransition,
+    EnsembleAnalysis,
+    GatedAnalysis,
+    LearnedLikelihood,
+    LinearTransition,
+    LocalEnsembleAnalysis,
+    MomentPrior,
+    Select,
+    SensorAttention,
+    ShardedEnsembleAnalysis,
+    SubModel,
+    UKFTransition,
+)
+from torch_denkf.objectives import (
+    DEnKFLoss,
+    GaussianLoss,
+    MixtureLoss,
+    ObservationLoss,
+    SensorLoss,
+    TransitionLoss,
+)
+from torch_denkf.smoothers import FixedLag
+
+B, T, E = 3, 14, 12
+MOVE = torch.tensor([[1.0, 0.1], [0.0, 0.9]], dtype=torch.float64)
+Q, R = torch.tensor([0.05, 0.1], dtype=torch.float64), torch.tensor([0.3, 0.4], dtype=torch.float64)  # standard dev.
+NEAR = Neighbours(torch.arange(2).expand(2, 2), torch.tensor([[1.0, 0.5], [0.5, 1.0]], dtype=torch.float64))
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+def folded(value):
+    """The first component between -pi and pi."""
+    return torch.cat([torch.atan2(value[..., :1].sin(), value[..., :1].cos()), value[..., 1:]], -1)
+
+
+class Heading(SubModel):
+    """A compass, and beside it what it does not turn: reads both components of the state, or the heading alone."""
+
+    def __init__(self, count=2):
+        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+        self.count = count
+
+    def observe(self, state):
+        return folded(state)[..., : self.count]
+
+    def compute(self, ensemble):
+        return self.observe(ensemble)
+
+
+class Sensor(SubModel):
+    """Reads what is there."""
+
+    def __init__(self, key):
+        super().__init__(nn.Identity(), [key], [("sensor", "ensemble")])
+
+    def compute(self, reading):
+        return reading
+
+
+def ahead(turn):
+    return torch.tensor([turn, 0.0])
+
+
+def members(turn):
+    generator = torch.Generator().manual_seed(1)
+    return FixedEnsemble(torch.tensor([0.4, 0.5]) * torch.randn(E, 2, generator=generator) + ahead(turn))
+
+
+def moments(turn):
+    return MomentPrior(ahead(turn), torch.diag(torch.tensor([0.16, 0.25])))
+
+
+def frames(turn):
+    """Readings, what a sensor draws of them, their labels; the truth jumps, so that gates act."""
+    generator = torch.Generator().manual_seed(2)
+    state = ahead(turn) + 0.1 * torch.randn(B, T, 2, generator=generator).cumsum(1)
+    state[:, 7:] += torch.tensor([1.2, 3.0])
+    reading = state + R * torch.randn(B, T, 2, generator=generator)
+    samples = reading.unsqueeze(-2) + R * torch.randn(B, T, E, 2, generator=generator)
+    data = TensorDict({"observation": folded(reading), "samples": folded(samples), "state": folded(state)}, [B, T])
+    data["target_observation"] = folded(state + 0.1)
+    data["compass"], data["other"] = data["samples"][..., :1], reading[..., 1:]
+    data["encoding"] = torch.randn(B, T, 3, generator=generator)
+    data["observed"] = torch.rand(B, T, 2, generator=generator) < 0.8
+    for name, component in (("compass", slice(0, 1)), ("other", slice(1, 2))):
+        data[f"{name}_observed"] = data["observed"][..., component]
+    return data
+
+
+def noise(key="observation"):
+    return ConstantNoise(R, in_key=key)
+
+
+def denkf(analysis, turn):
+    parts = {"transition": NoisyLinear(MOVE, Q.diag()), "sensor": None, "observation": Heading()}
+    return DEnKF(**parts, noise=noise(analysis.in_keys[2]), analysis=analysis, initial=members(turn))
+
+
+def ensemble(scheme="etkf", key="observation", angles=(0,), **options):
+    return lambda turn: denkf(EnsembleAnalysis(scheme, sensor_key=key, angles=angles, **options), turn)
+
+
+def local(**options):
+    return lambda turn: denkf(LocalEnsembleAnalysis(NEAR, sensor_key="samples", angles=[0], **options), turn)
+
+
+def sharded(turn):
+    return denkf(ShardedEnsembleAnalysis("etkf", sensor_key="observation", angles=[0]), turn).requires_grad_(False)
+
+
+def kalman(turn):
+    both = torch.eye(2)
+    prior = {"mean": ahead(turn), "cov": 0.2 * both}
+    return KalmanFilter(MOVE, Q.square().diag(), both, R.square(), **prior, angles=[0])
+
+
+def gaussian(kind):
+    def make(turn):
+        options = {"initial": moments(turn), "angles": [0], "observation_key": "samples"}
+        if kind is BackpropKF:
+            return BackpropKF(MOVE, Q.square().diag(), None, torch.eye(2), noise("samples"), **options)
+        walk = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        return kind(NoisyLinear(MOVE), walk, None, Heading(), noise("samples"), **options)
+
+    return make
+
+
+def particles(likelihood=None):
+    def make(turn):
+        options = {"angles": [0]} if likelihood is None else {"likelihood": likelihood()}
+        motion = NoisyLinear(MOVE, Q.diag())
+        sensor_noise = ConstantNoise(R, in_key=("sensor", "ensemble"))
+        return ParticleFilter(
+            motion, Sensor("observation"), Heading(), noise=sensor_noise, initial=members(turn), **options
+        )
+
+    return make
+
+
+def learned_likelihood():
+    torch.manual_seed(3)
+    keys = {"encoding_key": "encoding", "reading_key": ("sensor", "ensemble")}
+    return LearnedLikelihood(3, 2, num_cells=(8,), angles=[0], scale=[0.3, 0.4], **keys)
+
+
+def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
+    """A compass that draws samples, and another sensor; the compass may be late."""
+
+    def make(turn):
+        sensors = {
+            "compass": FusedSensor(Heading(1), R[:1], angles=[0], delay=delay),
+            "other": FusedSensor(Select([1]), R[1:]),
+        }
+        torch.manual_seed(4)
+        attention = SensorAttention({"compass": 1, "other": 1}, size=4, slope=2.0) if weights else None
+        for parameter in () if attention is None else attention.parameters():
+            parameter.data.add_(0.3 * torch.randn_like(parameter))
+        walk = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+        transition = {
+            "ensemble": lambda: NoisyLinear(MOVE, Q.diag()),
+            "Kalman": lambda: LinearTransition(MOVE, Q.square().diag()),
+            "EKF": lambda: EKFTransition(NoisyLinear(MOVE), walk),
+            "UKF": lambda: UKFTransition(NoisyLinear(MOVE), walk),
+        }[motion]()
+        initial = members(turn) if motion == "ensemble" else moments(turn)
+        options = {"weights": attention, "joint": joint, "analysis": analysis}
+        return FusedFilter(transition, sensors, initial=initial, **options)
+
+    return make
+
+
+def gated(make, **options):
+    return lambda turn: Gated(make(turn), **options)
+
+
+GATES = {
+    "student": {"response": "student", "window": 2, "rate": 0.2},
+    "reject, opens": {"response": "reject", "window": 1, "rate": 0.1, "patience": 2},
+    "adapted spread": {"rate": 0.0, "adapt_inflation": 0.1},
+    "adapted noise": {"rate": 0.2, "adapt_noise": 0.1},
+}
+OF_ENSEMBLES = {"one": {}, "by component": {"by_component": True}}
+
+FILTERS = {
+    **{f"ensemble, {scheme}": ensemble(scheme, "samples") for scheme in ("sensor", "perturbed", "etkf", "sakov")},
+    "ensemble, inflated": ensemble(inflation=1.1, relaxation=0.3),
+    "ensemble, rotated": ensemble(rotate=True),
+    "ensemble with a lag": lambda turn: FixedLag(ensemble()(turn), 3),
+    "local": local(inflation=1.1),
+    "local with a lag": lambda turn: FixedLag(local()(turn), 3),
+    "sharded": sharded,
+    "Kalman": kalman,
+    **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
+    "particles": particles(),
+    "particles, learned": particles(learned_likelihood),
+    **{
+        f"fused {motion}, {name}": fused(motion, **options)
+        for motion in ("ensemble", "Kalman", "UKF")
+        for name, options in {
+            "in turn": {},
+            "joint": {"joint": True},
+            "late": {"delay": 2},
+            "weights": {"weights": True},
+            "weights, late": {"weights": True, "delay": 2},
+        }.items()
+    },
+    **{
+        f"gated {name}, {gate}, {parts}": gated(make, **options, **by)
+        for name, make in {"ensemble": ensemble(), "samples": ensemble(key="samples"), "local": local()}.items()
+        for gate, options in GATES.items()
+        for parts, by in OF_ENSEMBLES.items()
+    },
+    **{
+        f"gated {name}, {gate}": gated(make, **options)
+        for name, make in {
+            "Kalman": kalman,
+            "EKF": gaussian(EKF),
+            "UKF": gaussian(UKF),
+            "with a lag": lambda turn: FixedLag(ensemble()(turn), 3),
+            "fused ensemble": fused("ensemble"),
+            "fused Kalman": fused("Kalman"),
+        }.items()
+        for gate, options in GATES.items()
+    },
+    **{
+        f"gated late {motion}, {gate}": gated(fused(motion, delay=2), **GATES[gate])
+        for motion in ("ensemble", "Kalman")
+        for gate in ("student", "reject, opens", "adapted noise")
+    },
+}
+
+
+def turned_back(key, value, turn):
+    """What was written at a turn, as it would be without."""
+    angle = {"mean", "ensemble", "past", "joint_mean", "past_mean"}
+    if isinstance(key, tuple) and key[0] in ("belief", "smoothed") and key[-1] in angle:
+        value = value.clone()
+        value[..., 0 :: 2 if key[-1] == "joint_mean" else value.shape[-1]] -= turn
+    return value
+
+
+def written(filter, turn):
+    torch.manual_seed(5)
+    out = filter.sequence(frames(turn))
+    return {
+        key: turned_back(key, out[key], turn) for key in filter.out_keys if key[0] in ("belief", "smoothed", "info")
+    }
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_beliefs_turn_with_their_angles(name):
+    here, there = (written(FILTERS[name](turn), turn) for turn in (0.0, math.pi))
+    data = frames(math.pi)["observation"][..., 0]
+    assert data.min() < -3
+    assert data.max() > 3
+    assert here["belief", "mean"].isfinite().all()
+    for key, value in here.items():  # gains and factors on variances carry rounding on from step to step
+        torch.testing.assert_close(there[key], value, rtol=1e-8, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}")
+
+
+@pytest.mark.parametrize("parts", OF_ENSEMBLES)
+def test_a_gate_that_spreads_members_over_more_than_a_turn_takes_their_angles_for_numbers(parts):
+    """Headings near zero wrap nowhere: an analysis that does not know that they are angles is the oracle."""
+    forecast = torch.tensor([0.4, 0.5]) * torch.randn(B, E, 2)
+    entries = (
+        {"ensemble": forecast, "observation": forecast},
+        {"ensemble": torch.randn(B, 2), "noise": torch.ones(B, 2)},
+    )
+    entries[1]["ensemble"][:, 1] += 20.0  # so far off that the gate rejected it long enough, and opens
+    out = []
+    for angles in ([0], []):
+        options = {"response": "reject", "window": 1, "adapt_inflation": 0.1, **OF_ENSEMBLES[parts]}
+        gate = GatedAnalysis(EnsembleAnalysis("etkf", angles=angles), 2, **options)
+        td = TensorDict(dict(zip(("forecast", "sensor"), entries, strict=True)), [B])
+        td.update(dict(zip(gate.state_keys, gate.initial_state([B]), strict=True)))
+        td["gate", "shut"] += gate.patience
+        td["gate", "log_inflation"] += math.log(9.0)
+        out.append(gate(td))
+        assert (td["gate", "factor"] == 1).all()
+    assert (3 * forecast[..., 0]).abs().max() > math.pi, "the adapted spread alone"
+    for key in gate.out_keys:
+        torch.testing.assert_close(out[0][key], out[1][key], rtol=1e-11, atol=1e-11, msg=lambda m, k=key: f"{k}: {m}")
+
+
+ANGLES = {"angles": [0]}
+BOTH = {**ANGLES, "observation_angles": [0]}
+
+
+def with_sensor(turn):
+    """A filter whose sensor draws samples."""
+    parts = {"transition": NoisyLinear(MOVE, Q.diag()), "observation": Heading(), "noise": noise("samples")}
+    return DEnKF(sensor=Sensor("samples"), analysis=EnsembleAnalysis(angles=[0]), initial=members(turn), **parts)
+
+
+LOSSES = {
+    **{f"DEnKFLoss, {score}": (DEnKFLoss, with_sensor, {**BOTH, "score": score}) for score in ("crps", "mse")},
+    "DEnKFLoss, nll": (DEnKFLoss, with_sensor, {**BOTH, "nll": 1.0, "observation": 1.0}),
+    **{
+        f"GaussianLoss, {score}": (GaussianLoss, gaussian(EKF), {**ANGLES, "score": score}) for score in ("crps", "nll")
+    },
+    "GaussianLoss, dims": (GaussianLoss, gaussian(UKF), {**ANGLES, "dims": [1, 0]}),
+    "MixtureLoss": (MixtureLoss, particles(), ANGLES),
+    "TransitionLoss": (TransitionLoss, with_sensor, ANGLES),
+    "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), ANGLES),
+    "SensorLoss": (SensorLoss, with_sensor, {"observation_angles": [0]}),
+    "ObservationLoss": (ObservationLoss, with_sensor, {"observation_angles": [0]}),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_losses_do_not_turn(name):
+    kind, make, options = LOSSES[name]
+    values = []
+    for turn in (0.0, math.pi):
+        torch.manual_seed(6)
+        values.append(kind(make(turn), **options)(frames(turn)))
+    assert values[0].keys()
+    for key, value in values[0].items():
+        torch.testing.assert_close(values[1][key], value, rtol=1e-9, atol=1e-9, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def know_of_angles():
+    """The classes of modules whose code speaks of angles, or of entries in which they are aligned."""
+    found, root = set(), Path(torch_denkf.__file__).parent
+    for file in sorted(root.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef) and any(map(_speaks_of_angles, ast.walk(node))):
+                place = ".".join(["torch_denkf", *file.relative_to(root).with_suffix("").parts])
+                found.add(getattr(importlib.import_module(place), node.name))
+    return {kind for kind in found if issubclass(kind, nn.Module)}
+
+
+def _speaks_of_angles(node):
+    words = {getattr(node, name, None) for name in ("arg", "attr", "id")}
+    return any(isinstance(word, str) and ("angles" in word or word == "aligned") for word in words)
+
+
+def test_every_module_that_knows_of_angles_is_turned():
+    made = [make(0.0) for make in FILTERS.values()] + [
+        kind(make(0.0), **options) for kind, make, options in LOSSES.values()
+    ]
+    turned = {kind for each in made for part in each.modules() for kind in type(part).__mro__}
+    found = know_of_angles()
+    assert {EnsembleAnalysis, LearnedLikelihood} < found
+    assert not found - turned, "add them to FILTERS or LOSSES"
