@@ -219,12 +219,12 @@ class FilterLoss(LossModule):
         values = self._entry(tensordict, self.tensor_keys.state)
         given = values.shape[-1]
         size = self._state_dim(out) or given
+        known = self._known(tensordict, "state", "state_observed", values, size)
         if given < size:
             raise ValueError(
                 f"{type(self).__name__} needs the whole true state of {size} dimensions, but "
                 f"{self.tensor_keys.state!r} has {given}. Add the others, with NaN in the rows that have no label"
             )
-        known = self._known(tensordict, "state", "state_observed", values, size)
         labels = labels_of(known, range(size), "", None)
         return labels._replace(mask=labels.mask.all(-1, keepdim=True))
 

@@ -191,8 +191,8 @@ class DEnKFLoss(SequenceLoss):
 
 
 def _smoother_of(make: Callable[[Filter], Smoother], filter: Filter) -> Smoother:
-    if not callable(make):
-        raise TypeError(f"smoother is called with the filter and makes a smoother, as EnRTS does; got {make!r}"[:200])
+    if not callable(make) or isinstance(make, Smoother):
+        raise TypeError(f"smoother is called with the filter: pass EnRTS, say, and not {make!r}"[:200])
     smoother = make(filter)
     if not isinstance(smoother, Smoother):
         raise TypeError(f"smoother must make a Smoother, as EnRTS and partial(EnKS, lag=5) do; got {smoother!r}"[:200])

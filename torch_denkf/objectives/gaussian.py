@@ -55,6 +55,7 @@ class GaussianLoss(SequenceLoss):
         statistics and minimum CRPS estimation", Mon. Weather Rev. 133, 2005, for the CRPS of a Gaussian.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)

@@ -54,6 +54,7 @@ class TransitionLoss(PartLoss):
         KeyError: if an entry is missing.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
