@@ -25,7 +25,7 @@ def problem():
 
 METRICS = {
     "coverage": lambda e, x: interval_coverage(e.mean(-2), e.var(-2), x, level=0.8),
-    "coverage of angles": lambda e, x: interval_coverage(e.mean(-2), e.var(-2), x, level=0.8, angles=range(x.shape[-1])),
+    "coverage of angles": lambda e, x: interval_coverage(e.mean(-2), e.var(-2), x, level=0.8, angles=[0]),
     "coverage of members": lambda e, x: ensemble_interval_coverage(e, x, level=0.8),
     "rmse": lambda e, x: state_errors(e.mean(-2), x).rmse,
     "mae": lambda e, x: state_errors(e.mean(-2), x).mae,
@@ -56,14 +56,14 @@ def test_a_dimension_without_any_label_has_no_number():
 
 
 def test_a_belief_that_is_nan_is_not_left_out():
-    ensemble, truth, gaps, known = problem()
+    ensemble, _, gaps, known = problem()
     ensemble[tuple(known[..., 0].nonzero()[0].tolist())] = torch.nan
     assert METRICS["rmse"](ensemble, gaps)[0].isnan()
 
 
 def test_what_needs_whole_rows_says_so():
     ensemble, truth, gaps, _ = problem()
-    with pytest.raises(ValueError, match="truth is NaN in places.*leave out"):
+    with pytest.raises(ValueError, match=r"truth is NaN in places.*leave out"):
         nees(ensemble.mean(-2), ensemble.var(-2), gaps)
     with pytest.raises(ValueError, match="leave out the rows"):
         rank_histogram(ensemble, gaps)

@@ -1,4 +1,4 @@
-"""Losses of every belief on frames with gaps in their labels, and their scores by hand: one element, its labels alone."""
+"""Losses of every belief on frames with gaps in their labels, and their scores by hand, an element's labels alone."""
 
 import math
 

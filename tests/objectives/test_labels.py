@@ -7,13 +7,14 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Normal
 
-from tests.filters.factories import OBS, FixedEnsemble, NoisyLinear, S, linear_denkf, linear_kalman, toy_denkf
+from tests.filters.factories import FixedEnsemble, NoisyLinear, S, linear_denkf, linear_kalman, toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, score_by_hand
-from tests.objectives.labels_for_tests import CASES, SCALE, TERMS, by_hand, case, gaps
+from tests.objectives.labels_for_tests import CASES, SCALE, TERMS, by_hand, case, element, gaps, normal_crps
 from tests.objectives.problem_for_tests import problem, stepped
 from tests.objectives.test_parts import forecasts_by_hand
-from torch_denkf.filters import DEnKF, ParticleFilter
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, Select
+from torch_denkf.data import Recording, RecordingReplay, Table
+from torch_denkf.filters import DEnKF, KalmanFilter, ParticleFilter
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, LinearObservation, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 
 NAN = math.nan
@@ -122,7 +123,7 @@ def test_one_label_of_two_dimensions_is_not_that_of_both():
 
 @pytest.mark.parametrize("name", ["members-crps", "members-mse", "particles-crps", "particles-mixture"])
 def test_angles_beyond_the_labels_and_members_on_both_sides_of_pi(name):
-    filter, frames, _, loss = case(name, terms=["state"], angles=[0, 2])
+    _, frames, _, loss = case(name, terms=["state"], angles=[0, 2])
     frames["state"] = frames["state"][..., :2]
     before = loss(frames)["loss_state"]
     frames["state"][..., 0] += 2 * math.pi
@@ -178,8 +179,6 @@ def known_filter(observation):
 @pytest.mark.parametrize("how", ["mask", "NaN"])
 @pytest.mark.parametrize("linear", [False, True])
 def test_a_known_observation_of_the_true_state_is_a_label_where_it_reads_labels(linear, how):
-    from torch_denkf.modules import LinearObservation
-
     matrix = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, -1.0]])
     filter = known_filter(LinearObservation(matrix) if linear else Select([2, 0]))
     frames, out = problem(filter)
@@ -292,6 +291,24 @@ def test_a_gaussian_step_is_scored_where_there_are_labels():
 # ------------------------------------------------------------------------------------------------------- other names
 
 
+def test_rows_of_a_recording_count_where_the_truth_was_measured(tmp_path):
+    # A reading every 0.1 s, the truth every 0.4 s; between, the data set holds the last one.
+    time = [0.1 * k for k in range(40)]
+    (tmp_path / "y.csv").write_text("t,y\n" + "".join(f"{t:.1f},{math.sin(t)}\n" for t in time))
+    (tmp_path / "x.csv").write_text("t,x\n" + "".join(f"{t:.1f},{math.sin(t) + 0.1}\n" for t in time[::4]))
+    streams = {"y": Table(tmp_path / "y.csv", ["y"], time="t"), "state": Table(tmp_path / "x.csv", ["x"], time="t")}
+    rows = RecordingReplay(Recording(**streams), clock="y")[:]
+    rows = rows.apply(lambda value: value.double() if value.is_floating_point() else value)
+    assert rows["state_observed"].sum() == 10
+    assert (rows["state"][1:4] == rows["state"][0]).all()
+    one = torch.eye(1)
+    filter = KalmanFilter(one, 0.1 * one, one, one, mean=torch.zeros(1), cov=one, observation_key="y")
+    mean = filter.sequence(rows.copy())["belief", "mean"]
+    expected = torch.stack([(mean[k] - math.sin(0.1 * k) - 0.1).square() for k in range(4, len(rows), 4)]).mean()
+    value = GaussianLoss(filter, score="mse", transition=0.0)(rows)["loss_state"]
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-6)  # the table's numbers are of single precision
+
+
 def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
     filter = toy_denkf()
     frames, _ = problem(filter)
@@ -311,7 +328,7 @@ def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
 
 @pytest.mark.parametrize("name", ["members-crps", "members-energy", "moments-nll", "particles-mixture"])
 def test_scores_of_labels_with_gaps_compile_without_a_break(name):
-    filter, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], angles=[1])
+    _, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], angles=[1])
     frames = hidden(frames, gaps()[1], "NaN")
     expected, rows = loss._state(frames, out)
     compiled = torch.compile(lambda: loss._state(frames, out), fullgraph=True, backend="eager")()
@@ -321,11 +338,7 @@ def test_scores_of_labels_with_gaps_compile_without_a_break(name):
 
 def test_gaussian_oracle_is_that_of_gaussian_loss():
     # The helper's closed form against scipy's, so that a slip in it shows.
-    from tests.objectives.labels_for_tests import element, normal_crps
-
     out = TensorDict({("belief", "mean"): torch.randn(1, 1), ("belief", "cov"): torch.full((1, 1, 1), 0.7)}, [1])
     value = element("moments-crps", out, "belief", (0,), torch.tensor([[0.4]]), [0], [1.0])
     mean = out["belief", "mean"].item()
     assert value.item() == pytest.approx(normal_crps(mean, 0.7**0.5, 0.4))
-    assert OBS == 2
-    assert GaussianLoss.SCORES == ("crps", "nll", "mse")

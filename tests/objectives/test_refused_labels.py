@@ -100,7 +100,7 @@ def test_another_belief_is_refused_and_the_right_loss_named():
     wrong = [DEnKFLoss(linear_kalman()), MixtureLoss(linear_kalman())]
     wrong += [GaussianLoss(linear_denkf("etkf")), GaussianLoss(bootstrap(8))]
     for loss in wrong:
-        with pytest.raises(KeyError, match="DEnKFLoss scores members.*MixtureLoss particles.*GaussianLoss a mean"):
+        with pytest.raises(KeyError, match=r"DEnKFLoss scores members.*MixtureLoss particles.*GaussianLoss a mean"):
             loss(data)
 
 

@@ -5,7 +5,15 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, linear_system, toy_denkf, toy_frames
+from tests.filters.factories import (
+    FixedEnsemble,
+    NoisyLinear,
+    linear_denkf,
+    linear_kalman,
+    linear_system,
+    toy_denkf,
+    toy_frames,
+)
 from tests.filters.gaussian_for_tests import directional_check
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter, Gated

@@ -1,7 +1,7 @@
 """Does the spread of a belief say how wrong its mean is?
 
-Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief. A truth
-that is NaN is not known, and does not count.
+Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief. A
+truth that is NaN is not known, and does not count.
 """
 
 from __future__ import annotations

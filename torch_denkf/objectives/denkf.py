@@ -117,7 +117,7 @@ class DEnKFLoss(SequenceLoss):
         values = (state, transition, sensor, observation, nll, kl, smoothed)
         super().__init__(filter, dict(zip(self.TERMS, values, strict=True)), score=score, **options)
         # In a tuple: its parameters are the filter's, and are the loss's already.
-        self._smoother = () if smoother is None else (_smoother_of(smoother, filter),)
+        self._smoother: tuple[Smoother, ...] = () if smoother is None else (_smoother_of(smoother, filter),)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
