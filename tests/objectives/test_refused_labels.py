@@ -150,7 +150,7 @@ def test_weights_count_and_noise_that_is_trained_gets_its_gradient(float64):
 @pytest.mark.parametrize("name", ["state", "state_observed", "target_observation", "observed", "belief"])
 def test_what_is_no_key(name, key):
     for loss in (DEnKFLoss(toy_denkf()), GaussianLoss(linear_kalman()), MixtureLoss(toy_filter())):
-        refuses(lambda loss=loss: loss.set_keys(**{name: key}), name, "must be a key", repr(key), error=TypeError)
+        refuses(lambda loss=loss: loss.set_keys(**{name: key}), name, "is a key", repr(key), error=TypeError)
     if name == "belief":
         refuses(lambda: TransitionLoss(linear_kalman(), belief=key), name, repr(key), error=TypeError)
 

@@ -12,6 +12,7 @@ from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
 from torch_denkf.modules._tensors import as_floating, check_dims
@@ -25,7 +26,7 @@ BELIEFS = (
 )
 
 
-class FilterLoss(LossModule):
+class FilterLoss(Checked, LossModule):
     """Runs a filter, or a part of it, and returns weighted terms: ``loss_<name>`` for each weight that is not zero.
 
     A subclass writes :meth:`_run`, and for each of its terms a method ``_<name>(tensordict, out)``, which returns its
@@ -151,7 +152,8 @@ class FilterLoss(LossModule):
             ValueError: for entries that the loss does not read.
         """
         for name, key in kwargs.items():
-            check_key(name, key)
+            if key is not None:
+                check_key(name, key)
         super().set_keys(**kwargs)
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
@@ -251,6 +253,12 @@ class FilterLoss(LossModule):
             dims=dims,
         )
 
+    @property
+    def _written(self) -> list[NestedKey]:
+        """What the filter writes, by the names of its modules: what stands before them is taken off."""
+        structure = self.filter.structure
+        return [*structure.frame_keys, *structure.step_keys]
+
     def _state_dim(self, out: TensorDictBase) -> int | None:
         """S, of the belief where there is one; ``None`` where nobody says."""
         for key in self.filter.structure.carry:
@@ -282,17 +290,3 @@ class FilterLoss(LossModule):
                 "loss.set_keys(...)."
             )
         return value
-
-
-def check_key(name: str, key: NestedKey | None) -> None:
-    """Raise unless this is a string, or a tuple of strings and such tuples; ``None`` passes.
-
-    Raises:
-        TypeError: if it is not.
-    """
-
-    def good(part: object) -> bool:
-        return bool(part) and (isinstance(part, str) or (isinstance(part, tuple) and all(map(good, part))))
-
-    if key is not None and not good(key):
-        raise TypeError(f"{name} must be a key, a string or a tuple of strings; got {key!r}")

@@ -39,12 +39,12 @@ class ReadingsLoss(FilterLoss):
         if term != "sensor":
             return True
         key = unravel_key(self.tensor_keys.sensor)
-        return key in self.filter.out_keys or key != self._AcceptedKeys.sensor
+        return key in self._written or key != self._AcceptedKeys.sensor
 
     def _samples(self, tensordict: TensorDictBase, out: TensorDictBase) -> tuple[Tensor, Labels]:
         """The sensor's samples ``[*B, E, O]``, and what they should be where it observed all."""
         key = self.tensor_keys.sensor
-        cure = "" if key in self.filter.out_keys else "No module of the filter writes it: set the weight sensor=0.0. "
+        cure = "" if key in self._written else "No module of the filter writes it: set the weight sensor=0.0. "
         target, samples = self._true_observation(tensordict, out), self._entry(out, key, cure)
         if samples.ndim == tensordict.ndim + 1:
             samples = samples.unsqueeze(-2)

@@ -179,7 +179,7 @@ class DEnKFLoss(SequenceLoss):
     # ------------------------------------------------------------------------------------------------------ helpers
 
     def _score(self, tensordict, out, key: NestedKey):
-        weights = [key for key in self.filter.out_keys if isinstance(key, tuple) and key[-1] == "log_weight"]
+        weights = [key for key in self._written if isinstance(key, tuple) and key[-1] == "log_weight"]
         if weights:
             raise TypeError(
                 f"DEnKFLoss scores members that count alike, but those of this {type(self.filter).__name__} have "
@@ -191,9 +191,9 @@ class DEnKFLoss(SequenceLoss):
 
 
 def _smoother_of(make: Callable[[Filter], Smoother], filter: Filter) -> Smoother:
-    if not callable(make) or isinstance(make, Smoother):
-        raise TypeError(f"smoother is called with the filter: pass EnRTS, say, and not {make!r}"[:200])
-    smoother = make(filter)
+    smoother = None if isinstance(make, Smoother) else make(filter)
     if not isinstance(smoother, Smoother):
-        raise TypeError(f"smoother must make a Smoother, as EnRTS and partial(EnKS, lag=5) do; got {smoother!r}"[:200])
+        raise TypeError(
+            f"smoother is called with the filter and makes a Smoother, like EnRTS or partial(EnKS, lag=5); got {make!r}"
+        )
     return smoother

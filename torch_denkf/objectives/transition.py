@@ -9,11 +9,12 @@ from typing import Literal
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules._running import reads
-from torch_denkf.objectives._base import FilterLoss, check_key
+from torch_denkf.objectives._base import FilterLoss
 from torch_denkf.objectives._options import Scale
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._scores import GAUSSIAN_SCORES, MEMBER_SCORES, score_gaussian, score_members
