@@ -108,6 +108,16 @@ def test_labels_of_a_part_of_the_state(name):
     agree(chosen(seen)["loss_state"], expected, filter)
 
 
+def test_scales_are_of_the_labels_or_of_the_whole_state():
+    filter, frames, _, loss = case("members-crps", terms=["state"], state_scale=SCALE[:2])
+    frames["state"] = frames["state"][..., :2]
+    expected = loss(frames)["loss_state"]
+    whole = DEnKFLoss(filter, transition=0.0, sensor=0.0, state_scale=SCALE)
+    assert whole(frames)["loss_state"].equal(expected)
+    both = DEnKFLoss(filter, transition=0.0, sensor=0.0, dims=[1, 0], state_scale=SCALE[1::-1])
+    assert both(frames)["loss_state"].equal(expected)
+
+
 def test_one_label_of_two_dimensions_is_not_that_of_both():
     filter = linear_denkf("etkf")
     readings = torch.randn(4, 9, 2) + filter["observation"].matrix @ torch.tensor([0.0, 9.0])
@@ -197,6 +207,11 @@ def test_a_known_observation_of_the_true_state_is_a_label_where_it_reads_labels(
         assert 0 < len(rows) < 14
         for loss in (SensorLoss(filter), DEnKFLoss(filter, state=0.0, transition=0.0)):
             agree(loss(data)["loss_sensor"], torch.stack(rows).mean(), filter)
+    # Labels of the dimensions 0 and 2 alone are all that is read.
+    alone = frames.exclude("target_observation").set("state", frames["state"][..., [0, 2]])
+    whole = score_by_hand("crps", out["sensor", "ensemble"], truth)[frames["observed"].all(-1)].mean()
+    value = DEnKFLoss(filter, state=0.0, transition=0.0, dims=[0, 2])(alone)["loss_sensor"]
+    torch.testing.assert_close(value, whole, **CLOSE)
     # Labels of the leading dimension alone: of the two readings, none is known, or one.
     data = frames.exclude("target_observation").set("state", frames["state"][..., :1])
     for loss in (SensorLoss(filter), DEnKFLoss(filter, state=0.0, transition=0.0)):
