@@ -9,7 +9,7 @@ from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_
 from tests.objectives.problem_for_tests import only, problem, stepped
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import Select
-from torch_denkf.objectives import DEnKFLoss
+from torch_denkf.objectives import DEnKFLoss, MixtureLoss, SensorLoss, TransitionLoss
 
 
 def test_paper_preset(float64):
@@ -58,6 +58,18 @@ def test_score_of_other_entries(float64):
     loss.set_keys(belief=("forecast", "ensemble"))
     expected = score_by_hand("crps", out["forecast", "ensemble"], frames["state"])[stepped(frames)].mean()
     torch.testing.assert_close(loss(frames)["loss_state"], expected, **CLOSE)
+
+
+@pytest.mark.parametrize("loss", [DEnKFLoss, SensorLoss, TransitionLoss, MixtureLoss])
+def test_a_filter_with_a_prefix_has_the_same_terms(float64, loss):
+    losses = []
+    for prefix in (None, "imu"):
+        torch.manual_seed(0)
+        filter = toy_denkf(prefix=prefix)
+        frames, _ = problem(filter)
+        losses.append(loss(filter)(frames))
+    assert list(losses[0].keys()) == list(losses[1].keys())
+    assert all(losses[0][key].equal(losses[1][key]) for key in losses[0].keys())  # noqa: SIM118
 
 
 def test_arguments_by_keyword(float64):

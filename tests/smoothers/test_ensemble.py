@@ -5,10 +5,18 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from tests.filters.factories import linear_denkf, linear_kalman, linear_system, toy_denkf, toy_frames
+from tests.filters.factories import (
+    FixedEnsemble,
+    NoisyLinear,
+    linear_denkf,
+    linear_kalman,
+    linear_system,
+    toy_denkf,
+    toy_frames,
+)
 from tests.filters.gaussian_for_tests import directional_check
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
-from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.filters import DEnKF, Filter, Gated
 from torch_denkf.functional import enrts_smooth, enrts_step, ensemble_cov
 from torch_denkf.modules import (
     ConstantNoise,
@@ -186,6 +194,41 @@ def test_damping_holds_the_inflation_that_goes_back(float64):
     torch.testing.assert_close(first[1], (1 + shift) * members, rtol=1e-9, atol=0)
     with pytest.raises(ValueError, match="above 0 and at most 1"):
         enrts_step(members, members, members, damping=0.0)
+
+
+@pytest.mark.parametrize("lag", [None, 1])
+def test_inflation_needs_a_damping(float64, lag):
+    """A direction that nobody reads: without a word the smoothed spread was that of the filter times the inflation."""
+    frames = drive(2, 8, missing=0.0, resets=False)
+    filter = DEnKF(
+        NoisyLinear(torch.eye(2)),
+        None,
+        LinearObservation(torch.tensor([[1.0, 0.0], [2.0, 0.0]])),
+        linear_denkf("etkf")["noise"],
+        EnsembleAnalysis("etkf", sensor_key="observation"),
+        initial=FixedEnsemble(torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])),
+    )
+    unread = lambda out, key: out[key, "ensemble"][..., 1].std(-1)  # noqa: E731
+    still = EnRTS(filter, lag)
+    first = still(frames.copy())
+    assert_close(unread(first, "smoothed"), unread(first, "belief"), rtol=1e-9, atol=0)
+    filter["analysis"].inflation = 1.2
+    for make in (lambda: EnRTS(filter, lag), lambda: still(frames.copy())):  # now, and set since it was made
+        with pytest.raises(ValueError, match=r"EnsembleAnalysis has inflation=1.2.*damping=.*EnKS or FixedLag"):
+            make()
+    carried = EnRTS(filter, lag, damping=1.0)(frames.copy())
+    assert (unread(carried, "smoothed")[:, 1:-1] > 1.19 * unread(carried, "belief")[:, 1:-1]).all()
+    EnRTS(filter, lag, damping=0.8)(frames.copy())
+    past = EnKS(filter, lag)(frames.copy())  # leaves it out
+    assert_close(unread(past, "smoothed"), unread(past, "belief"), rtol=1e-9, atol=0)
+    filter["analysis"].inflation = 0.9  # what shrinks does not grow on the way back
+    EnRTS(filter, lag)(frames.copy())
+
+
+def test_adapted_inflation_needs_a_damping():
+    gated = Gated(linear_denkf("etkf"), adapt_inflation=0.1)
+    with pytest.raises(ValueError, match=r"adapt_inflation=0.1.*damping="):
+        EnRTS(gated)
 
 
 @pytest.mark.parametrize("size", [4, 7])

@@ -1,4 +1,4 @@
-"""Functions of symmetric matrices that are safe to differentiate; where one has no value, it is NaN."""
+"""Functions of matrices that are safe to differentiate; where one has no value, it is NaN."""
 
 from __future__ import annotations
 
@@ -180,3 +180,23 @@ class _SymmetricFunction(torch.autograd.Function):
             divided = -divided * (1 + row + column) / ((1 + row) * (1 + column))
         gradient = (gradient + gradient.mT) / 2
         return vectors @ (divided * (vectors.mT @ gradient @ vectors)) @ vectors.mT, None
+
+
+def product_of_known(matrix: Tensor, vector: Tensor) -> Tensor:
+    """H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
+
+    Args:
+        matrix: H, ``[O, S]``.
+        vector: x, ``[*B, S]``.
+
+    Returns:
+        H x, ``[*B, O]``.
+
+    Examples:
+        >>> import torch
+        >>> product_of_known(torch.tensor([[2.0, 0.0], [1.0, 1.0]]), torch.tensor([3.0, torch.nan]))
+        tensor([6., nan])
+    """
+    unknown = vector.isnan()
+    reached = unknown.to(matrix.dtype) @ (matrix != 0).to(matrix.dtype).mT > 0
+    return torch.where(reached, torch.nan, torch.where(unknown, 0, vector) @ matrix.mT)

@@ -1,6 +1,7 @@
 """Does the spread of a belief say how wrong its mean is?
 
-Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief.
+Spread over skill, shares of intervals that hold the truth, and histograms that are flat for a calibrated belief. A
+truth that is NaN is not known, and does not count.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.metrics._paths import wrap_angle
-from torch_denkf.metrics.state import state_difference
+from torch_denkf.metrics.state import mean_of_known, state_difference
 
 __all__ = [
     "SpreadError",
@@ -50,7 +51,7 @@ def spread_skill_ratio(
     Args:
         mean: of the ensemble, ``[*B, S]``.
         variance: of the ensemble with divisor E-1, ``[*B, S]``.
-        truth: ``[*B, S]``, in the same units.
+        truth: ``[*B, S]``, in the same units; what is NaN does not count.
         ensemble_size: E; ``None`` for a distribution whose moments are exact.
 
     Returns:
@@ -73,8 +74,8 @@ def spread_skill_ratio(
         shapes = [list(part.shape) for part in (mean, variance, truth)]
         raise ValueError(f"mean, variance and truth need one shape; got {shapes}.")
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    batch = tuple(range(mean.ndim - 1))
-    return (factor * variance.mean(batch)).sqrt() / (mean - truth).square().mean(batch).sqrt()
+    spread, error = (mean_of_known(values, truth) for values in (variance, (mean - truth).square()))
+    return (factor * spread).sqrt() / error.sqrt()
 
 
 def interval_coverage(
@@ -87,7 +88,7 @@ def interval_coverage(
     Args:
         mean: ``[*B, S]``.
         variance: ``[*B, S]``.
-        truth: ``[*B, S]``, in the same units.
+        truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval.
         angles: dimensions that are angles in rad, whose errors are wrapped.
 
@@ -106,7 +107,7 @@ def interval_coverage(
     _check_variance(variance, error)
     _check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
-    return _share(error.abs() <= quantile * variance.sqrt())
+    return _share(error.abs() <= quantile * variance.sqrt(), truth)
 
 
 def ensemble_interval_coverage(
@@ -120,7 +121,7 @@ def ensemble_interval_coverage(
 
     Args:
         ensemble: ``[*B, E, S]``.
-        truth: ``[*B, S]``, in the same units.
+        truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
         angles: dimensions that are angles in rad; members are taken around their mean direction.
 
@@ -141,7 +142,7 @@ def ensemble_interval_coverage(
     """
     members, offset = _around_mean(ensemble, truth, angles)
     lower, upper = ensemble_interval(members, level=level)
-    return _share((lower <= offset) & (offset <= upper))
+    return _share((lower <= offset) & (offset <= upper), truth)
 
 
 def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
@@ -194,7 +195,8 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] 
         angles: dimensions that are angles in rad, whose errors are wrapped.
 
     Returns:
-        ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean.
+        ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean. NaN where
+        the truth is.
 
     Raises:
         ValueError: if the shapes differ, or if a variance is negative.
@@ -302,7 +304,7 @@ def spread_error(
     Args:
         mean: ``[*B, S]``.
         variance: ``[*B, S]``; of an ensemble with divisor E-1.
-        truth: ``[*B, S]``, in the same units.
+        truth: ``[*B, S]``, in the same units; what is NaN does not count.
         bins: of equal size up to one state, by the rank of the spread.
         ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
             distribution whose moments are exact.
@@ -321,16 +323,18 @@ def spread_error(
     """
     difference = state_difference(mean, truth, angles=angles)
     _check_variance(variance, difference)
-    squared, variance = difference.square().flatten(0, -2), variance.flatten(0, -2)
-    if not 1 <= bins <= len(squared):
-        raise ValueError(f"{bins} bins need at least one state each; got {len(squared)} states")
+    known = ~truth.isnan().flatten(0, -2)
+    fewest = int(known.sum(0).min())
+    if not 1 <= bins <= fewest:
+        raise ValueError(f"{bins} bins need at least one state each; got {fewest} states whose truth is known")
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    order = variance.argsort(0)
-    parts = [
-        torch.stack([part.mean(0).sqrt() for part in column.gather(0, order).tensor_split(bins)], -1)
-        for column in (factor * variance, squared)
-    ]
-    return SpreadError(*parts)
+    columns: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for dim in range(truth.shape[-1]):
+        spread, square = (v.flatten(0, -2)[known[:, dim], dim] for v in (factor * variance, difference.square()))
+        order = spread.argsort()
+        for column, values in zip(columns, (spread, square), strict=True):
+            column.append(torch.stack([part.mean().sqrt() for part in values[order].tensor_split(bins)]))
+    return SpreadError(*map(torch.stack, columns))
 
 
 def _around_mean(ensemble: Tensor, truth: Tensor, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -361,5 +365,5 @@ def _check_level(level: float) -> None:
         raise ValueError(f"level is the probability of the interval, in (0, 1); got {level}.")
 
 
-def _share(inside: Tensor) -> Tensor:
-    return inside.reshape(-1, inside.shape[-1]).to(torch.get_default_dtype()).mean(0)
+def _share(inside: Tensor, truth: Tensor) -> Tensor:
+    return mean_of_known(inside.to(torch.get_default_dtype()), truth)

@@ -92,7 +92,7 @@ def nees(
 
     Raises:
         ValueError: if the shapes do not fit, if a covariance is not positive definite (that of fewer than S + 1 members
-            never is), if ``level`` is not in (0, 1), or if there is nothing to average over.
+            never is), if ``level`` is not in (0, 1), if the truth is NaN, or if there is nothing to average over.
 
     Source:
         Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4.2.
@@ -106,6 +106,8 @@ def nees(
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"level is the probability of the bounds, in (0, 1); got {level}")
+    if bool(truth.isnan().any()):
+        raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
     error = state_difference(mean, truth, angles=angles)
     scale = _scale(error, covariance)
     if covariance.ndim == error.ndim:

@@ -1,15 +1,20 @@
-"""Errors of an estimated state, one figure for each of its dimensions."""
+"""Errors of an estimated state, one figure for each of its dimensions.
+
+A truth that is NaN is not known: it counts nowhere. Of data with a mask of labels that is
+``truth.where(data["state_observed"], torch.nan)``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_denkf.metrics._paths import wrap_angle
 
-__all__ = ["StateErrors", "state_difference", "state_errors"]
+__all__ = ["StateErrors", "mean_of_known", "state_difference", "state_errors"]
 
 
 class StateErrors(NamedTuple):
@@ -65,11 +70,11 @@ def state_errors(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()
 
     Args:
         estimated: states, ``[*B, S]``, such as the mean of a belief.
-        truth: the true states, of the same shape.
+        truth: the true states, of the same shape; NaN where they are not known, which does not count.
         angles: dimensions that are angles in rad, see :func:`state_difference`.
 
     Returns:
-        A :class:`StateErrors`.
+        A :class:`StateErrors`; NaN in a dimension whose truth is nowhere known.
 
     Raises:
         ValueError: if the shapes differ or there are no states.
@@ -84,5 +89,15 @@ def state_errors(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()
     difference = state_difference(estimated, truth, angles=angles)
     if difference.numel() == 0:
         raise ValueError(f"there are no states to average over, got {list(truth.shape)}")
-    batch = difference.reshape(-1, difference.shape[-1])
-    return StateErrors(batch.square().mean(0).sqrt(), batch.abs().mean(0))
+    return StateErrors(mean_of_known(difference.square(), truth).sqrt(), mean_of_known(difference.abs(), truth))
+
+
+def mean_of_known(values: Tensor, truth: Tensor) -> Tensor:
+    """The mean of values ``[*B, S]`` over all batch dims, where the truth ``[*B, S]`` is not NaN, ``[S]``.
+
+    Examples:
+        >>> mean_of_known(torch.tensor([[1.0], [3.0], [9.0]]), torch.tensor([[0.0], [0.0], [torch.nan]]))
+        tensor([2.])
+    """
+    known = ~truth.isnan().reshape(-1, truth.shape[-1])
+    return torch.where(known, values.reshape(-1, truth.shape[-1]), 0).sum(0) / known.sum(0)

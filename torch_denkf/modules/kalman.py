@@ -11,6 +11,7 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
 from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
+from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
@@ -241,8 +242,8 @@ class KalmanAnalysis(SubModel):
         self.reading_keys, self.observed_key = self.in_keys[2:], unravel_key(observed_key)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns ``H x`` of states ``[*, S]``."""
-        return state @ self.matrix.mT
+        """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""
+        return product_of_known(self.matrix, state)
 
     def without_reading(self, mean, cov, *_):
         """The belief where there is no reading: the forecast; innovation and its kin are zero."""
@@ -256,7 +257,7 @@ class KalmanAnalysis(SubModel):
         if observation.ndim > mean.ndim:
             observation = mean_observation(observation, self.angles)
         if self.angles:  # the same turn as the prediction
-            predicted = self.observe(mean)
+            predicted = mean @ self.matrix.mT
             observation = predicted + wrap_angles(observation - predicted, self.angles)
         update = kalman_update(mean, cov, observation, self.matrix, noise, observed=observed)
         return updated(update, observed, self.inflation)

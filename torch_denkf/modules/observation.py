@@ -9,6 +9,7 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf._checks import check_values
+from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import check_dims, register_constant, register_location, register_scale
@@ -142,5 +143,9 @@ class LinearObservation(_Observation):
         check_values("matrix", self.matrix)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns ``H x`` of states ``[*, S]``."""
-        return state @ self.matrix.mT
+        """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""
+        return product_of_known(self.matrix, state)
+
+    def compute(self, ensemble):
+        """The predicted observations."""
+        return ensemble @ self.matrix.mT

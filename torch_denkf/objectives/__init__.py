@@ -1,6 +1,6 @@
 """Training objectives, torchrl loss modules: of whole filters, and of their parts alone."""
 
-from torch_denkf.objectives._options import DimensionsOptions, ReadingsOptions, SequenceOptions
+from torch_denkf.objectives._options import ReadingsOptions, SequenceOptions
 from torch_denkf.objectives.denkf import DEnKFLoss
 from torch_denkf.objectives.gaussian import GaussianLoss
 from torch_denkf.objectives.mixture import MixtureLoss
@@ -15,7 +15,6 @@ __all__ = [
     "ObservationLoss",
     "SensorLoss",
     "TransitionLoss",
-    "DimensionsOptions",
     "ReadingsOptions",
     "SequenceOptions",
 ]

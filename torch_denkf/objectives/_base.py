@@ -1,4 +1,4 @@
-"""What all objectives of filters share: weighted terms, scales, angles, masks, and how a term is reduced."""
+"""What all objectives of filters share: weighted terms, labels, scales, angles, and how a term is reduced."""
 
 from __future__ import annotations
 
@@ -12,34 +12,43 @@ from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
-from torch_denkf.functional import wrap_angles
 from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.objectives._labels import Labels, labels_of, mask_of, true_values
 from torch_denkf.objectives._options import Scale
 
+#: Which objective is for which belief, for messages.
+BELIEFS = (
+    "DEnKFLoss scores members that count alike, MixtureLoss particles with weights, GaussianLoss a mean and a "
+    "covariance. "
+)
 
-class FilterLoss(LossModule):
+
+class FilterLoss(Checked, LossModule):
     """Runs a filter, or a part of it, and returns weighted terms: ``loss_<name>`` for each weight that is not zero.
 
     A subclass writes :meth:`_run`, and for each of its terms a method ``_<name>(tensordict, out)``, which returns its
-    value ``[*B]`` and which elements count (``None``: those of :meth:`_counts`). A mask of padding in the data, such as
-    ``("collector", "mask")``, leaves elements out of every term.
+    value ``[*B]`` and which elements have what it scores (``None``: all). Terms in ``OF_FRAMES`` count there, the
+    others where :meth:`_counts`, too. A mask of padding in the data, such as ``("collector", "mask")``, leaves elements
+    out of every term.
 
     Args:
         filter: the filter; its parameters are the loss's.
         weights: of the terms, by name; ``None`` for 1 where :meth:`_has` what the term scores, else 0.
         score: one of the class's ``SCORES``.
-        state_scale: ``[S]``; errors of the state are divided by it. A dimension with infinite scale does not count:
-            means are taken over the others.
+        dims: state dimensions that count; all that have labels by default.
+        state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
+            dimension with infinite scale does not count: means are taken over the others.
         observation_scale: ``[O]``, likewise, for observations.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
         observation_angles: likewise, dimensions of observations.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
 
     Raises:
-        ValueError: on an unknown score, or a scale that is not positive, infinite in all dimensions, or of another
-            length than what is scored.
+        ValueError: on an unknown score, a scale that is not positive, infinite in all dimensions, or of another length
+            than what is scored, or labels of another shape.
     """
 
     @dataclass
@@ -47,20 +56,28 @@ class FilterLoss(LossModule):
         """The entries that all objectives read.
 
         Attributes:
-            state: true state ``[*B, S]``; of sequences ``*B`` ends with time, here and below.
+            state: true state ``[*B, N]``, of the leading N components of the state; NaN where it is not known. Of
+                sequences ``*B`` ends with time, here and below.
+            state_observed: which of them are known, ``[*B, 1]`` or ``[*B, N]``, bool; by default the state's name and
+                ``_observed``, as data sets write it. It may be missing.
             target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
                 no parameters, it is that model's observation of the true state.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``.
+            target_observed: likewise, of the true observation.
+            observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
             sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
         """
 
         state: NestedKey = "state"
+        state_observed: NestedKey | None = None
         target_observation: NestedKey = "target_observation"
+        target_observed: NestedKey | None = None
         observed: NestedKey = "observed"
         sensor: NestedKey = ("sensor", "ensemble")
 
     default_keys = _AcceptedKeys
     SCORES: Sequence[str] = ()
+    #: Terms of frames alone, whether they were stepped to or not.
+    OF_FRAMES: Sequence[str] = ("sensor", "noise", "observation")
 
     def __init__(
         self,
@@ -68,6 +85,7 @@ class FilterLoss(LossModule):
         weights: Mapping[str, float | None],
         *,
         score: str,
+        dims: Sequence[int] | None = None,
         state_scale: Scale = None,
         observation_scale: Scale = None,
         angles: Sequence[int] = (),
@@ -86,7 +104,12 @@ class FilterLoss(LossModule):
             raise ValueError(f'reduction is "mean", "sum" or "none"; got {reduction!r}.')
         check_dims("angles", angles)
         check_dims("observation_angles", observation_angles)
+        if dims is not None:
+            check_dims("dims", dims, once=True)
+            if not len(dims):
+                raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
         super().__init__()
+        self.dims = None if dims is None else [int(dim) for dim in dims]
         self.filter, self.score, self.reduction = filter, score, reduction
         self.angles, self.observation_angles = list(angles), list(observation_angles)
         self._given_weights = dict(weights)
@@ -99,20 +122,13 @@ class FilterLoss(LossModule):
                 raise ValueError(
                     f"{name} is positive, and infinite where a dimension does not count; one must. Got {scale}."
                 )
-        self.choose_dimensions()
-        self.register_load_state_dict_post_hook(_choose_dimensions)
+        if self.dims is not None and self.state_scale is not None and self.state_scale.numel() != len(self.dims):
+            raise ValueError(f"state_scale has one entry for each of dims={self.dims}; got {self.state_scale.numel()}.")
         self._choose_terms()
 
     def register_scale(self, name: str, scale: Scale | float) -> None:
         """Keeps a scale as a buffer, or ``None``."""
         self.register_buffer(name, None if scale is None else as_floating(scale, name))
-
-    def choose_dimensions(self) -> None:
-        """Finds which dimensions count. Done once: a boolean index in forward would wait for the device."""
-        for name in ("state", "observation"):
-            scale = getattr(self, f"{name}_scale")
-            finite = None if scale is None or scale.isfinite().all() else scale.isfinite().nonzero().flatten()
-            self.register_buffer(f"{name}_counting", finite, persistent=False)
 
     @property
     def functional(self) -> bool:
@@ -128,6 +144,18 @@ class FilterLoss(LossModule):
     def in_keys(self, value) -> None:
         raise AttributeError("in_keys follow from the filter; rename the state with set_keys(state=...).")
 
+    def set_keys(self, **kwargs: NestedKey | None) -> None:
+        """Names entries otherwise, see the class's ``_AcceptedKeys``; ``None`` for the default.
+
+        Raises:
+            TypeError: for what is no key: a string, or a tuple of strings.
+            ValueError: for entries that the loss does not read.
+        """
+        for name, key in kwargs.items():
+            if key is not None:
+                check_key(name, key)
+        super().set_keys(**kwargs)
+
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         # set_keys calls this after it has renamed.
         self._choose_terms()
@@ -139,8 +167,12 @@ class FilterLoss(LossModule):
         losses = TensorDict({}, batch_size=[])
         for name, weight in self.weights.items():
             term, mask = getattr(self, f"_{name}")(tensordict, out)
+            if mask is None:
+                mask = counts
+            elif name not in self.OF_FRAMES:
+                mask = mask & counts
             if term.ndim:
-                term = self._reduce_term(term, counts if mask is None else mask, tensordict)
+                term = self._reduce_term(term, mask, tensordict)
             losses[f"loss_{name}"] = weight * term
         return losses
 
@@ -162,38 +194,78 @@ class FilterLoss(LossModule):
         """Whether there is what a term scores."""
         return True
 
-    # ----------------------------------------------------------------------------------------------------- errors
+    # ----------------------------------------------------------------------------------------------------- labels
 
-    def _state_error(self, estimate: Tensor, target: Tensor) -> Tensor:
-        """Scaled errors of states ``[*, S]`` in the dimensions that count."""
-        return self._scaled("state", wrap_angles(estimate - target, self.angles))
+    def _state_labels(self, tensordict: TensorDictBase, size: int) -> Labels:
+        """The true state as far as it counts, against an estimate of ``size`` dimensions."""
+        known, given = self._true_state(tensordict, size)
+        dims = range(min(given, size)) if self.dims is None else self.dims
+        return labels_of(known, dims, "state_scale", self.state_scale)
 
-    def _observation_error(self, estimate: Tensor, target: Tensor) -> Tensor:
-        """Scaled errors of observations ``[*, O]`` in the dimensions that count."""
-        return self._scaled("observation", wrap_angles(estimate - target, self.observation_angles))
+    def _observation_labels(self, tensordict: TensorDictBase, target: Tensor, size: int) -> Labels:
+        """The true observation as far as it counts, against readings of ``size`` dimensions."""
+        known = self._known(tensordict, "target_observation", "target_observed", target, size)
+        return labels_of(known, range(min(target.shape[-1], size)), "observation_scale", self.observation_scale)
 
-    def _scaled(self, name: str, errors: Tensor) -> Tensor:
-        scale = getattr(self, f"{name}_scale")
-        if scale is None:
-            return errors
-        if scale.numel() not in (1, errors.shape[-1]):
+    def _true_state(self, tensordict: TensorDictBase, size: int) -> tuple[Tensor, int]:
+        """The true state ``[*B, size]``, NaN where it is not known, and how many dimensions its labels have."""
+        values = self._entry(tensordict, self.tensor_keys.state)
+        return self._known(tensordict, "state", "state_observed", values, size, self.dims), values.shape[-1]
+
+    def _whole_state(self, tensordict: TensorDictBase, out: TensorDictBase) -> Labels:
+        """The true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
+
+        Raises:
+            ValueError: if the labels lack dimensions.
+        """
+        values = self._entry(tensordict, self.tensor_keys.state)
+        given = values.shape[-1]
+        size = self._state_dim(out) or given
+        known = self._known(tensordict, "state", "state_observed", values, size)
+        if given < size:
             raise ValueError(
-                f"{name}_scale has {scale.numel()} entries, but {errors.shape[-1]} dimensions of the {name} are "
-                "scored; pass one entry for each"
+                f"{type(self).__name__} needs the whole true state of {size} dimensions, but "
+                f"{self.tensor_keys.state!r} has {given}. Add the others, with NaN in the rows that have no label"
             )
-        return self._counting(name, errors) / self._counting(name, scale)
+        labels = labels_of(known, range(size), "", None)
+        return labels._replace(mask=labels.mask.all(-1, keepdim=True))
 
-    def _scale(self, name: str) -> Tensor | None:
-        """The scale of the dimensions that count."""
-        scale = getattr(self, f"{name}_scale")
-        return None if scale is None else self._counting(name, scale)
+    def _known(
+        self,
+        tensordict: TensorDictBase,
+        name: str,
+        observed_name: str,
+        values: Tensor,
+        size: int,
+        dims: Sequence[int] | None = None,
+    ) -> Tensor:
+        key, observed_key = getattr(self.tensor_keys, name), getattr(self.tensor_keys, observed_name)
+        observed_key = mask_of(key) if observed_key is None else observed_key
+        padding = (tensordict.get(mask, None) for mask in self._loss_mask_keys())
+        return true_values(
+            key,
+            values,
+            size,
+            tensordict.batch_size,
+            observed=tensordict.get(observed_key, None),
+            observed_key=observed_key,
+            padding=[mask for mask in padding if mask is not None],
+            dims=dims,
+        )
 
-    def _counting(self, name: str, value: Tensor, *dims: int) -> Tensor:
-        """The dimensions that count, of ``value`` along ``dims``; the last by default."""
-        index = getattr(self, f"{name}_counting")
-        for dim in (dims or (-1,)) if index is not None else ():
-            value = value.index_select(dim, index)
-        return value
+    @property
+    def _written(self) -> list[NestedKey]:
+        """What the filter writes, by the names of its modules: what stands before them is taken off."""
+        structure = self.filter.structure
+        return [*structure.frame_keys, *structure.step_keys]
+
+    def _state_dim(self, out: TensorDictBase) -> int | None:
+        """S, of the belief where there is one; ``None`` where nobody says."""
+        for key in self.filter.structure.carry:
+            value = out.get(key, None) if key[-1] in ("ensemble", "mean") else None
+            if value is not None:
+                return value.shape[-1]
+        return getattr(self.filter.initial, "state_dim", None)
 
     # -------------------------------------------------------------------------------------------------- reduction
 
@@ -209,9 +281,6 @@ class FilterLoss(LossModule):
 
     # ---------------------------------------------------------------------------------------------------- entries
 
-    def _true_state(self, tensordict: TensorDictBase) -> Tensor:
-        return self._entry(tensordict, self.tensor_keys.state)
-
     def _entry(self, tensordict: TensorDictBase, key: NestedKey, cure: str = "") -> Tensor:
         value = tensordict.get(key, None)
         if value is None:
@@ -221,8 +290,3 @@ class FilterLoss(LossModule):
                 "loss.set_keys(...)."
             )
         return value
-
-
-def _choose_dimensions(loss: FilterLoss, _) -> None:
-    """A loaded scale may be infinite elsewhere."""
-    loss.choose_dimensions()

@@ -13,7 +13,7 @@ from torch_denkf.filters._structure import previous_key
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import reads, run_module, run_modules
 
-__all__ = ["forecasts_from_truth", "has_members", "members_of"]
+__all__ = ["forecasts_from_truth", "has_members", "members_of", "one_earlier"]
 
 
 def has_members(filter: Filter, belief: str) -> bool:
@@ -66,13 +66,13 @@ def forecasts_from_truth(
         entries.update({key: start[key] for key in others})
     entries.update(carried)
     for key in structure.carry:
-        entries[key] = _one_earlier(entries[key], time)
+        entries[key] = one_earlier(entries[key], time)
     for key in structure.controls:
         stored = entries.get(previous_key(key))
         if stored is not None:
             entries[key] = stored
         elif key in entries:
-            entries[key] = _one_earlier(entries[key], time)
+            entries[key] = one_earlier(entries[key], time)
     written = run_module(transition, entries, call.part(place))
     return {key: written[forecast] for key, forecast in structure.forecast_of.items()}
 
@@ -116,7 +116,7 @@ def _without(entries: Entries, keys: tuple[NestedKey, ...]) -> Entries:
     return {key: value for key, value in entries.items() if unravel_key(key) not in keys}
 
 
-def _one_earlier(value: Tensor, time: int) -> Tensor:
+def one_earlier(value: Tensor, time: int) -> Tensor:
     """Every element from one step before; the first stays where it is."""
     count = value.shape[time]
     return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Literal, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules import StochasticMLP
+from torch_denkf.objectives._base import BELIEFS
 from torch_denkf.objectives._options import SequenceOptions
 from torch_denkf.objectives._scores import MEMBER_SCORES, score_members
 from torch_denkf.objectives._sequence import SequenceLoss
@@ -56,10 +57,13 @@ class DEnKFLoss(SequenceLoss):
         smoothed: weight of ``loss_smoothed``.
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
-        **options: scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`.
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. It also
+            says what gaps in the labels are.
 
     Raises:
-        ValueError: on an unknown score, a scale that is not positive, or slices that are not marked.
+        ValueError: on an unknown score, a scale that is not positive, labels of another shape, or slices that are not
+            marked.
+        TypeError: for particles with weights, which :class:`MixtureLoss` scores; or a smoother that is none.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -113,7 +117,7 @@ class DEnKFLoss(SequenceLoss):
         values = (state, transition, sensor, observation, nll, kl, smoothed)
         super().__init__(filter, dict(zip(self.TERMS, values, strict=True)), score=score, **options)
         # In a tuple: its parameters are the filter's, and are the loss's already.
-        self._smoother: tuple[Smoother, ...] = (smoother(filter),) if smoother is not None else ()
+        self._smoother: tuple[Smoother, ...] = () if smoother is None else (_smoother_of(smoother, filter),)
 
     @classmethod
     def paper(cls, filter: Filter, **kwargs) -> DEnKFLoss:
@@ -159,13 +163,13 @@ class DEnKFLoss(SequenceLoss):
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):
-        return self._score(out, self.tensor_keys.belief, self._true_state(tensordict)), None
+        return self._score(tensordict, out, self.tensor_keys.belief)
 
     def _transition(self, tensordict, out):
-        return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
+        return self._score(tensordict, out, self.tensor_keys.forecast)
 
     def _smoothed(self, tensordict, out):
-        return self._score(out, self.tensor_keys.smoothed, self._true_state(tensordict)), None
+        return self._score(tensordict, out, self.tensor_keys.smoothed)
 
     def _kl(self, tensordict, out):
         return sum(
@@ -174,5 +178,22 @@ class DEnKFLoss(SequenceLoss):
 
     # ------------------------------------------------------------------------------------------------------ helpers
 
-    def _score(self, out: TensorDictBase, key: NestedKey, target: torch.Tensor) -> torch.Tensor:
-        return score_members(self._state_error(self._entry(out, key), target.unsqueeze(-2)), self.score)
+    def _score(self, tensordict, out, key: NestedKey):
+        weights = [key for key in self._written if isinstance(key, tuple) and key[-1] == "log_weight"]
+        if weights:
+            raise TypeError(
+                f"DEnKFLoss scores members that count alike, but those of this {type(self.filter).__name__} have "
+                f'weights, {weights[0]!r}. Take MixtureLoss, with score="crps" for this one\'s score'
+            )
+        ensemble = self._entry(out, key, BELIEFS)
+        labels = self._state_labels(tensordict, ensemble.shape[-1])
+        return score_members(labels.errors(ensemble, self.angles), labels.mask, self.score), labels.rows
+
+
+def _smoother_of(make: Callable[[Filter], Smoother], filter: Filter) -> Smoother:
+    smoother = None if isinstance(make, Smoother) else make(filter)
+    if not isinstance(smoother, Smoother):
+        raise TypeError(
+            f"smoother is called with the filter and makes a Smoother, like EnRTS or partial(EnKS, lag=5); got {make!r}"
+        )
+    return smoother

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Unpack
 
-import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey
 
 from torch_denkf.filters import Filter
-from torch_denkf.objectives._dimensions import DimensionsLoss
-from torch_denkf.objectives._options import DimensionsOptions
+from torch_denkf.objectives._base import BELIEFS
+from torch_denkf.objectives._options import SequenceOptions
 from torch_denkf.objectives._scores import GAUSSIAN_SCORES, score_gaussian
+from torch_denkf.objectives._sequence import SequenceLoss
 
 __all__ = ["GaussianLoss"]
 
 
-class GaussianLoss(DimensionsLoss):
+class GaussianLoss(SequenceLoss):
     r"""Scores a filter with a mean and a covariance on sequences ``[*B, T]`` against the true states.
 
     The counterpart of :class:`~torch_denkf.objectives.DEnKFLoss`, whose fair CRPS estimates from members what is a
@@ -42,11 +42,12 @@ class GaussianLoss(DimensionsLoss):
         sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`DimensionsOptions`.
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. It also
+            says what gaps in the labels are.
 
     Raises:
-        ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``,
-            or slices that are not marked.
+        ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``, labels of
+            another shape, or slices that are not marked.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -54,6 +55,7 @@ class GaussianLoss(DimensionsLoss):
         statistics and minimum CRPS estimation", Mon. Weather Rev. 133, 2005, for the CRPS of a Gaussian.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
@@ -63,13 +65,16 @@ class GaussianLoss(DimensionsLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
+    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
         """The entries that the loss reads beside those of :class:`FilterLoss`.
 
         Attributes:
             belief: prefix of ``mean`` and ``cov`` of the belief.
             forecast: prefix of ``mean`` and ``cov`` of the forecast.
         """
+
+        belief: NestedKey = "belief"
+        forecast: NestedKey = "forecast"
 
     default_keys = _AcceptedKeys
     SCORES = GAUSSIAN_SCORES
@@ -84,7 +89,7 @@ class GaussianLoss(DimensionsLoss):
         transition: float = 1.0,
         sensor: float | None = None,
         nll: float = 0.0,
-        **options: Unpack[DimensionsOptions],
+        **options: Unpack[SequenceOptions],
     ):
         weights = dict(zip(self.TERMS, (state, transition, sensor, nll), strict=True))
         super().__init__(filter, weights, score=score, **options)
@@ -92,18 +97,14 @@ class GaussianLoss(DimensionsLoss):
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):
-        return self._score(out, self.tensor_keys.belief, self._true_state(tensordict)), None
+        return self._score(tensordict, out, self.tensor_keys.belief)
 
     def _transition(self, tensordict, out):
-        return self._score(out, self.tensor_keys.forecast, self._true_state(tensordict)), None
+        return self._score(tensordict, out, self.tensor_keys.forecast)
 
     # ------------------------------------------------------------------------------------------------------ helpers
 
-    def _score(self, out: TensorDictBase, prefix: str, target: torch.Tensor) -> torch.Tensor:
-        mean, cov = self._entry(out, (prefix, "mean")), self._entry(out, (prefix, "cov"))
-        errors = self._errors(mean, target)
-        cov = cov[..., : target.shape[-1], : target.shape[-1]]
-        if self.dims is not None:
-            cov = cov.index_select(-1, self.dims).index_select(-2, self.dims)
-        cov = self._counting("state", cov, -1, -2)
-        return score_gaussian(errors, cov, self.score, self._scale("state"))
+    def _score(self, tensordict, out, prefix: NestedKey):
+        mean, cov = (self._entry(out, (prefix, name), BELIEFS) for name in ("mean", "cov"))
+        labels = self._state_labels(tensordict, mean.shape[-1])
+        return score_gaussian(labels.errors(mean, self.angles), labels.mask, cov, self.score, labels.scale), labels.rows

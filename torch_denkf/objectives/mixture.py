@@ -8,17 +8,20 @@ from dataclasses import dataclass
 from typing import Literal, Unpack
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_weighted, weighted_mean
-from torch_denkf.objectives._dimensions import DimensionsLoss
-from torch_denkf.objectives._options import DimensionsOptions
+from torch_denkf.functional import weighted_mean
+from torch_denkf.objectives._base import BELIEFS
+from torch_denkf.objectives._labels import Labels
+from torch_denkf.objectives._options import SequenceOptions
+from torch_denkf.objectives._scores import mean_of, score_mixture
+from torch_denkf.objectives._sequence import SequenceLoss
 
 __all__ = ["MixtureLoss"]
 
 
-class MixtureLoss(DimensionsLoss):
+class MixtureLoss(SequenceLoss):
     r"""Scores a filter with weighted particles on sequences ``[*B, T]`` against the true states.
 
     The default score takes each particle for the centre of a Gaussian: :math:`-\log \sum_i w^i N(x; x^i,
@@ -43,18 +46,19 @@ class MixtureLoss(DimensionsLoss):
         filter: the filter to train, e.g. :class:`~torch_denkf.filters.DPF`. Members without weights count alike.
         score: ``"mixture"``, in nats, or ``"crps"``, the weighted CRPS (not fair: there is no fair one with weights)
             in each dimension, averaged.
-        component_std: :math:`\sigma`, a number or one for each of ``dims``, in units of ``state_scale``.
+        component_std: :math:`\sigma`, a number or one for each of ``dims``, else of the labels' dimensions, in units of
+            ``state_scale``.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
         mean: weight of ``loss_mean``.
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`DimensionsOptions`. With a
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. With a
             ``state_scale`` the mixture is a density of the state in its own units all the same.
 
     Raises:
-        ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``, or
-            slices that are not marked.
+        ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``,
+            labels of another shape, or slices that are not marked.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -79,7 +83,7 @@ class MixtureLoss(DimensionsLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(DimensionsLoss._AcceptedKeys):
+    class _AcceptedKeys(SequenceLoss._AcceptedKeys):
         """The entries that the loss reads beside those of :class:`FilterLoss`.
 
         Attributes:
@@ -87,6 +91,9 @@ class MixtureLoss(DimensionsLoss):
             forecast: prefix of ``ensemble`` and ``log_weight`` of the forecast.
             log_likelihood: of the reading.
         """
+
+        belief: NestedKey = "belief"
+        forecast: NestedKey = "forecast"
 
     default_keys = _AcceptedKeys
     SUPERVISED = ("state", "transition", "mean", "sensor")
@@ -104,50 +111,43 @@ class MixtureLoss(DimensionsLoss):
         mean: float = 0.0,
         sensor: float = 0.0,
         nll: float = 0.0,
-        **options: Unpack[DimensionsOptions],
+        **options: Unpack[SequenceOptions],
     ):
         weights = dict(zip(self.TERMS, (state, transition, mean, sensor, nll), strict=True))
         super().__init__(filter, weights, score=score, **options)
         self.register_scale("component_std", component_std)
         if not ((self.component_std > 0) & self.component_std.isfinite()).all():
             raise ValueError(f"component_std is the width of each component, positive and finite; got {component_std}.")
-        dims = options.get("dims")
-        if dims is not None and self.component_std.numel() not in (1, len(dims)):
-            raise ValueError(f"component_std has one entry for each of dims={list(dims)}; got {component_std}.")
+        if self.dims is not None and self.component_std.numel() not in (1, len(self.dims)):
+            raise ValueError(f"component_std has one entry for each of dims={self.dims}; got {component_std}.")
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 
     def _state(self, tensordict, out):
-        return self._score(out, self.tensor_keys.belief, tensordict), None
+        return self._score(tensordict, out, self.tensor_keys.belief)
 
     def _transition(self, tensordict, out):
-        return self._score(out, self.tensor_keys.forecast, tensordict), None
+        return self._score(tensordict, out, self.tensor_keys.forecast)
 
     def _mean(self, tensordict, out):
-        particles, log_weights = self._particles(out, self.tensor_keys.belief)
-        return self._errors(weighted_mean(particles, log_weights), self._true_state(tensordict)).square().mean(-1), None
+        errors, log_weights, labels = self._errors(tensordict, out, self.tensor_keys.belief)
+        # The mean of errors, because the mean of angles on both sides of pi is none.
+        return mean_of(weighted_mean(errors, log_weights).square(), labels.mask), labels.rows
 
     # ------------------------------------------------------------------------------------------------------ helpers
 
-    def _particles(self, out: TensorDictBase, prefix: str) -> tuple[torch.Tensor, torch.Tensor]:
-        particles = self._entry(out, (prefix, "ensemble"))
+    def _errors(
+        self, tensordict: TensorDictBase, out: TensorDictBase, prefix: NestedKey
+    ) -> tuple[torch.Tensor, torch.Tensor, Labels]:
+        """Errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
+        particles = self._entry(out, (prefix, "ensemble"), BELIEFS)
         log_weights = out.get((prefix, "log_weight"), None)
         if log_weights is None:
             log_weights = torch.full_like(particles[..., 0], -math.log(particles.shape[-2]))
-        return particles, log_weights
+        labels = self._state_labels(tensordict, particles.shape[-1])
+        return labels.errors(particles, self.angles), log_weights, labels
 
-    def _score(self, out: TensorDictBase, prefix: str, tensordict: TensorDictBase) -> torch.Tensor:
-        particles, log_weights = self._particles(out, prefix)
-        errors = self._errors(particles, self._true_state(tensordict).unsqueeze(-2))
-        if self.score == "crps":
-            return crps_weighted(errors, log_weights, torch.zeros_like(errors[..., 0, :])).mean(-1)
-        std = self.component_std
-        if std.numel() > 1:
-            std = self._counting("state", std)
-        # In the state's own units the density is one of the scaled state, divided by all scales.
-        scale = self._scale("state")
-        units = 0.0 if scale is None else scale.expand(errors.shape[-1]).log().sum()
-        std = std.expand(errors.shape[-1])
-        log_density = log_weights - 0.5 * (errors / std).square().sum(-1)
-        constant = std.log().sum() + 0.5 * math.log(2 * math.pi) * errors.shape[-1] + units
-        return constant - torch.logsumexp(log_density, -1)
+    def _score(self, tensordict, out, prefix: NestedKey):
+        errors, log_weights, labels = self._errors(tensordict, out, prefix)
+        std = labels.in_all_components("component_std", self.component_std)
+        return score_mixture(errors, labels.mask, log_weights, self.score, std, labels.scale), labels.rows

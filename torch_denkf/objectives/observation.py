@@ -26,7 +26,7 @@ class ObservationLoss(PartLoss, ReadingsLoss):
         **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
-        ValueError: if a scale is not positive.
+        ValueError: if a scale is not positive, or labels have another shape.
         KeyError: if the filter has no such model, or an entry is missing.
 
     Example:
@@ -45,8 +45,10 @@ class ObservationLoss(PartLoss, ReadingsLoss):
         """The entries that the loss reads.
 
         Attributes:
-            state: true state ``[*B, S]``.
+            state: true state ``[*B, S]``; elements count where all of it is known.
+            state_observed: where it is, ``[*B, 1]`` or ``[*B, S]``.
             target_observation: true observation ``[*B, O]``.
+            target_observed: where it is known, ``[*B, 1]`` or ``[*B, O]``.
         """
 
     default_keys = _AcceptedKeys

@@ -35,7 +35,8 @@ class SensorLoss(PartLoss, ReadingsLoss):
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames
-    count where the sensor observed all. The parameters of the loss are those of the modules it runs.
+    count where the sensor observed all and the true observation is known, see :class:`ReadingsOptions`. The parameters
+    of the loss are those of the modules it runs.
 
     Args:
         filter: the filter whose sensor is trained.
@@ -46,7 +47,7 @@ class SensorLoss(PartLoss, ReadingsLoss):
         **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
-        ValueError: on an unknown score, or a scale that is not positive.
+        ValueError: on an unknown score, a scale that is not positive, or labels of another shape.
         KeyError: if an entry that a term needs is missing.
 
     Example:
@@ -65,9 +66,11 @@ class SensorLoss(PartLoss, ReadingsLoss):
 
         Attributes:
             state: true state ``[*B, S]``, read where there is no true observation.
+            state_observed: where it is known, ``[*B, 1]`` or ``[*B, S]``.
             target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
                 no parameters, it is that model's observation of the true state.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``.
+            target_observed: where it is known, ``[*B, 1]`` or ``[*B, O]``.
+            observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
             sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
             noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
         """
@@ -124,9 +127,7 @@ class SensorLoss(PartLoss, ReadingsLoss):
         return out
 
     def _noise(self, tensordict, out):
-        errors, mask = self._reading_errors(tensordict, out)
+        samples, labels = self._samples(tensordict, out)
         noise = self._entry(out, self.tensor_keys.noise, "R must follow from frames alone. ")
-        error = errors.mean(-2)
-        cov = as_covariance(noise, self._true_observation(tensordict))
-        cov = self._counting("observation", cov, -1, -2)
-        return score_gaussian(error, cov, "nll", self._scale("observation")), mask
+        error = labels.errors(samples, self.observation_angles).mean(-2)
+        return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count
 from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
@@ -18,7 +18,7 @@ from torch_denkf.objectives._base import FilterLoss
 from torch_denkf.objectives._options import Scale
 from torch_denkf.objectives._part import PartLoss
 from torch_denkf.objectives._scores import GAUSSIAN_SCORES, MEMBER_SCORES, score_gaussian, score_members
-from torch_denkf.objectives._true_steps import forecasts_from_truth, has_members, members_of
+from torch_denkf.objectives._true_steps import forecasts_from_truth, has_members, members_of, one_earlier
 
 __all__ = ["TransitionLoss"]
 
@@ -29,7 +29,9 @@ class TransitionLoss(PartLoss):
     Nothing is filtered: all steps are made at once, each from the truth. The members of an ensemble filter are all at
     the truth, or around it by ``spread``; the transition's own noise makes them differ. A filter with a mean and a
     covariance starts from N(truth, spread²). The one term is ``loss_transition``. The first element of a sequence, and
-    those where an episode begins, do not count. The parameters of the loss are those of the transition.
+    those where an episode begins, do not count. Nor do those with gaps in their labels: a step starts where all of the
+    state is known, and is scored against what is known one step later, see :class:`SequenceOptions`. The parameters of
+    the loss are those of the transition.
 
     Args:
         filter: the filter whose transition is trained.
@@ -39,18 +41,21 @@ class TransitionLoss(PartLoss):
         spread: standard deviation around the truth, in the state's units: a number or ``[S]``. Members are drawn anew
             in each call.
         members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
-        state_scale: ``[S]``; errors of the state are divided by it, so that dimensions with different units count
-            alike. A dimension with infinite scale does not count: means are taken over the others.
+        dims: state dimensions that count; all by default.
+        state_scale: one for each of ``dims``; errors of the state are divided by it, so that dimensions with different
+            units count alike. A dimension with infinite scale does not count: means are taken over the others.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, a negative spread, too few members, a filter that
-            carries neither members nor moments, a batch without time, or slices that are not marked.
+            carries neither members nor moments, labels of a part of the state, a batch without time, or slices that
+            are not marked.
         KeyError: if an entry is missing.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
@@ -65,6 +70,7 @@ class TransitionLoss(PartLoss):
 
         Attributes:
             state: true state ``[*B, T, S]``.
+            state_observed: where it is known, ``[*B, T, 1]`` or ``[*B, T, S]``.
         """
 
     default_keys = _AcceptedKeys
@@ -76,18 +82,26 @@ class TransitionLoss(PartLoss):
         score: Literal["crps", "energy", "nll", "mse"] = "crps",
         spread: float | Sequence[float] | Tensor = 0.0,
         members: int | None = None,
+        dims: Sequence[int] | None = None,
         state_scale: Scale = None,
         angles: Sequence[int] = (),
         belief: str = "belief",
         reduction: Literal["mean", "sum", "none"] = "mean",
     ):
+        check_key("belief", belief)
         self.SCORES = MEMBER_SCORES if has_members(filter, belief) else GAUSSIAN_SCORES
         if members is not None:
             check_count(
                 "members", members, least=1 if score == "mse" else 2, cure='One member has no spread: score it by "mse"'
             )
         super().__init__(
-            filter, {"transition": 1.0}, score=score, state_scale=state_scale, angles=angles, reduction=reduction
+            filter,
+            {"transition": 1.0},
+            score=score,
+            dims=dims,
+            state_scale=state_scale,
+            angles=angles,
+            reduction=reduction,
         )
         self.belief, self.members = belief, members_of(filter, members) if has_members(filter, belief) else None
         self.register_scale("spread", spread)
@@ -110,31 +124,21 @@ class TransitionLoss(PartLoss):
         if not tensordict.ndim:
             raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
         refuse_unmarked_slices(tensordict, self.filter.init_key)
-        truth = self._finite_where_unused(tensordict)
-        written = forecasts_from_truth(
-            self.filter, tensordict, truth, self.belief, spread=self.spread, members=self.members
-        )
+        truth = self._whole_state(tensordict, tensordict).values
+        # Whatever else reads the true state finds no NaN either.
+        known = tensordict.copy().set(self.tensor_keys.state, truth)
+        written = forecasts_from_truth(self.filter, known, truth, self.belief, spread=self.spread, members=self.members)
         return TensorDict(written, tensordict.batch_size)
 
     def _counts(self, tensordict: TensorDictBase) -> Tensor:
         # Without a stored belief, which would let the first element of a slice count: its truth before is unknown.
-        return self.filter.stepped(tensordict.exclude("previous"))
+        stepped = self.filter.stepped(tensordict.exclude("previous"))
+        return stepped & one_earlier(self._whole_state(tensordict, tensordict).rows, tensordict.ndim - 1)
 
     def _transition(self, tensordict, out):
-        target = self._finite_where_unused(tensordict)
+        estimate = out[self.belief, "mean" if self.members is None else "ensemble"]
+        labels = self._state_labels(tensordict, estimate.shape[-1])
+        errors = labels.errors(estimate, self.angles)
         if self.members is not None:
-            ensemble = out[self.belief, "ensemble"]
-            return score_members(self._state_error(ensemble, target.unsqueeze(-2)), self.score), None
-        error = self._state_error(out[self.belief, "mean"], target)
-        cov = self._counting("state", out[self.belief, "cov"], -1, -2)
-        return score_gaussian(error, cov, self.score, self._scale("state")), None
-
-    def _finite_where_unused(self, tensordict: TensorDictBase) -> Tensor:
-        """The true state; padding may hold anything, and is a start of forecasts here."""
-        state, used = self._true_state(tensordict), None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is not None:
-                mask = mask.reshape(*tensordict.batch_size, 1)
-                used = mask if used is None else used & mask
-        return state if used is None else torch.where(used, state, state.nan_to_num(0.0, 0.0, 0.0))
+            return score_members(errors, labels.mask, self.score), labels.rows
+        return score_gaussian(errors, labels.mask, out[self.belief, "cov"], self.score, labels.scale), labels.rows

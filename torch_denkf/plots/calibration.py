@@ -91,6 +91,8 @@ def plot_calibration(
     elif read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
     else:
+        if bool(true.isnan().any()):
+            raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
         values = pit(read.mean[..., time, chosen], read.var[..., time, chosen], true, angles=turns).flatten(0, -2)
         counts = torch.stack([torch.histc(column, bins, 0, 1) for column in values.unbind(-1)])
     samples = true[..., 0].numel()

@@ -26,13 +26,13 @@ class EnRTS(Smoother):
     Args:
         filter: an ensemble filter. Its analysis must keep members in their places: not ``rotate=True``.
         lag: how many later readings count; ``None`` for all.
-        damping: factor on each gain. A long way back through a filter with inflation needs one below 1 / inflation, see
+        damping: factor on each gain, 1 by default. A filter with inflation needs one below 1 / inflation, see
             :func:`~torch_denkf.functional.enrts_step`.
 
     Raises:
         TypeError: for a filter without an ensemble.
-        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own; or a
-            damping that is not in (0, 1].
+        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own; for
+            one with inflation, without a damping; or for a damping that is not in (0, 1].
 
     Reference:
         Raanes, "On the ensemble Rauch-Tung-Striebel smoother and its equivalence to the ensemble Kalman smoother",
@@ -47,7 +47,7 @@ class EnRTS(Smoother):
         torch.Size([2, 3, 8, 5])
     """
 
-    def __init__(self, filter: Filter, lag: int | None = None, *, damping: float = 1.0):
+    def __init__(self, filter: Filter, lag: int | None = None, *, damping: float | None = None):
         kind, prefix = kind_of(filter)
         if kind != "ensemble":
             raise TypeError(
@@ -60,13 +60,28 @@ class EnRTS(Smoother):
             )
         keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
-        check_number("damping", damping, above=0, most=1, cure="It is a factor on each gain")
+        if damping is not None:
+            check_number("damping", damping, above=0, most=1, cure="It is a factor on each gain")
         self.damping = damping
+        self._refuse_inflation()
 
     def _smooth(self, entries, follows, out):
-        values = (entries[key] for key in self._needed)
-        ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=self.damping)
+        self._refuse_inflation()  # it may have been set since
+        values, damping = (entries[key] for key in self._needed), 1.0 if self.damping is None else self.damping
+        ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=damping)
         return ensemble, *moments_of(ensemble, None)
+
+    def _refuse_inflation(self) -> None:
+        """Raises where gains would carry an inflation back, and nobody said how to damp it."""
+        for part in submodels(self.filter) if self.damping is None else ():
+            for name, none in (("inflation", 1.0), ("adapt_inflation", 0.0)):
+                value = getattr(part, name, none)
+                if value > none:
+                    raise ValueError(
+                        f"{type(part).__name__} has {name}={value:g}, which the gains of EnRTS would carry back, so "
+                        f"that the spread grows in each step. Say damping=..., a factor below 1 / inflation on each "
+                        "gain; or take EnKS or FixedLag, which leave inflation out of the past"
+                    )
 
 
 class EnKS(Smoother):

@@ -1,0 +1,180 @@
+"""What a loss cannot score is refused by name: labels of another shape, another kind of belief, what is no key."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.filters.differences_for_tests import central_difference
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, toy_denkf
+from tests.filters.particle_for_tests import bootstrap, toy_filter
+from torch_denkf.filters import ParticleFilter
+from torch_denkf.modules import DiagonalNoise, GaussianLikelihood, Select
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.smoothers import EnKS, EnRTS
+
+LOSSES = {
+    "DEnKFLoss": lambda **options: DEnKFLoss(linear_denkf("etkf"), **options),
+    "GaussianLoss": lambda **options: GaussianLoss(linear_kalman(), **options),
+    "MixtureLoss": lambda **options: MixtureLoss(bootstrap(8), **options),
+    "TransitionLoss": lambda **options: TransitionLoss(linear_denkf("etkf"), **options),
+}
+LABELS = {  # of a state of two dimensions, for a batch [4, 5]
+    "without a last dimension": ({"state": torch.zeros(4, 5)}, {}, "'state'", "[4, 5, 'N']", "got [4, 5]"),
+    "with one more": ({"state": torch.zeros(4, 5, 2, 1)}, {}, "'state'", "got [4, 5, 2, 1]"),
+    "empty": ({"state": torch.zeros(4, 5, 0)}, {}, "'state'", "got [4, 5, 0]"),
+    "of more dimensions": ({"state": torch.zeros(4, 5, 3)}, {}, "'state' is [4, 5, 3]", "has 2 components"),
+    "dims beyond the belief": ({"state": torch.zeros(4, 5, 3)}, {"dims": [2]}, "dims=[2]", "has 2 components"),
+    "dims beyond the labels": ({"state": torch.zeros(4, 5, 1)}, {"dims": [1, 0]}, "dims=[1, 0]", "'state' has 1"),
+    "mask without a last dimension": (
+        {"state": torch.zeros(4, 5, 2), "state_observed": torch.ones(4, 5, dtype=torch.bool)},
+        {},
+        "'state_observed'",
+        "[4, 5, 1] or [*B, N] = [4, 5, 2]",
+        "got [4, 5]",
+    ),
+    "mask of more": (
+        {"state": torch.zeros(4, 5, 1), "state_observed": torch.ones(4, 5, 2, dtype=torch.bool)},
+        {},
+        "'state_observed'",
+        "got [4, 5, 2]",
+    ),
+    "mask of numbers": (
+        {"state": torch.zeros(4, 5, 2), "state_observed": torch.ones(4, 5, 1)},
+        {},
+        "'state_observed'",
+        "must be boolean",
+    ),
+}
+
+
+def refuses(make, *words, error=ValueError):
+    """The message holds these words."""
+    with pytest.raises(error) as caught:
+        make()
+    message = str(caught.value)
+    assert all(word in message for word in words), message
+
+
+@pytest.mark.parametrize("case", LABELS.values(), ids=LABELS)
+@pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES)
+def test_labels_of_another_shape(make, case):
+    entries, options, *words = case
+    if make is LOSSES["TransitionLoss"] and options:  # a step starts from all of the state, whatever is scored
+        words = ["'state' is [4, 5, 3]"] if options["dims"] == [2] else ["whole true state of 2", "'state' has 1"]
+    data = TensorDict({"observation": torch.zeros(4, 5, 2), **entries}, [4, 5])
+    refuses(lambda: make(**options)(data), *words)
+
+
+def test_no_dims():
+    for make in LOSSES.values():
+        refuses(lambda make=make: make(dims=[]), "dims", "got none")
+
+
+def test_parts_of_the_state_where_all_of_it_is_read():
+    short = TensorDict({"state": torch.zeros(4, 5, 2), "target_observation": torch.zeros(4, 5, 2)}, [4, 5])
+    refuses(lambda: ObservationLoss(toy_denkf())(short), "whole true state of 3", "'state' has 2")
+    short["action"] = torch.zeros(4, 5, 2)
+    refuses(lambda: TransitionLoss(toy_denkf())(short), "whole true state of 3", "'state' has 2")
+    short["measurement"], short["target_observation"] = torch.zeros(4, 5, 4), torch.zeros(4, 5, 3)
+    refuses(lambda: SensorLoss(toy_denkf())(short), "'target_observation' is [4, 5, 3]", "has 2 components")
+    read = TensorDict({"observation": torch.zeros(4, 5, 2), "state": torch.zeros(4, 5, 2)}, [4, 5])
+    read["observed"] = torch.ones(4, 5, dtype=torch.bool)
+    loss = SensorLoss(linear_denkf("etkf"))
+    loss.set_keys(sensor="observation")
+    refuses(lambda: loss(read), "'observed'", "got [4, 5]")
+
+
+# --------------------------------------------------------------------------------------------- another kind of belief
+
+
+def test_another_belief_is_refused_and_the_right_loss_named():
+    data = TensorDict({"observation": torch.zeros(4, 5, 2), "state": torch.zeros(4, 5, 2)}, [4, 5])
+    for score in ("crps", "energy", "mse"):
+        loss = DEnKFLoss(bootstrap(8), score=score)
+        refuses(lambda loss=loss: loss(data), "log_weight", "MixtureLoss", 'score="crps"', error=TypeError)
+    smoothed = DEnKFLoss(bootstrap(8), state=0.0, transition=0.0, smoothed=1.0, smoother=particle_smoother)
+    refuses(lambda: smoothed(data), "log_weight", "MixtureLoss", error=TypeError)
+    wrong = [DEnKFLoss(linear_kalman()), MixtureLoss(linear_kalman())]
+    wrong += [GaussianLoss(linear_denkf("etkf")), GaussianLoss(bootstrap(8))]
+    for loss in wrong:
+        with pytest.raises(KeyError, match=r"DEnKFLoss scores members.*MixtureLoss particles.*GaussianLoss a mean"):
+            loss(data)
+
+
+def particle_smoother(filter):
+    return EnKS(linear_denkf("etkf"))  # its smoothed members do not count: the filter's own have weights
+
+
+def weighted_crps(members, weights, truth):
+    """The definition, with numpy."""
+    away = np.abs(members[:, None] - members[None, :])
+    return weights @ np.abs(members - truth) - weights @ away @ weights / 2
+
+
+def test_weights_count_and_noise_that_is_trained_gets_its_gradient(float64):
+    members = torch.tensor([[-1.0], [0.2], [0.5], [2.0]])
+    noise = DiagonalNoise(1, r=0.8, num_cells=(), in_key="y")
+    filter = ParticleFilter(
+        NoisyLinear(torch.eye(1)),
+        None,
+        Select([0]),
+        GaussianLikelihood(sensor_key="y"),
+        noise=noise,
+        initial=FixedEnsemble(members),
+        resampling=None,
+    )
+    frames = TensorDict({"y": torch.tensor([[0.0], [0.4]]), "state": torch.tensor([[0.0], [0.3]])}, [2])
+    density = np.exp(-0.5 * (members[:, 0].numpy() - 0.4) ** 2 / 0.8**2)
+    weights, x = density / density.sum(), members[:, 0].numpy()
+    expected = weighted_crps(x, weights, 0.3)
+    assert abs(expected - weighted_crps(x, np.full(4, 0.25), 0.3)) > 0.05
+    loss = MixtureLoss(filter, score="crps")
+    value = loss(frames)["loss_state"]
+    assert value.item() == pytest.approx(expected, rel=1e-6)
+    value.backward()
+    trained = [p for p in noise.parameters() if p.grad is not None and p.grad.any()]
+    assert trained
+    for parameter in trained:
+        entry = int(parameter.grad.abs().argmax())
+        difference = central_difference(lambda: loss(frames)["loss_state"], parameter, entry)
+        torch.testing.assert_close(parameter.grad.view(-1)[entry], difference, rtol=1e-5, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ keys and callables
+
+
+@pytest.mark.parametrize("key", [5, 1.5, ("a", 3), (), "", ["state"], True])
+@pytest.mark.parametrize("name", ["state", "state_observed", "target_observation", "observed", "belief"])
+def test_what_is_no_key(name, key):
+    for loss in (DEnKFLoss(toy_denkf()), GaussianLoss(linear_kalman()), MixtureLoss(toy_filter())):
+        refuses(lambda loss=loss: loss.set_keys(**{name: key}), name, "is a key", repr(key), error=TypeError)
+    if name == "belief":
+        refuses(lambda: TransitionLoss(linear_kalman(), belief=key), name, repr(key), error=TypeError)
+
+
+def test_none_is_the_default_key():
+    loss = DEnKFLoss(toy_denkf())
+    loss.set_keys(state=("truth", "x"))
+    loss.set_keys(state=None)
+    assert loss.tensor_keys.state == "state"
+
+
+def test_what_makes_no_smoother():
+    options = {"state": 0.0, "transition": 0.0, "smoothed": 1.0}
+    for smoother in (EnRTS(toy_denkf()), "EnRTS", 3):
+        make = lambda smoother=smoother: DEnKFLoss(toy_denkf(), **options, smoother=smoother)  # noqa: E731
+        refuses(make, "smoother", error=TypeError)
+    refuses(lambda: DEnKFLoss(toy_denkf(), **options, smoother=lambda filter: filter), "Smoother", error=TypeError)
+
+
+def test_nothing_of_this_hides_a_sound_batch(float64):
+    data = TensorDict({"observation": torch.randn(4, 5, 2), "state": torch.randn(4, 5, 2)}, [4, 5])
+    data["state_observed"] = torch.ones(4, 5, 1, dtype=torch.bool)
+    for make in LOSSES.values():
+        values = sum(make()(data).values())
+        assert math.isfinite(values)
+        random = make is LOSSES["MixtureLoss"]  # the particles are drawn
+        assert random or values.equal(sum(make()(data.exclude("state_observed")).values()))
