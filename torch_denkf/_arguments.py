@@ -86,16 +86,17 @@ def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
     for parameter in parameters:
         if parameter.kind is parameter.VAR_KEYWORD:
             annotation = str(parameter.annotation)
-            kind = getattr(function, "__globals__", {}).get(annotation.removeprefix("Unpack[").removesuffix("]"))
-            open_ended = not annotation.startswith("Unpack[") or kind is None
-            options = _of_bases(owner) if open_ended else dict(_fields(kind))
+            name = annotation.removeprefix("Unpack[").removesuffix("]")
+            kind = getattr(function, "__globals__", {}).get(name) if name != annotation else None
+            open_ended = kind is None
+            options = _of_bases(owner) if kind is None else dict(_fields(kind))
     return signature.replace(parameters=parameters), options, open_ended
 
 
 def _of_bases(owner: type) -> dict[str, str]:
     """What the next class takes, to which ``**kwargs`` are handed on, by name."""
     for base in owner.__mro__[1:]:
-        if "__init__" in base.__dict__ and issubclass(base, Checked):
+        if "__init__" in base.__dict__ and Checked in base.__mro__:
             signature, options, _ = _signature(base)
             return {name: str(one.annotation) for name, one in signature.parameters.items()} | options
     return {}
