@@ -52,6 +52,10 @@ def export_step(
     A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
     returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
 
+    What the package returns for the example is compared with the eager step, see
+    :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the
+    noise changes.
+
     Args:
         filter: trained; its device is the package's.
         example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
@@ -67,7 +71,7 @@ def export_step(
     Raises:
         KeyError: if an entry that the step reads is missing.
         ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
-        RuntimeError: if there is no C++ compiler, or this torch cannot trace the step.
+        RuntimeError: if there is no C++ compiler, this torch cannot trace the step, or the package is wrong.
         OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:

@@ -43,11 +43,10 @@ class CompiledSteps:
 
             need_compiler()
         self.chunk, self.options = chunk, dict(options)
-        self._functions: dict[tuple, Callable] = {}
-        self._compared: set[tuple] = set()
+        self._functions: dict[tuple, tuple[Callable, set]] = {}
 
     def __getstate__(self) -> dict:
-        return {"chunk": self.chunk, "options": self.options, "_functions": {}, "_compared": set()}
+        return {"chunk": self.chunk, "options": self.options, "_functions": {}}
 
     def step(self, steps: Steps, entries: Entries, batch_size: torch.Size) -> Entries:
         """What one step writes; ``entries`` hold its noise."""
@@ -109,8 +108,8 @@ class CompiledSteps:
         Raises:
             RuntimeError: if it does not return what it returns eagerly.
         """
-        given = list(tensors(inputs))
-        device = given[0].device
+        some = next(tensors(inputs))
+        device = some.device
         kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
@@ -121,11 +120,11 @@ class CompiledSteps:
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
             own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
-            self._functions[kind] = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
-        function = self._functions[kind]
-        # What torch.compile compiles anew for.
-        seen = (kind, torch.is_grad_enabled(), *((value.dtype, value.shape, value.requires_grad) for value in given))
-        if seen not in self._compared and has_values(given[0]):
+            compiled = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
+            self._functions[kind] = compiled, set()
+        function, compared = self._functions[kind]
+        mode = torch.is_grad_enabled(), some.dtype  # for each torch.compile compiles anew
+        if mode not in compared and has_values(some):
             refuse_other_numbers(
                 function,
                 make(),
@@ -139,7 +138,7 @@ class CompiledSteps:
                 cure='Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
                 "filter.compile(chunk=0); and please report the filter.",
             )
-            self._compared.add(seen)
+            compared.add(mode)
         out = function(*inputs)
         return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
 
@@ -166,7 +165,8 @@ def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
 
 
 def _parameters(steps: Steps) -> dict[str, Tensor]:
-    modules = steps.structure.modules
+    """Of the modules that run in a chunk."""
+    modules = (steps.structure.transition, *steps.structure.update)
     return {f"{place}.{name}": value for place, module in modules for name, value in module.named_parameters()}
 
 
