@@ -129,7 +129,9 @@ def test_an_lstm_cell_is_taken_apart(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["dEKF", pytest.param("LSTMFilter", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["EKF of a known motion", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dEKF", "LSTMFilter"))]
+)
 def test_compiled(name, tmp_path):
     assert_the_same(FILTERS[name](), tmp_path)
 

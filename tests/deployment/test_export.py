@@ -9,8 +9,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.deployment import export_step, load_step
+from torch_denkf.deployment import export, export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.filters.inductor import trace_below_autograd
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
@@ -185,3 +186,27 @@ def test_without_a_compiler_the_error_says_what_to_do(tmp_path, monkeypatch):
     example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
     with pytest.raises(RuntimeError, match=r"apt install g\+\+"):
         export_step(small_filter(), example, tmp_path / "step.pt2")
+
+
+class Wrong(nn.Module):
+    """A step that reads half of each reading: right for readings of zero."""
+
+    def __init__(self, step):
+        super().__init__()
+        self.step, self.place = step, step.in_keys.index("reading")
+
+    def forward(self, *values):
+        return self.step(*(value / 2 if place == self.place else value for place, value in enumerate(values)))
+
+
+def test_a_package_that_is_wrong_is_not_written(tmp_path, monkeypatch):
+    path, filter = tmp_path / "step.pt2", small_filter()
+    path.write_bytes(b"an older one")
+    example = filter.initialise(TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}))
+    filter.draw_noise(example)
+    monkeypatch.setattr(export, "trace_below_autograd", lambda step, values: trace_below_autograd(Wrong(step), values))
+    with pytest.raises(RuntimeError, match=r"package is wrong: \(.*No file is written"):
+        export_step(filter, example, path, compiled=False)
+    assert path.read_bytes() == b"an older one"
+    monkeypatch.undo()
+    export_step(filter, example, path, compiled=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
+from torch_denkf.filters._compared import refuse_other_numbers
 from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.modules._call import Entries
@@ -51,6 +52,10 @@ def export_step(
     A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
     returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
 
+    What the package returns for the example is compared with the eager step, see
+    :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the
+    noise changes.
+
     Args:
         filter: trained; its device is the package's.
         example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
@@ -66,7 +71,7 @@ def export_step(
     Raises:
         KeyError: if an entry that the step reads is missing.
         ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
-        RuntimeError: if there is no C++ compiler, or this torch cannot trace the step.
+        RuntimeError: if there is no C++ compiler, this torch cannot trace the step, or the package is wrong.
         OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
@@ -115,21 +120,46 @@ def export_step(
     }
     was_training = filter.training
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
+    package = io.BytesIO()  # torch's own writer ends the process where the disk is full
     try:
         with torch.no_grad():
             program = trace_below_autograd(step, values)
+            _write(program, package, json.dumps(signature), compiled)
+            refuse_other_numbers(
+                _run(package, compiled),
+                step,
+                values,
+                names=in_keys,
+                outputs=out_keys,
+                frames=[key for key in in_keys if key not in filter.belief_keys and key[0] != "noise"],
+                what="package",
+                cure="No file is written. "
+                + ("Write the graph, compiled=False, which is slower; and p" if compiled else "P")
+                + "lease report the filter.",
+            )
     finally:
         filter.train(was_training)
-    package = io.BytesIO()  # torch's own writer ends the process where the disk is full
+    write_bytes(path, package.getbuffer())
+    return path
+
+
+def _write(program: torch.export.ExportedProgram, package: io.BytesIO, signature: str, compiled: bool) -> None:
+    """Writes a package."""
     if compiled:
         clear_damaged_libraries()
-        options = {"aot_inductor.metadata": {SIGNATURE: json.dumps(signature)}}
+        options = {"aot_inductor.metadata": {SIGNATURE: signature}}
         with clear_full_cache():
             torch._inductor.aoti_compile_and_package(program, package_path=package, inductor_configs=options)
     else:
-        torch.export.save(program, package, extra_files={SIGNATURE: json.dumps(signature)})
-    write_bytes(path, package.getbuffer())
-    return path
+        torch.export.save(program, package, extra_files={SIGNATURE: signature})
+
+
+def _run(package: io.BytesIO, compiled: bool) -> Callable:
+    """What runs a package."""
+    package.seek(0)
+    if compiled:
+        return torch._inductor.aoti_load_package(package)
+    return torch.export.load(package).module(check_guards=False)
 
 
 def _inputs(filter: Filter, entries: Entries, example: TensorDictBase) -> list[NestedKey]:

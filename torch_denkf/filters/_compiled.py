@@ -8,8 +8,11 @@ from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 
+from torch_denkf._checks import has_values
+from torch_denkf.filters._compared import placed, refuse_other_numbers, tensors
 from torch_denkf.filters._steps import Steps
 from torch_denkf.modules._call import Call, Entries
 
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
     from torch_denkf.filters._sequence import Rows
 
 __all__ = ["CompiledSteps"]
+
+#: Where an episode begins, among the names of what a chunk takes.
+_BEGINS = ("start", "begins")
 
 
 class CompiledSteps:
@@ -37,26 +43,22 @@ class CompiledSteps:
 
             need_compiler()
         self.chunk, self.options = chunk, dict(options)
-        self._functions: dict[tuple, Callable] = {}
+        self._functions: dict[tuple, tuple[Callable, set]] = {}
 
     def __getstate__(self) -> dict:
         return {"chunk": self.chunk, "options": self.options, "_functions": {}}
 
     def step(self, steps: Steps, entries: Entries, batch_size: torch.Size) -> Entries:
         """What one step writes; ``entries`` hold its noise."""
-        keys = tuple(entries)
-        device = next(iter(entries.values())).device
-        writes = (*steps.structure.frame_keys, *steps.step_keys)
+        keys, writes = tuple(entries), (*steps.structure.frame_keys, *steps.step_keys)
         make = partial(_step, steps, keys, writes, batch_size)
-        values = self._function(("step", keys, batch_size), steps, device, make)(*entries.values())
-        if self._overwrites(device):
-            values = tuple(value.clone() for value in values)
+        values = self._call(("step", keys, batch_size), steps, make, tuple(entries.values()), keys, writes)
         return dict(zip(writes, values, strict=True))
 
     def sequence(self, steps: Steps, todo: Rows) -> Entries:
         """What the steps write on a sequence ``[*B, T]``, in chunks; all noise is among the inputs."""
         time, count = len(todo.size) - 1, todo.size[-1]
-        batch, device = torch.Size(todo.size[:-1]), next(iter(todo.starts.values())).device
+        batch = torch.Size(todo.size[:-1])
         inputs, starts, begins, shifted, keep = todo.inputs, todo.starts, todo.begins, todo.shifted, todo.keep
         detach_every, keys, start_keys = todo.detach_every or 0, tuple(inputs), tuple(starts)
         carry, outputs, begin = (), [], 0
@@ -81,9 +83,10 @@ class CompiledSteps:
                 keep,
             )
             make = partial(_chunk, steps, keys, frozenset(shifted), start_keys, keep, batch, time, cuts, first)
-            carry, values = self._function(kind, steps, device, make)(carry, now, resets, now_starts)
-            if self._overwrites(device):
-                carry, values = (tuple(value.clone() for value in part) for part in (carry, values))
+            carried = () if first else steps.structure.carry
+            names = (*carried, *keys, *(() if begins is None else (_BEGINS,)), *(start_keys if now_starts else ()))
+            given, writes = (carry, now, resets, now_starts), (*steps.structure.carry, *keep)
+            carry, values = self._call(kind, steps, make, given, names, writes)
             outputs.append(values)
             begin += length
         if len(outputs) == 1:
@@ -91,7 +94,22 @@ class CompiledSteps:
         columns = zip(*outputs, strict=True)
         return {key: torch.cat(values, time) for key, values in zip(keep, columns, strict=True)}
 
-    def _function(self, kind: tuple, steps: Steps, device: torch.device, make: Callable[[], Callable]) -> Callable:
+    def _call(self, kind: tuple, steps: Steps, make: Callable, inputs: tuple, names: tuple, writes: tuple) -> tuple:
+        """What the compiled function of a kind returns, which is compiled, and compared, where there is none yet.
+
+        Args:
+            kind: what tells the function from others, beside the filter's modules and what tensors it takes.
+            steps: the filter's.
+            make: returns the function to compile.
+            inputs: what it takes.
+            names: of the tensors in ``inputs``.
+            writes: names of the tensors that it returns.
+
+        Raises:
+            RuntimeError: if it does not return what it returns eagerly.
+        """
+        some = next(tensors(inputs))
+        device = some.device
         kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
@@ -102,8 +120,27 @@ class CompiledSteps:
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
             own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
-            self._functions[kind] = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
-        return self._functions[kind]
+            compiled = torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
+            self._functions[kind] = compiled, set()
+        function, compared = self._functions[kind]
+        mode = torch.is_grad_enabled(), some.dtype  # for each torch.compile compiles anew
+        if mode not in compared and has_values(some):
+            refuse_other_numbers(
+                function,
+                make(),
+                inputs,
+                names=names,
+                outputs=writes,
+                frames=_frames(steps, names),
+                # Who records gradients of single steps seldom wants them; a backward pass takes as long to compile.
+                parameters=None if kind[0] == "step" else _parameters(steps),
+                what=kind[0] if kind[0] == "step" else "sequence",
+                cure='Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
+                "filter.compile(chunk=0); and please report the filter.",
+            )
+            compared.add(mode)
+        out = function(*inputs)
+        return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
 
     def _overwrites(self, device: torch.device) -> bool:
         """Whether outputs lie in memory that the next call uses again: that of CUDA graphs."""
@@ -118,6 +155,19 @@ class CompiledSteps:
         from torch_denkf.filters.inductor import options_for_processors  # importing inductor takes half a second
 
         return {"options": options_for_processors()}
+
+
+def _frames(steps: Steps, names: tuple) -> list[NestedKey]:
+    """Which inputs are neither noise nor beliefs, nor say where an episode begins."""
+    structure = steps.structure
+    others = {*structure.carry, *structure.belief, _BEGINS}
+    return [name for name in names if name not in others and name[0] != "noise"]
+
+
+def _parameters(steps: Steps) -> dict[str, Tensor]:
+    """Of the modules that run in a chunk."""
+    modules = (steps.structure.transition, *steps.structure.update)
+    return {f"{place}.{name}": value for place, module in modules for name, value in module.named_parameters()}
 
 
 def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:

@@ -229,6 +229,10 @@ class Filter(Checked, TensorDictSequential):
         ``step(without=...)``, which would compile anew for each reading that is lost; a warning says so once. On a
         policy's data they stay eager, too.
 
+        Compilers have errors that nothing else shows. So the first call also runs eagerly, and where a reading is zero
+        or hidden both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
+        differs by more than rounding is refused.
+
         Args:
             chunk: steps of a sequence in one compiled graph. What is left over after whole chunks runs step by step. A
                 small chunk compiles sooner, a large one runs faster. 0 goes back to eager.
@@ -241,7 +245,8 @@ class Filter(Checked, TensorDictSequential):
             This filter.
 
         Raises:
-            RuntimeError: if there is no C++ compiler, which processors need.
+            RuntimeError: if there is no C++ compiler, which processors need. In a later call, if what was compiled is
+                wrong.
             ValueError: if ``chunk`` is negative.
         """
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")

@@ -1,0 +1,221 @@
+"""A compiled function beside the eager one, once: a compiler may be wrong, and say nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+__all__ = ["placed", "refuse_other_numbers", "tensors"]
+
+#: Roundings by which two orders of the same sums may differ: of the largest number in a column, and in an entry.
+_OF_COLUMN, _OF_ENTRY = 1000, 10
+#: Roundings by which inputs are changed to see what that does to the eager result, and how often at most.
+_NUDGE, _NUDGES = 8, 32
+
+
+def refuse_other_numbers(
+    compiled: Callable,
+    eager: Callable,
+    inputs: Sequence[Any],
+    *,
+    names: Sequence[NestedKey],
+    outputs: Sequence[NestedKey],
+    frames: Collection[NestedKey],
+    parameters: Mapping[str, Tensor] | None = None,
+    what: str,
+    cure: str,
+) -> None:
+    """Raises unless a compiled function returns what it returns eagerly, up to rounding.
+
+    Both run on the inputs as they are. Where a frame is hidden, not finite, or nothing but zero, both run again with
+    numbers in it: an update by zero, or by nothing, is right whatever the gain. NaN in both is equal.
+
+    How far rounding goes depends on the filter: a variance that a reading makes 1e6 times smaller loses six digits, and
+    a particle filter draws another particle. So it is measured. Where the results differ in more than their last
+    digits, the eager function runs on inputs that differ in theirs, and draws other numbers, if it draws any. The
+    compiled result may be twice as far off.
+
+    Args:
+        compiled: takes ``inputs``, and returns tensors, in tuples or not.
+        eager: the same.
+        inputs: tensors, ``None``, or tuples of them. What takes their place has their shapes, strides and need of
+            gradients, so that nothing is compiled again.
+        names: of the tensors in ``inputs``, in their order.
+        outputs: names of the tensors that are returned, in their order.
+        frames: names of inputs that may be any number: readings, actions, masks.
+        parameters: by name; if given, the gradient of the outputs, in one direction, by these and by the frames is
+            compared, too. Where there is no backward pass yet, one is compiled.
+        what: was compiled, for the message.
+        cure: what to do, for the message.
+
+    Raises:
+        RuntimeError: if they are farther apart; names the output that is farthest, and by how much.
+    """
+    given = list(tensors(inputs))
+    free = [name in frames for name in names]
+    telling = [_telling(value) if may else value for value, may in zip(given, free, strict=True)]
+    labels, by, trained = [repr(name) for name in outputs], [], []
+    if parameters is not None and torch.is_grad_enabled():
+        # Not by beliefs: of a covariance one triangle may be read, or the other.
+        by = [index for index, value in enumerate(given) if value.requires_grad and free[index]]
+        trained = [name for name, value in parameters.items() if value.requires_grad]
+        labels += [f"gradient by {name!r}" for name in [names[index] for index in by]]
+        labels += [f"gradient by the parameter {name}" for name in trained]
+
+    def run(function: Callable, values: Sequence[Tensor], seed: int = 0) -> list[Tensor]:
+        return _results(function, inputs, values, by, [parameters[name] for name in trained], seed)
+
+    same = all(one is other for one, other in zip(given, telling, strict=True))
+    for values in [given] if same else [given, telling]:
+        ours, theirs = run(compiled, values), run(eager, values)
+        off, allowed = list(map(_distance, ours, theirs)), _last_digits(theirs, len(outputs))
+        step = 0.0
+        for nudge in range(1, _NUDGES + 1):
+            if _fits(off, allowed):
+                break
+            step = step or _NUDGE * _coarsest_rounding(lambda values=values: run(eager, values))
+            near = run(eager, [_nudged(value, step, nudge) for value in values], nudge)
+            spread = map(_distance, near, theirs)
+            allowed = [torch.maximum(most, 2 * far) for most, far in zip(allowed, spread, strict=True)]
+        if not _fits(off, allowed):
+            times = [
+                (far / most.clamp(min=1e-300)).nan_to_num(nan=0.0).max() for far, most in zip(off, allowed, strict=True)
+            ]
+            worst = int(torch.stack(times).argmax())
+            raise RuntimeError(
+                f"The compiled {what} is wrong: {labels[worst]} is up to {float(off[worst].max()):.3g} off what the "
+                f"same code gives eagerly, up to {float(theirs[worst].abs().max()):.3g}; rounding explains "
+                f"{float(allowed[worst].max()):.1g}. That is an error of torch's compiler (torch {torch.__version__}), "
+                f"and nothing is returned. {cure}"
+            )
+
+
+def tensors(value: Any) -> Iterator[Tensor]:
+    """The tensors in nested tuples and lists."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from tensors(part)
+
+
+def placed(like: Any, values: Iterator[Tensor]) -> Any:
+    """Tensors in place of those in nested tuples."""
+    if isinstance(like, Tensor):
+        return next(values)
+    return tuple(placed(part, values) for part in like) if isinstance(like, tuple) else like
+
+
+def _results(
+    function: Callable,
+    like: Sequence[Any],
+    values: Sequence[Tensor],
+    by: Sequence[int],
+    parameters: Sequence[Tensor],
+    seed: int,
+) -> list[Tensor]:
+    """What a function returns, in memory of its own, and its gradients by some of the ``values`` and ``parameters``."""
+    copies = {id(value): value.detach().requires_grad_() for value in values if value.requires_grad}
+    leaves = [copies.get(id(value), value) for value in values]
+    places = iter(leaves)
+    devices = sorted({value.device.index or 0 for value in values if value.is_cuda})
+    with torch.random.fork_rng(devices):
+        for generator in (torch.default_generator, *(torch.cuda.default_generators[index] for index in devices)):
+            generator.manual_seed(seed)
+        out = list(tensors(function(*(placed(part, places) for part in like))))
+    found = [value.detach().clone() for value in out]
+    sources, ends = [*(leaves[index] for index in by), *parameters], [value for value in out if value.requires_grad]
+    if not sources or not ends:
+        return found + [torch.zeros_like(value) for value in sources]
+    along = [_waves(end) for end in ends]
+    return found + list(torch.autograd.grad(ends, sources, along, materialize_grads=True))
+
+
+def _waves(value: Tensor) -> Tensor:
+    """Numbers between -1 and 1, as many and of the kind of a tensor's."""
+    numbers = torch.arange(1, value.numel() + 1, dtype=torch.float64).sin()
+    return numbers.reshape(value.shape).to(value.device, value.dtype)
+
+
+def _telling(value: Tensor) -> Tensor:
+    """A frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
+    if value.dtype == torch.bool:
+        known, numbers = value, torch.ones_like(value)
+    elif value.is_floating_point():
+        known, numbers = value.isfinite(), 1 + _waves(value) / 2
+        some = known & (value != 0)
+        if some.any():
+            numbers = numbers * value.detach()[some].abs().mean()
+        else:
+            known = some
+    else:
+        return value
+    if known.all():
+        return value
+    one = [slice(0, 1) if stride == 0 else slice(None) for stride in value.stride()]  # written to once
+    new = torch.where(known, value.detach(), numbers)[*one]
+    out = torch.empty_strided(new.shape, value.stride(), dtype=value.dtype, device=value.device)
+    return out.copy_(new).expand(value.shape).requires_grad_(value.requires_grad)
+
+
+def _nudged(value: Tensor, step: float, seed: int) -> Tensor:
+    """The same numbers but for the last digits."""
+    if not value.is_floating_point():
+        return value
+    noise = torch.randn(value.shape, generator=torch.Generator().manual_seed(seed)).to(value)
+    return (value.detach() * (1 + step * noise)).requires_grad_(value.requires_grad)
+
+
+def _distance(one: Tensor, other: Tensor) -> Tensor:
+    """How far two tensors are apart, in each column; infinitely where one of them has no value."""
+    one, other = one.cpu().double(), other.cpu().double()
+    same = (one == other) | (one.isnan() & other.isnan())
+    return _columns(torch.where(same, 0.0, (one - other).abs().nan_to_num(nan=torch.inf)))
+
+
+def _columns(value: Tensor) -> Tensor:
+    """The largest number in each column."""
+    value = value.reshape(-1, value.shape[-1] if value.ndim and value.numel() else 1)
+    return value.amax(0) if len(value) else value.new_zeros(1)
+
+
+def _last_digits(values: Sequence[Tensor], outputs: int) -> list[Tensor]:
+    """How far two orders of the same sums may be apart, for each column; ``values`` after ``outputs`` are gradients."""
+    sizes = [_columns(value.cpu().double().abs().nan_to_num(nan=0, posinf=0)) for value in values]
+    steepest = max((float(size.max()) for size in sizes[outputs:]), default=0.0)
+    found = []
+    for index, (value, size) in enumerate(zip(values, sizes, strict=True)):
+        eps = torch.finfo(value.dtype).eps if value.is_floating_point() else 0.0
+        largest = float(size.max()) if index < outputs else steepest
+        found.append(min(_OF_COLUMN * eps, 0.02) * size + _OF_ENTRY * eps * largest)
+    return found
+
+
+def _fits(off: Iterable[Tensor], allowed: Iterable[Tensor]) -> bool:
+    return all(bool((far <= most).all()) for far, most in zip(off, allowed, strict=True))
+
+
+class _Precision(TorchDispatchMode):
+    """Finds the coarsest rounding among all that is computed."""
+
+    coarsest = 0.0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for value in tensors(out):
+            if value.is_floating_point():
+                self.coarsest = max(self.coarsest, torch.finfo(value.dtype).eps)
+        return out
+
+
+def _coarsest_rounding(run: Callable[[], Any]) -> float:
+    """The rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
+    with _Precision() as mode:
+        run()
+    products = 0.0 if torch.get_float32_matmul_precision() == "highest" else torch.finfo(torch.bfloat16).eps
+    return max(mode.coarsest, products)
