@@ -66,8 +66,8 @@ def refuse_trained(name: str, value: Any, why: str) -> None:
     """
     if isinstance(value, Tensor) and value.requires_grad:
         raise ValueError(
-            f"{name} asks for a gradient and would never be trained: {why}. Detach it, and choose it on validation data; "
-            "where there is trainable=True, or a module that learns it, take that"
+            f"{name} asks for a gradient and would never be trained: {why}. Detach it, and choose it on validation "
+            "data; or take trainable=True, or a module that learns it, where there is one"
         )
 
 
