@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 
 import torch_denkf.data.kitti.drive as module
 from tests.real_data import KITTI
 from torch_denkf.data import cache_entry, list_kitti_drives, read_kitti_drive
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.kitti.files import read_calibration, read_poses
 from torch_denkf.metrics import dead_reckoning
 from torch_denkf.vision.poses import poses_to_state, state_to_poses
@@ -224,7 +224,7 @@ def test_times_are_nominal_without_a_file(tmp_path):
 def test_the_cache(tmp_path, monkeypatch):
     root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
     first = read_kitti_drive(root, "00", cache=cache)
-    assert isinstance(first["image"], MemoryMappedTensor)
+    assert isinstance(first["image"], CachedTensor)
     entries = list(cache.iterdir())
     assert len(entries) == 1
     # From now on the cache alone is read: images are not opened again.
@@ -247,7 +247,7 @@ def test_the_cache(tmp_path, monkeypatch):
     assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
     assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
     assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
-    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], MemoryMappedTensor)
+    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
 
 
 def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -15,6 +14,7 @@ import torch_denkf.data.recordings.frames as frames_module
 from tests.data import replay_for_tests as shared
 from tests.data.recordings.own_files import SIZE, pixels, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.filters import DEnKF
@@ -210,7 +210,7 @@ def test_pictures_are_decoded_once(runs, run, tmp_path, monkeypatch):
         again = cached(runs, split="all")
         other = cached(Recording(**streams(run)), clock=25.0)  # another clock, the same pictures
     assert (again[:] == first[:]).all()
-    assert isinstance(again._pictures.stores[0], MemoryMappedTensor)
+    assert isinstance(again._pictures.stores[0], CachedTensor)
     assert other[0]["pixels"].equal(torch.from_numpy(pixels(1)))
     assert "pixels" not in video._storage[:]
     cached(runs, size=(12, 16))
