@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_number, read_number
 from torch_denkf._files import clear_errors
 from torch_denkf._progress import progress_bar
 from torch_denkf.data.cache import cache_folder, cached, stamp
@@ -223,7 +223,7 @@ class Images(Frames):
 def _number(file: Path) -> float | None:
     """The number that a file is called."""
     try:
-        return float(file.stem)
+        return read_number(file.stem)
     except ValueError:
         return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_number, read_number
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.recordings.clock import Way
 
@@ -152,10 +153,11 @@ def read_numbers(
 
 def _choose(file: Path, there: Sequence[str], time: str, columns: Sequence[str] | None) -> list[str]:
     names = [time, *([name for name in there if name != time] if columns is None else columns)]
-    missing = [name for name in names if name not in there]
+    count = Counter(there)
+    missing = [name for name in names if not count[name]]
     if missing:
         raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {_hint(there, time, missing)}")
-    twice = [name for name in names if there.count(name) > 1]
+    twice = [name for name in names if count[name] > 1]
     if twice:
         raise ValueError(f"{file} has two columns {twice[0]!r}; give one another name, or pass columns= without it")
     return names
@@ -173,10 +175,10 @@ def _hint(there: Sequence[str], time: str, missing: Sequence[str]) -> str:
 def _number(text: str) -> float:
     """A finite number that float32 can hold; NaN for what is none."""
     try:
-        number = float(text)
+        number = read_number(text)
     except ValueError:
         return math.nan
-    return number if abs(number) <= LARGEST and "_" not in text else math.nan
+    return number if abs(number) <= LARGEST else math.nan
 
 
 def _is_number(text: str) -> bool:
@@ -201,7 +203,8 @@ def _read_csv(file: Path, time: str, columns: Sequence[str] | None):
             filled = (row for row in reader if any(map(str.strip, row)))
             there = [name.strip() for name in next(filled, [])]
             names = _choose(file, there, time, columns)
-            where = [there.index(name) for name in names]
+            places = {name: place for place, name in enumerate(there)}
+            where = [places[name] for name in names]
             for row in filled:
                 place = f"{file}:{reader.line_num}"
                 if any(map(str.strip, row[len(there) :])):
