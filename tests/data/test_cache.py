@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from torch_denkf.cli.cache import main as denkf_cache
 from torch_denkf.data import cache_entry
 from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget, sweep
-from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, open_entry
+from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, is_entry, open_entry
 
 ROOT = Path(__file__).parents[2]
 NAME = "drive-0123456789abcdef"
@@ -177,6 +177,10 @@ def damage(entry, how):
     elif how == "another manifest":
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {}, "tensors": {}})
         (entry / MANIFEST).write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
+    elif how.startswith("a pipe"):
+        file = entry / (MANIFEST if how == "a pipe for a manifest" else "pixels.bin")
+        file.unlink()
+        os.mkfifo(file)
     elif how == "path":
         outside = {"../x": {"dtype": "uint8", "shape": [1], "bytes": 1, "crc32": 0, "ends": 0}}
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {"": []}, "tensors": outside})
@@ -203,6 +207,8 @@ WAYS = (
     "half a manifest",
     "manifest",
     "another manifest",
+    "a pipe",
+    "a pipe for a manifest",
     "path",
 )
 
@@ -210,6 +216,7 @@ WAYS = (
 @pytest.mark.parametrize("how", WAYS)
 def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
     damage(entry, how)
+    assert is_entry(entry) == (how not in ("no manifest", "a pipe for a manifest"))
     with pytest.raises(DamagedEntry):
         open_entry(entry)
     with caplog.at_level(logging.WARNING, "torch_denkf"):

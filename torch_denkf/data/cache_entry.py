@@ -11,6 +11,7 @@ Nothing else is read, and nothing that is read can hold code.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import mmap
 import os
@@ -200,16 +201,23 @@ def check_entry(folder: Path) -> None:
 def is_entry(folder: Path) -> bool:
     """Whether a folder is one that this module writes, sound or not."""
     try:
-        with (folder / MANIFEST).open("rb") as stream:
+        with _open(folder / MANIFEST) as stream:
             return FORMAT.encode() in stream.read(_LARGEST_MANIFEST)
     except OSError:
         return False
 
 
+def _open(file: Path) -> BinaryIO:
+    """Opens a plain file; a pipe would wait for a writer."""
+    if file.exists() and not file.is_file():
+        raise OSError(errno.EINVAL, "it is no file", str(file))
+    return file.open("rb")
+
+
 def _read_manifest(folder: Path) -> dict[str, Any]:
     file = folder / MANIFEST
     try:
-        with file.open("rb") as stream:
+        with _open(file) as stream:
             sealed = json.loads(stream.read(_LARGEST_MANIFEST))
         text = sealed["content"]
         content = json.loads(text)
@@ -231,7 +239,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 def _check(file: Path, about: dict[str, Any], whole: bool) -> int:
     """Compares a file with what the manifest says; when it was written to last, ns."""
     try:
-        with file.open("rb") as stream:
+        with _open(file) as stream:
             size = os.fstat(stream.fileno()).st_size
             expected = torch.Size(about["shape"]).numel() * _DTYPES[about["dtype"]].itemsize
             if not size == about["bytes"] == expected:
