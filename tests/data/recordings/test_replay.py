@@ -1,5 +1,6 @@
 """Rows of one's own recordings are the numbers in their files, on the clock that was asked for."""
 
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -148,6 +149,29 @@ def test_images_are_in_the_order_of_their_numbers(tmp_path):
     write_images(tmp_path / "run", [f"{name}.png" for name in names])
     data = open_runs(Recording(eye=Images(tmp_path / "run")))
     assert data[:]["time"].flatten().tolist() == [0, 0.25, 0.5, 0.625]
+    assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["img_0", "img_1", "img_3", "img_4"], [0, 1, 3, 4]),  # number 2 is missing
+        (["000005", "000010", "000025", "000030"], [0, 1, 4, 5]),  # each fifth was kept; 15 and 20 are missing
+        (["9_left", "10_left", "12_left", "13_left"], [0, 1, 3, 4]),
+        (["0", "33", "67", "100"], [0, 1, 2, 3]),  # stamps, not counts
+        (["run1_8", "run1_9", "run2_0", "run2_5"], [0, 1, 2, 3]),
+        (["1_3", "2_0", "13_1", "14_1"], [0, 1, 2, 3]),  # 1_3 is not 13
+    ],
+)
+def test_a_missing_image_moves_no_other_one(tmp_path, names, times):
+    write_images(tmp_path / "run", [f"{name}.png" for name in names])
+    missing = times[-1] + 1 - len(times)
+    warned = pytest.warns(
+        UserWarning, match=f"by their numbers {missing} images are missing, the first after {names[1]}"
+    )
+    with warned if missing else nullcontext():
+        data = open_runs(Recording(eye=Images(tmp_path / "run", rate=10.0, start=2.0)))
+    np.testing.assert_allclose(data[:]["time"].flatten(), np.array(times) / 10, atol=1e-12)
     assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
 
 

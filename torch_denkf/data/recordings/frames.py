@@ -170,7 +170,8 @@ class Images(Frames):
     """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
 
     Args:
-        rate: pictures a second, from ``start`` on, in the place of ``times`` and of the numbers in the names.
+        rate: pictures a second, from ``start`` on, in the place of ``times``. Where the images are numbered, a number
+            that is missing is a picture that is missing; a warning counts them.
 
     Raises:
         ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` beside it.
@@ -209,7 +210,7 @@ class Images(Frames):
     def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
         place = stored["place"].numpy()
         if self.rate is not None:
-            return place / self.rate
+            return _counted(source, self._files(source))[place] / self.rate
         times = [_number(file) for file in self._files(source)]
         if None in times:
             name = self._files(source)[times.index(None)].name
@@ -218,6 +219,25 @@ class Images(Frames):
                 "pass times= or rate="
             )
         return np.array(times)[place] * SECONDS[self.unit]
+
+
+def _counted(source: Path, files: list[Path]) -> np.ndarray:
+    """How many pictures a camera of steady rate took before each: where names end in numbers, one may be missing."""
+    numbers = np.array([_number(file) or float((re.findall(r"\d+", file.stem) or "0")[-1]) for file in files])
+    steps = np.diff(numbers)
+    least = steps.min(initial=np.inf)
+    if least <= 0 or not np.allclose(steps / least, (steps / least).round(), rtol=0, atol=1e-6):
+        return np.arange(len(files))  # names that do not count
+    counted = ((numbers - numbers[0]) / least).round()
+    missing = int(counted[-1]) + 1 - len(files)
+    if missing:
+        first = files[int(np.flatnonzero(np.diff(counted) > 1)[0])].name
+        warnings.warn(
+            f"{source}: by their numbers {missing} images are missing, the first after {first}; the others keep their "
+            "times",
+            stacklevel=6,
+        )
+    return counted
 
 
 def _number(file: Path) -> float | None:
