@@ -21,7 +21,7 @@ from torch_denkf._progress import progress_bar
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
 from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
-from torch_denkf.data.video import NOT_DECODED, decoded_frames
+from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 
 __all__ = ["Frames", "Images", "Video"]
 
@@ -161,8 +161,12 @@ class Video(Frames):
         return [source]
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
+        times = []
         for number, (time, pixels) in enumerate(decoded_frames(files[0])):
+            times.append(time)
             yield time, pixels, f"frame {number} of {files[0]}"
+        if times:
+            say_if_cut(files[0], times)
 
 
 @dataclass(frozen=True)
