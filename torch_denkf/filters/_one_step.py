@@ -12,6 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch_denkf.filters._ceiling import look_at_ceiling
 from torch_denkf.filters._checks import (
     check_inputs,
+    refuse_far_belief,
     refuse_missing_actions,
     refuse_non_finite,
     refuse_single_readings,
@@ -57,6 +58,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
         say_ignored_mask(filter, tensordict)
         written = filter.take_step(entries, tensordict.batch_size)
     if filter.check_finite and not torch.compiler.is_compiling():
+        refuse_far_belief(entries, structure.carry)
         refuse_non_finite(structure, entries, written, filter.reject)
     write(tensordict, written)
     return tensordict

@@ -14,6 +14,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters import Filter, Monitored
+from torch_denkf.filters._checks import refuse_far_belief
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
@@ -248,6 +249,7 @@ class DEnKFTransform(Transform):
 
     def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
+        refuse_far_belief(entries, self.filter.carry_keys)
         finite = all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys)
         absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:
