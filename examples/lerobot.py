@@ -117,7 +117,8 @@ def fail(rows: TensorDict) -> TensorDict:
 
 def go_black(rows: TensorDict) -> TensorDict:
     """Rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
-    return BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
+    rows = BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
+    return rows.set("observed", rows["seen"])
 
 
 def make_filter(data: LeRobotReplay) -> DEnKF:

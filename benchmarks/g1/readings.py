@@ -98,7 +98,7 @@ def read_codes(
             part = data[rows]
             part["pixels"] = failing(part["pixels"], hand(part["state"][:, list(ARM)]), condition, draw, exact)
             codes.append(code_of(sensors, part["pixels"]))
-            observed.append(check(part)["observed"])
+            observed.append(check(part)["seen"])
         command = torch.cat([everything["action"][:, list(ARM)], everything["action"][:, list(HAND)]], -1)
         entries = {
             "code": torch.cat(codes),
@@ -172,7 +172,7 @@ def black_readings(sensors: Sequence[ImageSensor], target: Target, members: int)
     pixels = GREY * torch.rand(1, *sensors[0].image_shape, generator=generator)
     samples, encoding = read_code(sensors, code_of(sensors, pixels).unsqueeze(0), members, generator)
     entries = {"ensemble": samples[..., list(target.dims)], "encoding": encoding}
-    observed = BlackIsMissing()(TensorDict({"pixels": pixels}, [1]))["observed"]
+    observed = BlackIsMissing()(TensorDict({"pixels": pixels}, [1]))["seen"]
     return TensorDict({**entries, "observed": observed.unsqueeze(0)}, batch_size=[1, 1])
 
 

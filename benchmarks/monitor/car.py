@@ -62,7 +62,7 @@ class CarGates(NamedTuple):
     def seen(self, reading: TensorDict) -> Tensor:
         """Which readings the pictures leave, ``[N, 1]``."""
         signs = TensorDict({"signs": reading["signs"][:, BLIND], "observed": reading["observed"]}, [len(reading)])
-        return self.pictures(signs)["observed"]
+        return self.pictures(signs)["seen"]
 
     def answered(self, reading: TensorDict) -> TensorDict:
         """The reading without what its pictures speak against.
@@ -70,7 +70,7 @@ class CarGates(NamedTuple):
         Where the flow contradicts the road, the speed is that of the flow.
         """
         out, signs = reading.copy().set("observed", self.seen(reading)), reading["signs"]
-        second = ~self.flow(TensorDict({"signs": signs[:, PICTURES:]}, [len(signs)]))["observed"]
+        second = ~self.flow(TensorDict({"signs": signs[:, PICTURES:]}, [len(signs)]))["seen"]
         second = second & ~reading["plane"].isnan()
         ensemble = reading["sensor", "ensemble"].clone()
         speed = self.scale * reading["plane"] / KITTI_DT

@@ -42,7 +42,7 @@ def read_codes(
     if file.exists():
         return TensorDict(torch.load(file, weights_only=True), batch_size=[len(demos)]).auto_batch_size_(2)
     by_number = {episode.demo: episode for episode in data.episodes}
-    check, sensor = BlackIsMissing(), sensor.eval()
+    check, sensor = BlackIsMissing(observed_key="arrived", out_key="observed"), sensor.eval()
     sequences = []
     for number in demos:
         episode = by_number[number]

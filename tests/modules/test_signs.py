@@ -19,7 +19,7 @@ def test_clean_readings_are_taken_out_at_the_rate(rate):
     gate = SignGate(3, rate=rate).calibrate([clean(200_000)])
     # Of independent signs, each beyond its quantile with a third of the rate.
     expected = 1 - (1 - rate / 3) ** 3
-    found = (~gate(clean(100_000, seed=1))["observed"]).double().mean().item()
+    found = (~gate(clean(100_000, seed=1))["seen"]).double().mean().item()
     assert abs(found - expected) < 5 * math.sqrt(expected / 100_000)
     quantile = math.exp(torch.special.ndtri(torch.tensor(1 - rate / 3, dtype=torch.float64)).item())
     assert gate.limits.tolist() == pytest.approx([quantile] * 3, rel=0.08)
@@ -30,20 +30,20 @@ def test_floor_margin_and_what_is_not_known():
     gate = SignGate(2, rate=0.02, floor=(0.5, 0.0)).calibrate([data], margin=2.0)
     assert gate.limits.tolist() == [0.5, 196.0]
     signs = torch.tensor([[0.4, 0.0], [0.6, 0.0], [torch.nan, 200.0], [torch.nan, 100.0]])
-    assert gate(TensorDict({"signs": signs}, [4]))["observed"].flatten().tolist() == [True, False, False, True]
+    assert gate(TensorDict({"signs": signs}, [4]))["seen"].flatten().tolist() == [True, False, False, True]
 
 
 def test_what_was_not_observed_stays_so():
-    gate = SignGate(1, observed_key=("camera", "seen"), sign_key="heat").calibrate(
+    gate = SignGate(1, observed_key=("camera", "given"), out_key=("camera", "seen"), sign_key="heat").calibrate(
         [clean(60, 1).rename_key_("signs", "heat")]
     )
     seen = torch.tensor([[True, False], [True, True]])
-    td = TensorDict({"heat": torch.tensor([[0.0], [1e6]]), "camera": {"seen": seen}}, [2])
+    td = TensorDict({"heat": torch.tensor([[0.0], [1e6]]), "camera": {"given": seen}}, [2])
     assert gate(td)["camera", "seen"].tolist() == [[True, False], [False, False]]
 
 
 def test_before_calibration_nothing_is_large():
-    assert SignGate(3)(clean(5))["observed"].all()
+    assert SignGate(3)(clean(5))["seen"].all()
 
 
 def test_wrong_arguments_are_named():
@@ -51,6 +51,8 @@ def test_wrong_arguments_are_named():
         SignGate(2, floor=(0.1,))
     with pytest.raises(ValueError, match="rate"):
         SignGate(2, rate=0.0)
+    with pytest.raises(ValueError, match="out_key must differ from observed_key"):
+        SignGate(2, observed_key="seen")
     with pytest.raises(ValueError, match="signs of 'camera'"):
         InnovationMonitor({"camera": MonitoredSensor("info", 1, sign_key="signs")})
 

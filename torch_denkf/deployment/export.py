@@ -16,7 +16,7 @@ from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
-from torch_denkf.modules._call import flat_noise
+from torch_denkf.modules._call import Entries
 
 
 class _FlatStep(nn.Module):
@@ -95,21 +95,23 @@ def export_step(
         need_compiler()
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
-    written = list(filter.out_keys)
-    counted = [key for key in written if filter.reject and key == REJECTED]
-    out_keys = list(dict.fromkeys([*filter.carry_keys, *filter.belief_keys, *map(unravel_key, out_keys), *counted]))
-    unknown = [key for key in out_keys if key not in written]
+    structure = filter.structure
+    inner = {filter.outer(key): key for key in (*structure.frame_keys, *filter.steps().step_keys)}
+    asked = [inner.get(key, key) for key in map(unravel_key, out_keys)]
+    out_keys = list(dict.fromkeys([*structure.carry, *structure.belief, *asked, *[REJECTED] * filter.reject]))
+    unknown = [key for key in out_keys if key not in inner.values()]
     if unknown:
-        raise ValueError(f"the filter does not write {unknown}; it writes {written}")
-    in_keys = _inputs(filter, example)
+        raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")
+    entries = filter.entries_of(example, one_step=True)
+    in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
-    values = tuple(example.get(key).clone(memory_format=torch.contiguous_format) for key in in_keys)
+    values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)
     signature = {
         "inputs": [
             (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)
         ],
         "outputs": [_name(key) for key in out_keys],
-        "carry": [_name(key) for key in filter.carry_keys],
+        "carry": [_name(key) for key in structure.carry],
     }
     was_training = filter.training
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
@@ -130,17 +132,16 @@ def export_step(
     return path
 
 
-def _inputs(filter: Filter, example: TensorDictBase) -> list[NestedKey]:
+def _inputs(filter: Filter, entries: Entries, example: TensorDictBase) -> list[NestedKey]:
     """What the step reads: all that it must, and what the example has of what it may."""
     structure = filter.structure
     keys = [*structure.needed, *structure.controls, *structure.carry]
-    missing = [key for key in keys if example.get(key, None) is None]
+    missing = [key for key in keys if key not in entries]
     if missing:
         raise KeyError(
             f"the step reads {missing}, which the example lacks; it holds {sorted(map(str, example.keys(True, True)))}"
         )
-    keys += [key for key in structure.optional if example.get(key, None) is not None]
-    return [*keys, *flat_noise(example.get("noise", None))]
+    return [*keys, *[key for key in entries if key not in keys and (key in structure.optional or key[0] == "noise")]]
 
 
 def _name(key: NestedKey) -> str:

@@ -48,6 +48,10 @@ class PackagedStep:
             KeyError: if an input is missing.
             ValueError: if it has another shape or dtype than the package was made for.
         """
+        nested = [key for key in entries if not isinstance(key, str) or isinstance(entries[key], Mapping)]
+        if nested or not isinstance(entries, Mapping):
+            found = f"nested entries, {nested[0]!r}" if nested else type(entries).__name__
+            raise TypeError(f"a packaged step takes a flat dictionary of {list(self.inputs)}; got {found}")
         values = []
         for name, (shape, dtype) in self.inputs.items():
             if name not in entries:

@@ -26,6 +26,7 @@ __all__ = [
     "refuse_non_finite",
     "refuse_single_readings",
     "refuse_two_precisions",
+    "refuse_unguarded",
     "refuse_unknown_noise",
     "refuse_unknown_readings",
 ]
@@ -78,6 +79,25 @@ def check_inputs(
         )
 
 
+def refuse_unguarded(filter: Filter) -> None:
+    """Raises a ``ValueError`` where readings are to be rejected, and one cannot be hidden."""
+    structure, name = filter.structure, type(filter).__name__
+    for place, module in structure.unmasked:
+        raise ValueError(
+            f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads "
+            'no mask that could hide one: name it in optional_keys=["observed"], and say self.observed_key = '
+            '"observed".'
+        )
+    guarded = {key for guard in structure.guards for key in (*guard.whole, *guard.components)}
+    for key in structure.readings:
+        if key not in guarded:
+            readers = [type(part).__name__ for part in structure.readers(key)]
+            raise ValueError(
+                f"{name} is to reject readings that cannot be true, and {', '.join(readers)} does not say which entry "
+                f'is the mask of {key!r}: self.observed_key = "observed", for example.'
+            )
+
+
 def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, reject: bool) -> None:
     """Raises a ``ValueError`` where a reading or the new belief is not finite; the message names the input that is not.
 
@@ -87,6 +107,7 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
     """
+    refuse_far_belief(entries, structure.carry)
     finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
     # -inf is the log-weight of a particle that is out of the question.
@@ -95,7 +116,10 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
-    if absurd and not set(absurd) & set(bad):
+    negative = [key for key, value in given.items() if key[-1] in ("cov", "var") and _lowest_variance(key, value) < 0]
+    if negative and not bad:
+        why = f"negative variances in {negative}"
+    elif absurd and not set(absurd) & set(bad):
         why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
     else:
         why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
@@ -122,6 +146,11 @@ def _is_far(value: Tensor) -> bool:
     if not value.is_floating_point() or not has_values(value):
         return False
     return bool(((value.abs() > LARGEST_READING) & value.isfinite()).any())
+
+
+def _lowest_variance(key: NestedKey, value: torch.Tensor) -> float:
+    variance = value.diagonal(dim1=-2, dim2=-1) if key[-1] == "cov" and value.ndim > 1 else value
+    return float(variance.min()) if variance.numel() else 0.0
 
 
 def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:

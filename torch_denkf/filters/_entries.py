@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
 
 from torch_denkf.filters._checks import refuse_unknown_noise
 from torch_denkf.modules._call import Entries, flat_noise
@@ -13,13 +15,18 @@ from torch_denkf.modules._call import Entries, flat_noise
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["entries_of", "of_one_robot", "write"]
+__all__ = ["entries_of", "of_one_robot", "own", "write"]
 
 
 def of_one_robot(filter: Filter, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
     """A tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and on its device."""
     if isinstance(tensordict, TensorDictBase):
         return tensordict
+    if not isinstance(tensordict, Mapping):
+        raise TypeError(
+            f"{type(filter).__name__} takes a tensordict, or a dictionary of numbers, arrays or tensors; got "
+            f"{type(tensordict).__name__}"
+        )
     like = filter.like()
     out = TensorDict(dict(tensordict), batch_size=[])
     out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
@@ -36,20 +43,37 @@ def entries_of(filter: Filter, tensordict: TensorDictBase, keys: Iterable[Nested
     """
     entries = {}
     for key in keys:
-        value = tensordict.get(key, None)
+        value = tensordict.get(filter.outer(key), None)
         if value is not None:
             entries[key] = value
-    noise = flat_noise(tensordict.get("noise", None))
+    noise = flat_noise(tensordict.get(filter.outer("noise"), None))
     if noise:
         refuse_unknown_noise(filter, noise)
         entries.update(noise)
     return entries
 
 
-def write(tensordict: TensorDictBase, written: Entries) -> None:
+def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
+    """The entries, each in memory of its own: no views, of a filter's constants for example, nothing that was given.
+
+    Args:
+        written: what modules wrote.
+        given: tensors that the caller keeps.
+    """
+    if torch.compiler.is_compiling():  # what a graph returns is its own
+        return written
+    seen, out = {id(value) for value in given}, {}
+    for key, value in written.items():
+        out[key] = value.clone() if value._is_view() or id(value) in seen else value
+        seen.add(id(value))
+    return out
+
+
+def write(filter: Filter, tensordict: TensorDictBase, written: Entries) -> None:
     """Sets entries, looking up each nested tensordict once."""
     owners: dict[tuple, Any] = {}
     for key, value in written.items():
+        key = filter.outer(key)
         prefix = () if isinstance(key, str) else key[:-1]
         owner = tensordict if not prefix else owners.get(prefix)
         if owner is None:

@@ -26,7 +26,7 @@ def write_noise(filter: Filter, tensordict: TensorDictBase, generator: torch.Gen
     entries, size = filter.entries_of(tensordict), tensordict.batch_size
     modules = (*filter.structure.modules, ("initial", filter.initial))
     drawn = draw_noise(filter, entries, size, modules, time=len(size) > 0, generator=generator, as_far_as_known=True)
-    write(tensordict, drawn or {})
+    write(filter, tensordict, drawn or {})
     return tensordict
 
 

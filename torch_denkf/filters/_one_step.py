@@ -12,17 +12,16 @@ from tensordict import NestedKey, TensorDictBase
 from torch_denkf.filters._ceiling import look_at_ceiling
 from torch_denkf.filters._checks import (
     check_inputs,
-    refuse_far_belief,
     refuse_missing_actions,
     refuse_non_finite,
     refuse_single_readings,
     refuse_unknown_readings,
 )
-from torch_denkf.filters._entries import write
+from torch_denkf.filters._entries import own, write
 from torch_denkf.filters._noise import draw_noise
-from torch_denkf.filters._said import say_eager, say_ignored_mask, say_up_to_date
+from torch_denkf.filters._said import mark_carried, say_eager, say_foreign, say_ignored_mask, say_up_to_date
 from torch_denkf.filters._slices import starts_of
-from torch_denkf.filters._steps import blank
+from torch_denkf.filters._steps import blank, where_rows
 from torch_denkf.filters._structure import KNOWN, previous_key, submodels
 from torch_denkf.filters._summaries import summaries
 from torch_denkf.modules._call import Call, Entries
@@ -58,9 +57,8 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
         say_ignored_mask(filter, tensordict)
         written = filter.take_step(entries, tensordict.batch_size)
     if filter.check_finite and not torch.compiler.is_compiling():
-        refuse_far_belief(entries, structure.carry)
         refuse_non_finite(structure, entries, written, filter.reject)
-    write(tensordict, written)
+    write(filter, tensordict, own(written, entries.values()))
     return tensordict
 
 
@@ -78,6 +76,7 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     """A step from the belief under ``("previous", ...)``, or the initial one; see :meth:`Filter.forward`."""
     structure = filter.structure
     entries = filter.entries_of(tensordict)
+    given = list(entries.values())
     resumed = all(previous_key(key) in entries for key in structure.carry)
     refuse_missing_actions(structure, entries, resumed)
     for key in (*structure.carry, *structure.controls):
@@ -86,10 +85,13 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     check_inputs(filter, entries, tensordict)
     say_ignored_mask(filter, tensordict)
     say_up_to_date(filter, entries[structure.carry[0]])
-    reset, known = starts_of(tensordict, filter.init_key, step=True), entries.get(KNOWN)
-    if known is not None:
-        known = known.reshape(*tensordict.batch_size, 1)
-        reset = ~known if reset is None else reset | ~known
+    say_foreign(filter, entries[structure.carry[0]])
+    # A mark may be that of a slice of data, which goes on from the belief before it.
+    known = entries.get(KNOWN)
+    if known is None:
+        reset = starts_of(tensordict, filter.init_key, step=True)
+    else:
+        reset = ~known.reshape(*tensordict.batch_size, 1)
     call, steps = Call(tensordict.batch_size), filter.steps()
     if reset is None:
         written = filter.take_step(entries, tensordict.batch_size)
@@ -98,13 +100,16 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
         written = steps.frames(entries, call)
         entries.update(written)
         start = filter.initial_belief(entries, call)
+        entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
         written.update(steps.advance(entries, call, reset, start))
         blank(steps, written, reset)
-    write(tensordict, written)
-    for key in structure.carry:
-        tensordict.set(("next", *previous_key(key)), written[key])
+    if filter.check_finite and not torch.compiler.is_compiling():
+        refuse_non_finite(structure, entries, written, filter.reject)
     some = written[structure.carry[0]]
-    tensordict.set(("next", *KNOWN), torch.ones(*tensordict.batch_size, 1, dtype=torch.bool, device=some.device))
+    following = {("next", *previous_key(key)): written[key] for key in structure.carry}
+    following["next", *KNOWN] = torch.ones(*tensordict.batch_size, 1, dtype=torch.bool, device=some.device)
+    write(filter, tensordict, own({**written, **following}, given))
+    mark_carried(filter, tensordict.get(filter.outer(("next", *previous_key(structure.carry[0])))))
     return tensordict
 
 
@@ -131,7 +136,7 @@ def initial_belief(filter: Filter, entries: Entries, call: Call) -> Entries:
     """See :meth:`Filter.initial_belief`."""
     belief = filter.structure.belief
     hidden = {key: value for key, value in entries.items() if key not in belief}
-    return summaries(run_module(filter.initial, hidden, call.part("initial")), belief)
+    return own(summaries(filter, run_module(filter.initial, hidden, call.part("initial"))), entries.values())
 
 
 def first_belief(
@@ -139,6 +144,7 @@ def first_belief(
 ) -> TensorDictBase:
     """See :meth:`Filter.initialise`; ``reject`` as the filter's."""
     entries, call, structure = filter.entries_of(tensordict), Call(tensordict.batch_size), filter.structure
+    given = list(entries.values())
     missing, steps = set(refuse_unknown_readings(structure, without)), filter.steps(reject=reject)
     entries = steps.usable(entries, call)
     frame_keys, written = set(structure.frame_keys), {}
@@ -152,5 +158,5 @@ def first_belief(
     else:
         written.update(start)
         written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
-    write(tensordict, written)
+    write(filter, tensordict, own(written, given))
     return tensordict

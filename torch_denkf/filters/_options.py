@@ -23,6 +23,7 @@ class FilterOptions(TypedDict, total=False):
     variance_ceiling: float | None
     check_finite: bool
     reject: bool
+    prefix: str | None
 
 
 def options_of(filter: Filter) -> FilterOptions:
@@ -35,4 +36,5 @@ def options_of(filter: Filter) -> FilterOptions:
         "variance_ceiling": filter.variance_ceiling,
         "check_finite": filter.check_finite,
         "reject": filter.reject,
+        "prefix": filter.prefix,
     }

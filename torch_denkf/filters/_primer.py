@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,30 @@ from torch_denkf.filters._structure import KNOWN, previous_key
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["LastAction", "belief_primer"]
+__all__ = ["LastAction", "belief_primer", "refuse_resets_of_groups"]
+
+
+def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
+    """Raises where torchrl would not reset what is kept: it resets the entries of the group that is done, no others.
+
+    Args:
+        reset_keys: of the environment.
+        kept: keys that start anew with each episode.
+
+    Raises:
+        ValueError: if episodes end in groups of agents alone, and an entry stands outside of them.
+    """
+    groups = [key[:-1] for key in map(unravel_key, reset_keys) if isinstance(key, tuple)]
+    if "_reset" in reset_keys or not groups:
+        return
+    for key in kept:
+        if not any(key[: len(group)] == group for group in groups):
+            raise ValueError(
+                f"Episodes of this environment end in {groups[0]} alone, and torchrl then keeps what stands outside of "
+                f"that group, as {key!r} would: the belief would go on from the episode before. Give the environment a "
+                "done of its own, at the root; or, where the group has the batch size of the environment, give the "
+                f"filter the name of the group, prefix={groups[0][0]!r}."
+            )
 
 
 class LastAction(TensorDictPrimer):
@@ -41,6 +65,7 @@ class LastAction(TensorDictPrimer):
         actions = {"action": ("previous", "action")} if actions is None else actions
         self.actions = {unravel_key(key): unravel_key(kept) for key, kept in actions.items()}
         super().__init__(Composite() if primers is None else primers, expand_specs=True)
+        self._carried = list(self.primers.keys(True, True))
 
     def _with_actions(self) -> None:
         """Adds the actions' shapes, which only the environment knows."""
@@ -53,8 +78,21 @@ class LastAction(TensorDictPrimer):
                 self.default_value[kept] = 0.0
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds what is carried."""
+        """Adds what is carried.
+
+        Raises:
+            ValueError: if another transform carries an entry of the same name, or the environment resets groups of
+                agents alone.
+        """
         self._with_actions()
+        if self.parent is not None:
+            refuse_resets_of_groups(self.parent.reset_keys, self.primers.keys(True, True))
+        taken = [key for key in self._carried if key in observation_spec.keys(True, True)]
+        if taken:
+            raise ValueError(
+                f"The environment carries {taken[0]!r} already, for another filter of the policy: both would start "
+                'from one belief. Give one of them a name of its own, prefix="imu" for example.'
+            )
         return super().transform_observation_spec(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -83,8 +121,10 @@ def belief_primer(filter: Filter) -> TensorDictPrimer:
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         belief = initial(probe)
     primers = Composite()
-    for key in filter.carry_keys:
+    for key in filter.structure.carry:
         value = belief.get(key)
-        primers[previous_key(key)] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-    primers[KNOWN] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
-    return LastAction({key: previous_key(key) for key in filter.structure.controls}, primers=primers)
+        kept = filter.outer(previous_key(key))
+        primers[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+    primers[filter.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
+    actions = {key: filter.outer(previous_key(key)) for key in filter.structure.controls}
+    return LastAction(actions, primers=primers)

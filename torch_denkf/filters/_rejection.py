@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
+from torch_denkf._checks import check_mask
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 
@@ -107,11 +108,23 @@ def usable(guards: Sequence[Guard], entries: Entries, batch_size: Sequence[int])
         for part in parts[1:]:
             fine = fine & part
         observed = entries.get(guard.mask)
+        if observed is not None:
+            _check_mask(guard.mask, observed, batch_size, fine.shape[-1])
         lost = ~fine if observed is None else observed & ~fine
         out[guard.mask] = fine if observed is None else observed & fine
         count = count + lost.sum(-1, keepdim=True)
     out[REJECTED] = count
     return out
+
+
+def _check_mask(key: NestedKey, mask: Tensor, batch_size: Sequence[int], width: int) -> None:
+    """Raises a ``ValueError`` unless a mask is boolean, ``[*B, 1]`` or ``[*B, O]``."""
+    check_mask(f"the mask {key!r}", mask)
+    widths = {1, mask.shape[-1] if width == 1 and mask.ndim else width}
+    if mask.shape[:-1] != tuple(batch_size) or mask.ndim == 0 or mask.shape[-1] not in widths:
+        raise ValueError(
+            f"the mask {key!r} must be [*B, 1] or [*B, O] with B = {list(batch_size)}; got {list(mask.shape)}"
+        )
 
 
 def rejected_keys(guards: Sequence[Guard], entries: Mapping[NestedKey, Tensor]) -> list[NestedKey]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from typing import TYPE_CHECKING
+from weakref import ref
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -14,7 +15,15 @@ from torch_denkf.modules._running import reads
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["mark_up_to_date", "say_eager", "say_ignored_mask", "say_once", "say_up_to_date"]
+__all__ = [
+    "mark_carried",
+    "mark_up_to_date",
+    "say_eager",
+    "say_foreign",
+    "say_ignored_mask",
+    "say_once",
+    "say_up_to_date",
+]
 
 #: What environments and data sets call their mask.
 _MASK = "observed"
@@ -22,6 +31,8 @@ _MASK = "observed"
 _OWN_MASK = "_observed"
 #: Beliefs that an environment's transform has brought up to the frame beside them.
 _UP_TO_DATE = WeakIdKeyDictionary()
+#: Beliefs that a policy's filter wrote for its next step, and a reference to that filter.
+_CARRIED = WeakIdKeyDictionary()
 
 
 def say_once(filter: Filter, about: str, text: str) -> None:
@@ -112,6 +123,24 @@ def say_up_to_date(filter: Filter, belief: torch.Tensor) -> None:
             f"{type(filter).__name__} in a policy starts its step from a belief that DEnKFTransform has brought up to "
             "this frame already: each reading counts twice. Keep the filter in one place: in the environment, where "
             "the policy reads ('belief', 'mean'), or in the policy behind filter.make_tensordict_primer().",
+        )
+
+
+def mark_carried(filter: Filter, belief: torch.Tensor) -> None:
+    """Remembers, as long as it lives, which policy's filter wrote the belief that it will start from."""
+    if not torch.compiler.is_compiling():
+        _CARRIED[belief] = ref(filter)
+
+
+def say_foreign(filter: Filter, belief: torch.Tensor) -> None:
+    """Says that a policy's filter starts its step from what another one wrote."""
+    writer = None if torch.compiler.is_compiling() else _CARRIED.get(belief)
+    if writer is not None and writer() is not filter:
+        say_once(
+            filter,
+            "foreign",
+            f"{type(filter).__name__} in a policy starts its step from a belief that another filter wrote. Where both "
+            'are in one policy, give one of them a name of its own, prefix="imu" for example.',
         )
 
 

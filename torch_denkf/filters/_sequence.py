@@ -17,7 +17,7 @@ from torch_denkf.filters._checks import (
     refuse_far_belief,
     refuse_missing_actions,
 )
-from torch_denkf.filters._entries import write
+from torch_denkf.filters._entries import own, write
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._rejection import REJECTED
 from torch_denkf.filters._said import say_ignored_mask
@@ -68,10 +68,11 @@ def filter_sequence(
             f"batch_size {list(size)}."
         )
     filter.structure  # noqa: B018 - sorts the modules anew where one has been replaced
-    keep = list(filter.out_keys) if keep is None else [unravel_key(key) for key in keep]
-    unknown = [key for key in keep if key not in filter.out_keys]
+    inner = {filter.outer(key): key for key in (*filter.structure.frame_keys, *filter.steps().step_keys)}
+    keep = list(inner.values()) if keep is None else [inner.get(key, key) for key in map(unravel_key, keep)]
+    unknown = [key for key in keep if key not in inner.values()]
     if unknown:
-        raise ValueError(f"keep names {unknown}; the filter writes {list(filter.out_keys)}.")
+        raise ValueError(f"keep names {unknown}; the filter writes {list(inner)}.")
     new = starts_of(tensordict, filter.init_key)
     rows, new = as_rows(tensordict, new)
     outputs = filter_rows(filter, rows, new, detach_every, keep)
@@ -79,7 +80,7 @@ def filter_sequence(
         look_at_ceiling(filter, outputs)
     if rows is not tensordict:
         outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
-    write(tensordict, {key: outputs[key] for key in keep})
+    write(filter, tensordict, {key: outputs[key] for key in keep})
     return tensordict
 
 
@@ -89,8 +90,10 @@ def stepped(filter: Filter, tensordict: TensorDictBase) -> Tensor:
     new, first = starts_of(tensordict, filter.init_key), torch.zeros(size, dtype=torch.bool, device=tensordict.device)
     first[..., 0] = True
     new = first if new is None else first | new.reshape(size)
-    if all(tensordict.get(previous_key(key), None) is not None for key in filter.structure.carry):
-        known = tensordict.get(KNOWN, None)  # a policy's data: every element with a belief before it is a step
+    if all(tensordict.get(filter.outer(previous_key(key)), None) is not None for key in filter.structure.carry):
+        known = tensordict.get(
+            filter.outer(KNOWN), None
+        )  # a policy's data: every element with a belief before it is a step
         return torch.ones_like(new) if known is None else known.reshape(size)
     return ~new
 
@@ -109,6 +112,7 @@ def filter_rows(
     """
     structure, time, size = filter.structure, rows.ndim - 1, rows.batch_size
     entries, call = filter.entries_of(rows), Call(size, time=True)
+    given = list(entries.values())
     check_inputs(filter, entries, rows, carry=False)
     if filter.check_finite and not filter.reject and not torch.compiler.is_compiling():
         refuse_far_belief(entries, [name for key in structure.carry for name in (key, previous_key(key))])
@@ -127,7 +131,7 @@ def filter_rows(
         begins, resumes = _beginnings(structure, entries, new, size)
         fresh = begins
     if stored:  # these have seen their frame
-        starts = summaries({key: entries[key] for key in structure.carry}, structure.belief)
+        starts = summaries(filter, {key: entries[key] for key in structure.carry}, entries)
     elif begins is None:  # where only the first element starts, only its initial belief is needed
         head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
         starts = filter.initial_belief(head, call._replace(batch_size=torch.Size((*size[:-1], 1))))
@@ -151,7 +155,7 @@ def filter_rows(
     if fresh is None:
         fresh = _or_first(begins, size, next(iter(starts.values())).device)
     blank(steps, outputs, fresh)
-    return {**{key: frames[key] for key in keep if key in frames}, **outputs}
+    return {**own({key: frames[key] for key in keep if key in frames}, given), **outputs}
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:

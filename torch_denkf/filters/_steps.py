@@ -50,6 +50,7 @@ class Steps(NamedTuple):
 
     def usable(self, entries: Entries, call: Call) -> Entries:
         """What the modules may read: without readings that cannot be true, if they are to be rejected."""
+        refuse_group_readings(self.structure, entries, call.batch_size)
         return usable(self.structure.guards, entries, call.batch_size) if self.reject else entries
 
     def run(
@@ -105,15 +106,14 @@ class Steps(NamedTuple):
             What transition and update write.
         """
         structure, start = self.structure, {} if start is None else start
-        written = self.run([structure.transition], entries, call)
         entries = dict(entries)
         if reset is not None:
-            for key in structure.carry:
-                start_value = start[key]
-                if key in structure.forecast_of:
-                    forecast_key = structure.forecast_of[key]
-                    written[forecast_key] = where_rows(reset, start_value, written[forecast_key])
-                entries[key] = where_rows(reset, start_value, entries[key])  # an update may read it, too
+            # Before the transition, too: its gradient would be NaN where the episode before diverged.
+            entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
+        written = self.run([structure.transition], entries, call)
+        if reset is not None:
+            for key, forecast_key in structure.forecast_of.items():
+                written[forecast_key] = where_rows(reset, start[key], written[forecast_key])
         return self._update(entries, written, call, reset, start, missing)
 
     def first(
@@ -198,6 +198,24 @@ class Steps(NamedTuple):
         if resumes is None:
             return carry
         return {key: where_rows(resumes, row[previous_key(key)], value) for key, value in carry.items()}
+
+
+def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Sequence[int]) -> None:
+    """Raises a ``ValueError`` where a raw reading has dimensions that neither the batch nor an ensemble has."""
+    size = len(batch_size)
+    members = next(
+        (entries[key].shape[-2] for key in structure.carry if key[-1] == "ensemble" and key in entries), None
+    )
+    for key in structure.plain:
+        value = entries.get(key)
+        if value is None or value.ndim <= size + 1 or (value.ndim == size + 2 and value.shape[-2] == members):
+            continue
+        raise ValueError(
+            f"The reading {key!r} is {list(value.shape)}, and the batch is {list(batch_size)}: {value.ndim - size - 1} "
+            "dimension(s) too many. Readings of several robots need a belief for each: filter a tensordict whose batch "
+            "holds the robots, such as tensordict['agents'] of a group. Readings of one robot: put them side by side, "
+            "with flatten(-2)."
+        )
 
 
 def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:

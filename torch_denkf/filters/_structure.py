@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -47,7 +48,7 @@ class Structure(NamedTuple):
     Attributes:
         frames: modules that read frames alone, and not the belief.
         transition: the module that forecasts the carry: the first that depends on the belief.
-        update: the modules between the forecast and the belief.
+        update: the modules between the forecast and the belief, and those that depend on the action alone.
         needed: keys that must be there beside the carry and the controls.
         optional: keys that are used where they are there.
         controls: keys that drive the transition.
@@ -58,6 +59,7 @@ class Structure(NamedTuple):
         beside: what else the transition writes.
         observation_dims: O of each entry that a noise module of the update writes, as far as it is known.
         readings: raw entries that the analyses' readings are made of.
+        plain: those of them that an analysis reads itself.
         guards: what a mask hides, of those readings.
         unmasked: modules of the update that take in a reading and read no mask.
         own_info: new names for diagnostics that several analyses would write under one.
@@ -80,6 +82,7 @@ class Structure(NamedTuple):
     beside: tuple[NestedKey, ...]
     observation_dims: dict[NestedKey, int]
     readings: tuple[NestedKey, ...]
+    plain: tuple[NestedKey, ...]
     guards: tuple[Guard, ...]
     unmasked: tuple[Placed, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
@@ -92,6 +95,12 @@ class Structure(NamedTuple):
     def modules(self) -> tuple[Placed, ...]:
         """All modules, in the order in which they run."""
         return (*self.frames, self.transition, *self.update)
+
+    def readers(self, key: NestedKey) -> list[TensorDictModuleBase]:
+        """The sub-models of the update that take in a reading that is made of the entry ``key``."""
+        parts = [part for _, module in self.update for part in submodels(module)]
+        direct = [part for part in parts if key in map(unravel_key, getattr(part, "reading_keys", ()))]
+        return direct or [part for part in parts if getattr(part, "reading_keys", ())]
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
         """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
@@ -126,16 +135,11 @@ class Structure(NamedTuple):
                 f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
                 f"{needed}. Give both the same keys."
             )
-        dependent, frames, steps = {*carry, *control_keys}, [], []
-        for place, module in modules:
-            must, may = reads(module)
-            if dependent.isdisjoint((*must, *may)):
-                frames.append((place, module))
-            else:
-                steps.append((place, module))
-                dependent.update(map(unravel_key, module.out_keys))
+        _refuse_both([*needed, *optional], carry, modules)
+        frames, steps = _sorted(modules, carry, control_keys)
         _refuse_overwriting([*frames, *steps])
         _refuse_nesting([*needed, *optional], [key for _, module in modules for key in writes(module)])
+        _refuse_unread_masks(modules)
         own_info, totals = _apart(steps)
         renamed = {name for names in own_info.values() for name in names.values()}
         needed, optional = ([key for key in keys if key not in renamed] for keys in (needed, optional))
@@ -165,6 +169,7 @@ class Structure(NamedTuple):
             beside=tuple(key for key in writes(steps[0][1]) if key not in forecast_of.values()),
             observation_dims=_observation_dims([*frames, *steps[1:]]),
             readings=tuple(_readings(frames, steps[1:], needed)),
+            plain=tuple(_plain(steps[1:], needed)),
             guards=_guards(frames, steps[1:], needed, initial),
             unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
@@ -173,6 +178,66 @@ class Structure(NamedTuple):
             frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,
         )
+
+
+def _sorted(
+    modules: Sequence[Placed], carry: Sequence[NestedKey], controls: Sequence[NestedKey]
+) -> tuple[list[Placed], list[Placed]]:
+    """The modules that read frames alone; and the others, the transition first.
+
+    A module that depends on the action and not on the belief, such as a reading's noise, runs behind the transition. So
+    does one that carries entries of its own alone, such as a count.
+    """
+    frames: list[Placed] = []
+    driven: list[Placed] = []
+    steps: list[Placed] = []
+    on_action, on_belief = set(controls), set(carry)
+    for place, module in modules:
+        read = {*chain(*reads(module))}
+        if not steps and not on_belief.isdisjoint(read) and set(writes(module)) <= set(carry):
+            driven.append((place, module))
+        elif not on_belief.isdisjoint(read):
+            steps.append((place, module))
+            on_belief.update(writes(module))
+        elif not on_action.isdisjoint(read):
+            (steps if steps else driven).append((place, module))
+            on_action.update(writes(module))
+        else:
+            frames.append((place, module))
+    if not steps:
+        raise ValueError(f"No module forecasts {list(carry)}: each that reads the belief writes over it.")
+    made = {key: place for place, module in driven for key in writes(module) if key not in carry}
+    for key in chain(*reads(steps[0][1])):
+        if key in made:
+            raise ValueError(
+                f"{steps[0][0]!r} forecasts the belief and reads {key!r}, which {made[key]!r} makes of the action "
+                "alone. Let the transition read the action itself, or put both into one module."
+            )
+    return frames, [*steps[:1], *driven, *steps[1:]]
+
+
+def _refuse_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules: Sequence[Placed]) -> None:
+    """Raises where an entry comes from outside and is written, too: the next step would read what this one wrote."""
+    for place, module in modules:
+        both = [key for key in writes(module) if key in read and key not in carry]
+        if both:
+            raise ValueError(
+                f"{place!r} ({type(module).__name__}) writes {both[0]!r}, which the filter also reads from outside: "
+                "the next step would take what this one wrote for a new reading. Write it under another key, and let "
+                "the modules behind it read that one; or carry it from step to step: let the initial belief write it."
+            )
+
+
+def _refuse_unread_masks(modules: Sequence[Placed]) -> None:
+    """Raises where a module marks readings as missing, and no module looks at its mask."""
+    parts = [part for _, module in modules for part in submodels(module)]
+    read = {key for _, module in modules for key in chain(*reads(module))}
+    for part in parts:
+        if part.marks is not None and part.marks not in read:
+            raise ValueError(
+                f"{type(part).__name__} marks readings as missing in {part.marks!r}, which no module of the filter "
+                f"reads: give observed_key={part.marks!r} to the filter or its analysis."
+            )
 
 
 def _forecasts(
@@ -230,6 +295,14 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
             found.update(dict.fromkeys(reads(module)[0]))
     made_by_steps = {key for _, module in update for key in writes(module)}
     return [key for key in found if key in needed and key not in made_by_steps]
+
+
+def _plain(update: Sequence[Placed], needed: Sequence[NestedKey]) -> Iterator[NestedKey]:
+    """The readings that come from outside as they are; of an analysis they stand in front of their noise."""
+    for _, module in update:
+        for part in submodels(module):
+            first = [unravel_key(key) for key in getattr(part, "reading_keys", ())[:1]]
+            yield from (key for key in first if key in needed)
 
 
 def _guards(

@@ -23,10 +23,11 @@ from torch import Tensor
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters import _one_step
 from torch_denkf.filters._ceiling import say_ceiling
-from torch_denkf.filters._checks import refuse_two_precisions
+from torch_denkf.filters._checks import refuse_two_precisions, refuse_unguarded
 from torch_denkf.filters._compiled import CompiledSteps
 from torch_denkf.filters._entries import entries_of, of_one_robot
 from torch_denkf.filters._noise import write_noise
@@ -41,7 +42,7 @@ from torch_denkf.modules._running import check_module, named_modules_of, reads
 __all__ = ["Filter"]
 
 
-class Filter(TensorDictSequential):
+class Filter(Checked, TensorDictSequential):
     """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
 
     The modules are sorted once, by their keys: those that depend on the belief (transition, observation, analysis) are
@@ -79,6 +80,8 @@ class Filter(TensorDictSequential):
         reject: whether such readings count as not observed, in steps, sequences, compiled and packaged, and
             ``("info", "rejected")`` ``[*B, 1]`` counts them: each component of a vector that an update reads itself,
             and one for all that a sensor reads. What shares a mask is rejected together.
+        prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
+            mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
     Raises:
         ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
@@ -108,11 +111,15 @@ class Filter(TensorDictSequential):
         variance_ceiling: float | None = 1e12,
         check_finite: bool = True,
         reject: bool = False,
+        prefix: str | None = None,
     ):
         if len(modules) == 1 and isinstance(modules[0], Mapping):
             modules = (OrderedDict(modules[0]),)
-        for part in modules[0].values() if len(modules) == 1 and isinstance(modules[0], Mapping) else modules:
-            check_module("modules", part)
+            for name, part in modules[0].items():
+                check_module(str(name), part)
+        else:
+            for number, part in enumerate(modules):
+                check_module(f"modules[{number}]", part)
         check_module("initial", initial)
         super().__init__(*modules)
         self.initial = initial
@@ -122,6 +129,7 @@ class Filter(TensorDictSequential):
         if variance_ceiling is not None:
             check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
         self.variance_ceiling, self.check_finite, self.reject = variance_ceiling, check_finite, reject
+        self.prefix = prefix
         self.compiled: CompiledSteps | None = None
         self._said: set[str] = set()
         refuse_two_precisions(self)
@@ -139,25 +147,29 @@ class Filter(TensorDictSequential):
         structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
         self._sorted_for = (*all_modules(self), self.initial, *self.control_keys, self.reject)
         self._structure = structure
-        self.in_keys = structure.in_keys(self.init_key)
-        self.out_keys = [*structure.frame_keys, *self.steps().step_keys]
-        self._all_keys = list(dict.fromkeys([*self.in_keys, *chain(*reads(self.initial))]))
+        written = [*structure.frame_keys, *self.steps().step_keys]
+        self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
+        self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
+        self.out_keys = [self.outer(key) for key in written]
+        self._all_keys = list(dict.fromkeys([*structure.in_keys(self.init_key), *chain(*reads(self.initial))]))
+        if self.reject:
+            refuse_unguarded(self)
         self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
 
     @property
     def carry_keys(self) -> list[NestedKey]:
         """The entries of the belief that go on from step to step."""
-        return list(self.structure.carry)
+        return [self.outer(key) for key in self.structure.carry]
 
     @property
     def belief_keys(self) -> list[NestedKey]:
         """All entries of the belief: the carry, and what follows from it."""
-        return list(self.structure.belief)
+        return [self.outer(key) for key in self.structure.belief]
 
     @property
     def log_likelihood_keys(self) -> list[NestedKey]:
         """The log-likelihoods that add up to that of all readings."""
-        return list(self.structure.likelihoods)
+        return [self.outer(key) for key in self.structure.likelihoods]
 
     @property
     def frame_modules(self) -> list[TensorDictModuleBase]:
@@ -173,6 +185,21 @@ class Filter(TensorDictSequential):
     def update_modules(self) -> list[TensorDictModuleBase]:
         """The modules between the forecast and the belief."""
         return [module for _, module in self.structure.update]
+
+    def outer(self, key: NestedKey) -> NestedKey:
+        """Where a tensordict holds what the modules know as ``key``: entries of the filter's own, under the prefix."""
+        if self.prefix is None:
+            return key
+        names = (key,) if isinstance(key, str) else key
+        if names[0] == "next":
+            return ("next", self.prefix, *names[1:])
+        own = key in self._own_keys or names[0] in ("noise", "previous")
+        return (self.prefix, *names) if own else key
+
+    def inside(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """A shallow copy that holds the filter's own entries as they would be without a prefix."""
+        out = tensordict.copy()
+        return out if self.prefix is None else out.update(tensordict.get(self.prefix))
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""

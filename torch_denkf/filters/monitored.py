@@ -53,12 +53,13 @@ class Monitored(Filter):
         _check_filter("Monitored", filter)
         check_module("monitor", monitor)
         read = [key for key in monitor.in_keys if key not in monitor.state_keys]
-        missing = [key for key in map(unravel_key, read) if key not in filter.out_keys]
+        written = filter.structure.out_keys
+        missing = [key for key in map(unravel_key, read) if key not in written]
         if missing:
-            raise KeyError(f"the monitor reads {missing}, which the filter does not write; it writes {filter.out_keys}")
+            raise KeyError(f"the monitor reads {missing}, which the filter does not write; it writes {written}")
         like = filter.like()
         modules = OrderedDict(named_modules_of(filter))
-        taken = [key for key in monitor.state_keys if key in filter.out_keys]
+        taken = [key for key in monitor.state_keys if key in written]
         if taken:
             raise ValueError(
                 f"the filter writes {taken[0]} already; give this monitor another name: monitor_key="

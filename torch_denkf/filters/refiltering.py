@@ -149,7 +149,7 @@ class Refiltering:
         drawn = draw_noise(self.filter, entries, row.batch_size, self.filter.structure.modules)
         if drawn is None:
             raise ValueError("A module cannot draw its noise before the step, so that the step cannot be made again.")
-        write(row, drawn)
+        write(self.filter, row, drawn)
         return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:

@@ -11,12 +11,13 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
+from torch_denkf._arguments import Checked
 from torch_denkf.modules._call import Call, Entries, Noise, flat_noise
 
 __all__ = ["SubModel"]
 
 
-class SubModel(TensorDictModule):
+class SubModel(Checked, TensorDictModule):
     """A part of a filter: a function of tensors, and the keys of what it reads and writes.
 
     A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
@@ -33,6 +34,7 @@ class SubModel(TensorDictModule):
     Attributes:
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
             for one tensor without a name of its own.
+        marks: the mask that the sub-model makes where it finds readings that are missing; ``None`` if it makes none.
 
     Example:
         >>> from tensordict import TensorDict
@@ -55,6 +57,7 @@ class SubModel(TensorDictModule):
 
     else:
         noise_names = ()
+    marks: NestedKey | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
@@ -123,6 +126,10 @@ class SubModel(TensorDictModule):
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
         """The modules inside that may draw noise of their own, by name."""
+        return {}
+
+    def of_carry(self, entries: Entries) -> Entries:
+        """Of an initial belief: what else of the belief follows from the entries that are carried on, by key."""
         return {}
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:

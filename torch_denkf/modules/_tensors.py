@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from tensordict import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_number, check_values
@@ -16,6 +17,7 @@ __all__ = [
     "as_vector",
     "check_dims",
     "mean_of_members",
+    "own_mask",
     "register_constant",
     "register_location",
     "register_scale",
@@ -24,10 +26,11 @@ __all__ = [
 
 
 def as_floating(value: Any, name: str = "the constant") -> Tensor:
-    """A floating tensor: a tensor keeps its precision, everything else gets torch's default one.
+    """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
 
     Raises:
-        TypeError: if it is neither a tensor nor numbers, or complex; ``name`` is the argument's.
+        TypeError: if it is neither a tensor nor numbers, if it is complex, or if it requires a gradient, which would get
+            lost; ``name`` is the argument's.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
@@ -39,18 +42,23 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
         raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
     if tensor.is_complex():
         raise TypeError(f"{name} must be real; got {tensor.dtype}. Real and imaginary parts are two components each")
-    if isinstance(value, Tensor) and tensor.is_floating_point():
-        return tensor
-    return tensor.to(torch.get_default_dtype())
+    if tensor.requires_grad:
+        raise TypeError(
+            f"{name} requires a gradient, and would be copied into a constant, which learns nothing: pass "
+            f"{name}.detach(); where it is to be learned, trainable=True, or a module that learns it"
+        )
+    keeps = isinstance(value, Tensor) and tensor.is_floating_point()
+    return tensor.detach().to(tensor.dtype if keeps else torch.get_default_dtype(), copy=True)
 
 
 def register_constant(
     module: nn.Module, name: str, value: Tensor | Sequence | float | None, *, trainable: bool = False
 ) -> None:
     """Keeps a constant in a module as a buffer, or as a parameter; ``None`` stays ``None``."""
-    tensor = None if value is None else as_floating(value, name)
+    given = value.detach() if trainable and isinstance(value, Tensor) else value
+    tensor = None if value is None else as_floating(given, name)
     if trainable and tensor is not None:
-        module.register_parameter(name, nn.Parameter(tensor.clone()))
+        module.register_parameter(name, nn.Parameter(tensor))
     else:
         module.register_buffer(name, tensor)
 
@@ -144,6 +152,19 @@ def variance_and_floor(
     check_values(f"floor of {owner}", floor, least=0)
     check_values(f"r^2 - floor of {owner}", variance - floor, above=0, cure="The floor is a variance below r^2")
     return variance - floor, floor.clone()
+
+
+def own_mask(observed_key: NestedKey, out_key: NestedKey) -> NestedKey:
+    """The key of a mask that a module makes of another one, unravelled.
+
+    Raises:
+        ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
+    """
+    if unravel_key(observed_key) == unravel_key(out_key):
+        raise ValueError(
+            f"out_key must differ from observed_key, {observed_key!r}: one black picture would hide all that follow"
+        )
+    return unravel_key(out_key)
 
 
 def mean_of_members(value: Tensor, batch_size: Sequence[int]) -> Tensor:

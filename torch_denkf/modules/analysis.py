@@ -21,7 +21,7 @@ from torch_denkf.functional import (
     relax_to_prior_spread,
 )
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._tensors import check_dims
+from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]
 
@@ -88,7 +88,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
                 check_values(name.replace("_", "'s "), factors)
-            self.register_buffer(name, factors, persistent=False)
+            self.register_buffer(name, None if factors is None else as_floating(factors, name), persistent=False)
 
     @property
     def noise_names(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import own_mask
 
 __all__ = ["BlackIsMissing"]
 
@@ -14,31 +15,38 @@ __all__ = ["BlackIsMissing"]
 class BlackIsMissing(SubModel):
     """Marks pictures that are black all over as not observed: no scene is.
 
-    A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor:
-    the filter then goes by its motion until the camera is back, and its spread grows.
+    A sensor reads something in a black picture, too, and a filter believes it. Put this module in front of the sensor,
+    ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask, ``observed_key="seen"``. The
+    filter then goes by its motion until the camera is back, and its spread grows.
 
     Args:
         threshold: a picture none of whose pixels is brighter, as a share of white, is black.
         image_key: pictures ``[*B, C, H, W]``, in [0, 1] or of whole numbers up to 255.
-        observed_key: the mask ``[*B, 1]``; pictures that were not observed before stay so.
+        observed_key: optional mask ``[*B, 1]`` of pictures that were missing before.
+        out_key: the mask ``[*B, 1]``: False where a picture is black, and where it was missing before.
 
     Raises:
-        ValueError: if the threshold is not between 0 and 1.
+        ValueError: if the threshold is not between 0 and 1, or both masks have one key.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> pictures = torch.stack([torch.zeros(3, 4, 4), torch.full((3, 4, 4), 0.3)])
-        >>> BlackIsMissing()(TensorDict({"pixels": pictures}, [2]))["observed"].tolist()
+        >>> BlackIsMissing()(TensorDict({"pixels": pictures}, [2]))["seen"].tolist()
         [[False], [True]]
     """
 
     def __init__(
-        self, threshold: float = 0.02, *, image_key: NestedKey = "pixels", observed_key: NestedKey = "observed"
+        self,
+        threshold: float = 0.02,
+        *,
+        image_key: NestedKey = "pixels",
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = "seen",
     ):
         check_number("threshold", threshold, least=0, most=1)
-        super().__init__(nn.Identity(), [image_key], [observed_key], optional_keys=[observed_key])
-        self.threshold = threshold
+        super().__init__(nn.Identity(), [image_key], [out_key], optional_keys=[observed_key])
+        self.threshold, self.marks = threshold, own_mask(observed_key, out_key)
 
     def compute(self, pixels: Tensor, before: Tensor | None = None) -> Tensor:
         """The mask ``[*B, 1]``."""

@@ -54,6 +54,25 @@ class WithJointMoments(WithPast):
         own = (*joint, mean, cov, cov.diagonal(dim1=-2, dim2=-1), age)
         return {**written, **dict(zip(self._own, own, strict=True))}
 
+    def of_carry(self, entries):
+        """The present state and the oldest one."""
+        mean, cov = (entries[self.belief_key, name] for name in self.PAST)
+        size = mean.shape[-1] // (self.lag + 1)
+        present = dict(
+            zip(
+                [(self.belief_key, name) for name in ("mean", "cov", "var")],
+                _part(mean, cov, slice(None, size)),
+                strict=True,
+            )
+        )
+        oldest = dict(zip(self._own[len(self.PAST) :], _part(mean, cov, slice(-size, None)), strict=False))
+        return {**super().of_carry(entries), **present, **oldest}
+
+
+def _part(mean: torch.Tensor, cov: torch.Tensor, part: slice) -> tuple[torch.Tensor, ...]:
+    """Mean, covariance and variance of one of the states in a joint one."""
+    return mean[..., part], cov[..., part, part], cov[..., part, part].diagonal(dim1=-2, dim2=-1)
+
 
 class JointForecast(SubModel):
     """The joint state moves on by one step: the forecast in front of the last belief's states, the oldest is forgotten.
@@ -90,8 +109,5 @@ class PresentOfJoint(SubModel):
     def compute(self, mean, cov, age):
         """The beliefs."""
         size = self.size
-        beliefs = [
-            (mean[..., part], cov[..., part, part], cov[..., part, part].diagonal(dim1=-2, dim2=-1))
-            for part in (slice(None, size), slice(-size, None))
-        ]
-        return *beliefs[0], mean, cov, *beliefs[1], (age + 1).clamp(max=mean.shape[-1] // size - 1)
+        present, oldest = (_part(mean, cov, part) for part in (slice(None, size), slice(-size, None)))
+        return *present, mean, cov, *oldest, (age + 1).clamp(max=mean.shape[-1] // size - 1)

@@ -39,6 +39,10 @@ class InPlaceOf(SubModel):
         """Draws the noise of the module inside."""
         return self.module.draw_noise(batch_size, **sizes)
 
+    def of_carry(self, entries):
+        """What follows for the module inside."""
+        return self.module.of_carry(entries) if isinstance(self.module, SubModel) else {}
+
     def parts(self):
         """Those of the module inside."""
         if type(self.module) is TensorDictSequential:
@@ -117,6 +121,12 @@ class WithEnsemblePast(WithPast):
         age = torch.full((*call.batch_size, 1), self.age, device=ensemble.device)
         own = (past, ensemble, *moments_of(ensemble, log_weight), age)
         return {**written, **dict(zip(self._own, own, strict=True))}
+
+    def of_carry(self, entries):
+        """The oldest state."""
+        ensemble = entries[self.belief_key, "past"][..., -1, :]
+        moments = moments_of(ensemble, entries.get((self.belief_key, "log_weight")))
+        return {**super().of_carry(entries), **dict(zip(self._own[1:], (ensemble, *moments), strict=False))}
 
 
 class EnsemblePast(SubModel):

@@ -102,6 +102,20 @@ class WithMomentsPast(WithPast):
         own = (*past, mean, cov, cov.diagonal(dim1=-2, dim2=-1), age)
         return {**written, **dict(zip(self._own, own, strict=True))}
 
+    def of_carry(self, entries):
+        """The oldest state."""
+        past = (entries[self.belief_key, name] for name in self.PAST)
+        oldest = _oldest(entries[self.belief_key, "cov"], *past)
+        return {**super().of_carry(entries), **dict(zip(self._own[len(self.PAST) :], oldest, strict=False))}
+
+
+def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Tensor, ...]:
+    """Mean, covariance and variance of the oldest state, beside the covariance of the present one."""
+    gain = past_gain[..., -1, :, :]
+    smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
+    smoothed = (smoothed + smoothed.mT) / 2
+    return past_mean[..., -1, :], smoothed, smoothed.diagonal(dim1=-2, dim2=-1)
+
 
 class MomentsPast(SubModel):
     """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
@@ -168,10 +182,6 @@ class LaggedMoments(SubModel):
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
         """The past, and the belief of its oldest state."""
         shift = (past_gain @ (mean - forecast)[..., None, :, None]).squeeze(-1)
-        past_mean, gain = past_mean + shift, past_gain[..., -1, :, :]
-        smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
-        smoothed = (smoothed + smoothed.mT) / 2
-        variance = smoothed.diagonal(dim1=-2, dim2=-1)
-        oldest = past_mean[..., -1, :]
+        past_mean = past_mean + shift
         age = (age + 1).clamp(max=past_mean.shape[-2])
-        return past_mean, past_cov, past_gain, oldest, smoothed, variance, age
+        return past_mean, past_cov, past_gain, *_oldest(cov, past_mean, past_cov, past_gain), age

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._calibration import sign_limits
+from torch_denkf.modules._tensors import own_mask
 
 __all__ = ["SignGate"]
 
@@ -28,16 +29,18 @@ class SignGate(SubModel):
         rate: share of the clean readings that are marked, all signs together.
         floor: values up to which a sign is never large, one for all signs or one for each.
         sign_key: the signs ``[*B, K]``. NaN says nothing.
-        observed_key: the mask ``[*B, 1]`` or ``[*B, O]``; what was not observed before stays so.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of readings that were missing before.
+        out_key: the mask, of the same shape: False where a sign is large, and where a reading was missing before. Let
+            the filter read it, ``observed_key="seen"``.
 
     Raises:
-        ValueError: if a number is out of range.
+        ValueError: if a number is out of range, or both masks have one key.
 
     Example:
         >>> from tensordict import TensorDict
         >>> clean = TensorDict({"signs": torch.linspace(0, 0.5, 1001).unsqueeze(-1)}, [1001])
         >>> gate = SignGate(1, rate=0.01).calibrate([clean])
-        >>> gate(TensorDict({"signs": torch.tensor([[0.2], [0.8]])}, [2]))["observed"].tolist()
+        >>> gate(TensorDict({"signs": torch.tensor([[0.2], [0.8]])}, [2]))["seen"].tolist()
         [[True], [False]]
     """
 
@@ -52,11 +55,12 @@ class SignGate(SubModel):
         floor: float | Sequence[float] = 0.0,
         sign_key: NestedKey = "signs",
         observed_key: NestedKey = "observed",
+        out_key: NestedKey = "seen",
     ):
         check_count("count", count)
         check_number("rate", rate, above=0, below=0.5)
-        super().__init__(nn.Identity(), [sign_key], [observed_key], optional_keys=[observed_key])
-        self.rate = rate
+        super().__init__(nn.Identity(), [sign_key], [out_key], optional_keys=[observed_key])
+        self.rate, self.marks = rate, own_mask(observed_key, out_key)
         self.register_buffer("floor", floors(floor, count))
         self.register_buffer("limits", torch.full((count,), torch.inf))
 

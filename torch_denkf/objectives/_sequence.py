@@ -55,7 +55,7 @@ class SequenceLoss(ReadingsLoss):
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_unmarked_slices(tensordict, self.filter.init_key)
-        return self.filter.sequence(tensordict.copy(), detach_every=self.detach_every)
+        return self.filter.inside(self.filter.sequence(tensordict.copy(), detach_every=self.detach_every))
 
     def _counts(self, tensordict: TensorDictBase) -> Tensor:
         return self.filter.stepped(tensordict)
@@ -63,6 +63,6 @@ class SequenceLoss(ReadingsLoss):
     def _nll(self, tensordict, out):
         key = self.tensor_keys.log_likelihood
         # Of several analyses, each with its own readings, the likelihoods multiply.
-        keys = self.filter.log_likelihood_keys if key == self._AcceptedKeys.log_likelihood else []
+        keys = self.filter.structure.likelihoods if key == self._AcceptedKeys.log_likelihood else []
         first, *others = [self._entry(out, key) for key in keys or [key]]
         return -sum(others, first).squeeze(-1), None

@@ -154,7 +154,7 @@ class DEnKFLoss(SequenceLoss):
         if "smoothed" not in self.weights:
             return super()._run(tensordict)
         refuse_unmarked_slices(tensordict, self.filter.init_key)
-        return self._smoother[0].sequence(tensordict.copy(), detach_every=self.detach_every)
+        return self.filter.inside(self._smoother[0].sequence(tensordict.copy(), detach_every=self.detach_every))
 
     # ------------------------------------------------------------------------------- terms: value and mask [*B, T]
 

@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torch_denkf._arguments import Checked
 from torch_denkf.filters import Filter
 from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.functional.smoothing import check_lag
@@ -17,7 +18,7 @@ from torch_denkf.modules._call import Entries
 __all__ = ["Smoother"]
 
 
-class Smoother(TensorDictModuleBase):
+class Smoother(Checked, TensorDictModuleBase):
     """Filters a sequence ``[*B, T]``, then says what each state looks like given what came later.
 
     It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
@@ -42,7 +43,8 @@ class Smoother(TensorDictModuleBase):
         super().__init__()
         check_lag(lag)
         self.filter, self.lag, self._needed = filter, lag, list(needed)
-        self.smoothed_keys: list[NestedKey] = [("smoothed", name) for name in written]
+        under = () if filter.prefix is None else (filter.prefix,)
+        self.smoothed_keys: list[NestedKey] = [(*under, "smoothed", name) for name in written]
         self.in_keys = list(filter.in_keys)
         self.out_keys = [*filter.out_keys, *self.smoothed_keys]
         self._running: tuple = (None, None)
@@ -77,13 +79,14 @@ class Smoother(TensorDictModuleBase):
         rows, new = as_rows(tensordict, starts_of(tensordict, self.filter.init_key))
         wanted = list(dict.fromkeys([*keep, *self._needed]))
         filter = self._filter_for(rows.batch_size[-1] if rows.ndim else 0)
-        out = filter.sequence(rows.copy(), detach_every=detach_every, keep=wanted)
+        filtered = filter.sequence(rows.copy(), detach_every=detach_every, keep=wanted)
+        out = filter.inside(filtered)
         # A step from the element before: not from a stored belief, as where a slice of a policy's data begins.
         follows = self.filter.stepped(rows)
         if new is not None:
             follows = follows & ~new.reshape(rows.batch_size)
         smoothed = self._smooth({key: out.get(key) for key in out.keys(True, True)}, follows, out)
-        written = {**{key: out.get(key) for key in keep}, **dict(zip(self.smoothed_keys, smoothed, strict=True))}
+        written = {**{key: filtered.get(key) for key in keep}, **dict(zip(self.smoothed_keys, smoothed, strict=True))}
         for key, value in written.items():
             tensordict.set(key, value if rows is tensordict else value.flatten(0, 1))
         return tensordict

@@ -117,7 +117,7 @@ def kind_of(filter: Filter) -> tuple[str, str]:
     """
     if not isinstance(filter, Filter):
         raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
-    carry = [key for key in filter.carry_keys if isinstance(key, tuple) and len(key) == 2]
+    carry = [key for key in filter.structure.carry if isinstance(key, tuple) and len(key) == 2]
     transition = filter.transition_module
     for prefix in dict.fromkeys(key[0] for key in carry):
         names = {key[1] for key in carry if key[0] == prefix}

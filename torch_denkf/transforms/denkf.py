@@ -13,10 +13,13 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
+from torch_denkf._arguments import Checked
 from torch_denkf.filters import Filter, Monitored
-from torch_denkf.filters._checks import refuse_far_belief
+from torch_denkf.filters._checks import refuse_far_belief, refuse_unguarded
+from torch_denkf.filters._entries import own
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
+from torch_denkf.filters._primer import refuse_resets_of_groups
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters._steps import where_rows
@@ -27,7 +30,7 @@ from torch_denkf.transforms._packaged import PackagedRun, Step
 __all__ = ["DEnKFTransform"]
 
 
-class DEnKFTransform(Transform):
+class DEnKFTransform(Checked, Transform):
     """Filters an environment's observations: appends the belief to what the environment emits.
 
     At reset the belief is the filter's initial belief (of the rows that reset; the others keep theirs bit for bit).
@@ -49,7 +52,8 @@ class DEnKFTransform(Transform):
     the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
     belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
     one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
-    groups of agents, the belief is the environment's, and starts anew where any agent does.
+    groups of agents, the belief is the environment's, and starts anew where the environment's own ``done`` says so; an
+    environment without one is refused.
 
     Args:
         filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
@@ -117,21 +121,25 @@ class DEnKFTransform(Transform):
             filter = FixedLag(filter, lag)
         if monitor is not None:
             filter = Monitored(filter, monitor)
-        self._keep = [*filter.belief_keys, *map(unravel_key, diagnostics)]
-        self._reject = filter.reject or not check_finite
-        written = [*filter.out_keys, *([REJECTED] if self._reject else [])]
-        unknown = [key for key in self._keep if key not in written]
+        structure, self._reject = filter.structure, filter.reject or not check_finite
+        if self._reject:
+            refuse_unguarded(filter)
+        written = [*structure.out_keys, *([REJECTED] if self._reject else [])]
+        inner = {filter.outer(key): key for key in written}
+        further = [inner.get(key, key) for key in map(unravel_key, diagnostics)]
+        unknown = [key for key in further if key not in written]
         if unknown:
-            raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {written}.")
-        structure = filter.structure
+            raise KeyError(f"diagnostics {unknown} are not written by the filter; it writes {list(inner)}.")
+        self._keep = [*structure.belief, *further]
         self.store_ensemble, self.no_grad, self.check_finite = store_ensemble, no_grad, check_finite
-        dropped = [] if store_ensemble else [key for key in filter.belief_keys if key[-1] not in ("mean", "var", "age")]
+        dropped = [] if store_ensemble else [key for key in structure.belief if key[-1] not in ("mean", "var", "age")]
         super().__init__(
             in_keys=list(structure.needed),
-            out_keys=[key for key in self._keep if key not in dropped],
+            out_keys=[filter.outer(key) for key in self._keep if key not in dropped],
         )
         self._dropped_keys = dropped
-        self._names = {key: (*key[:-1], "_" + key[-1]) if key in dropped else key for key in self._keep}
+        names = {key: (*key[:-1], "_" + key[-1]) if key in dropped else key for key in self._keep}
+        self._names = {key: filter.outer(key)[:-1] + names[key][-1:] for key in self._keep}
         self.filter = filter
         self._controls, self._optional = list(structure.controls), list(structure.optional)
         if packaged is not None and not no_grad:
@@ -146,7 +154,7 @@ class DEnKFTransform(Transform):
                 )
             self._packaged = PackagedRun(
                 packaged,
-                carry={key: self._names[key] for key in filter.carry_keys},
+                carry={key: self._names[key] for key in structure.carry},
                 controls=self._controls,
                 frames=self.in_keys,
                 optional=self._optional,
@@ -166,7 +174,7 @@ class DEnKFTransform(Transform):
                     self._assert_finite({**_present(next_tensordict, (*self.in_keys, *self._optional)), **kept})
                 return self._emit(kept, next_tensordict)
         entries = {}
-        for key in self.filter.carry_keys:
+        for key in self.filter.structure.carry:
             name = self._names[key]
             value = tensordict.get(name, None)
             if value is None:
@@ -186,33 +194,40 @@ class DEnKFTransform(Transform):
             written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
         if self.check_finite:
             self._assert_finite({**entries, **written})
-        return self._emit(written, next_tensordict)
+        return self._emit(written, next_tensordict, entries.values())
 
-    def _emit(self, written: Mapping[NestedKey, torch.Tensor], next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _emit(
+        self,
+        written: Mapping[NestedKey, torch.Tensor],
+        next_tensordict: TensorDictBase,
+        given: Iterable[torch.Tensor] = (),
+    ) -> TensorDictBase:
+        kept = own({key: written[key] for key in self._names}, given)
         for key, name in self._names.items():
-            next_tensordict.set(name, written[key])
-        mark_up_to_date(written[self.filter.carry_keys[0]])
+            next_tensordict.set(name, kept[key])
+        mark_up_to_date(kept[self.filter.structure.carry[0]])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
             start = first_belief(self.filter, tensordict_reset.copy(), reject=self._reject)
-            if any(start.get(key, None) is None for key in self._keep):
+            lacking = [key for key in self._keep if start.get(self.filter.outer(key), None) is None]
+            if lacking:
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
                 template = self._trial(start.copy())
-                for key in self._keep:
-                    start.set(key, start.get(key, torch.zeros_like(template[key])))
+                for key in lacking:
+                    start.set(self.filter.outer(key), torch.zeros_like(template[key]))
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
         if given and all(value is not None for value in given.values()):
             mask = self._reset_mask(tensordict)
             for key, value in given.items():
-                start.set(key, value if mask is None else where_rows(mask, start.get(key), value))
-            start = self.filter.summarise(start)
+                start.set(key, value.clone() if mask is None else where_rows(mask, start.get(key), value))
+            start = self.filter.summarise(start.exclude(*(key for key in self.filter.belief_keys if key not in given)))
         if self.check_finite:
-            entries = _present(start, (*self.in_keys, *self._optional, *self.filter.carry_keys))
+            entries = self.filter.entries_of(start, one_step=True)
             self._assert_finite(entries, used=self.filter.update_at_reset)
         for key, name in self._names.items():
-            tensordict_reset.set(name, start.get(key))
+            tensordict_reset.set(name, start.get(self.filter.outer(key)))
         return tensordict_reset
 
     def _reset_on_native_autoreset(self, tensordict, tensordict_reset):
@@ -249,8 +264,8 @@ class DEnKFTransform(Transform):
 
     def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
-        refuse_far_belief(entries, self.filter.carry_keys)
-        finite = all(torch.isfinite(entries[key]).all() for key in self.filter.carry_keys)
+        refuse_far_belief(entries, self.filter.structure.carry)
+        finite = all(torch.isfinite(entries[key]).all() for key in self.filter.structure.carry)
         absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:
             return
@@ -291,12 +306,23 @@ class DEnKFTransform(Transform):
             written = self._trial(self.filter.initialise(row))
         for key in keys:
             value = written[key]
-            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+            spec[self.filter.outer(key)] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the belief and the diagnostics."""
+        """Adds the belief and the diagnostics.
+
+        Raises:
+            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone.
+        """
         keys = [key for key in self._keep if key not in self._dropped_keys]
+        refuse_resets_of_groups(self.parent.reset_keys, self.out_keys)
+        taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
+        if taken:
+            raise ValueError(
+                f"The environment emits {taken[0]!r} already, as that of another filter: one would start from the "
+                'belief of the other. Give this filter a name of its own, prefix="imu" for example.'
+            )
         return self._add_specs(observation_spec, keys, observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -304,7 +330,7 @@ class DEnKFTransform(Transform):
         if input_spec.get("full_state_spec", None) is None:
             input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
         observation_spec = self.parent.full_observation_spec.clone()
-        keys = [key for key in self.filter.carry_keys if key not in self._dropped_keys]
+        keys = [key for key in self.filter.structure.carry if key not in self._dropped_keys]
         self._add_specs(input_spec["full_state_spec"], keys, observation_spec)
         return input_spec
 

@@ -111,7 +111,8 @@ class UR5Recipe(ArmRecipe):
 
     def build(self) -> Filter:
         """The whole filter, from pictures on."""
-        parts = OrderedDict(black=BlackIsMissing(), sensor=self.sensor, **self.modules())
+        black = BlackIsMissing(observed_key="arrived", out_key="observed")
+        parts = OrderedDict(black=black, sensor=self.sensor, **self.modules())
         return Filter(parts, initial=self.initial())
 
     def behind(self, model: Filter, *, training: bool = False) -> Filter:

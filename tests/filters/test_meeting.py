@@ -1,0 +1,350 @@
+"""Where two features meet: actions and noise, marks and stored beliefs, divergence and gradients, groups, readings."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.modules import set_recurrent_mode
+from torchrl.modules.utils import get_env_transforms_from_module
+
+from tests.filters.composed import ReplayedFrames
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, stepwise
+from torch_denkf.filters import Filter, KalmanFilter
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel
+from torch_denkf.transforms import DEnKFTransform, LastAction
+
+MEAN = ("belief", "mean")
+
+
+def walk(**kwargs):
+    one = torch.eye(1)
+    return KalmanFilter(one, 0.25 * one, one, one, mean=torch.zeros(1), cov=one, **kwargs)
+
+
+# ------------------------------------------------------------------------------------------- noise that actions drive
+
+
+class DrivenNoise(SubModel):
+    """Variances that grow with the last action."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), ["action"], [("sensor", "noise")])
+
+    def compute(self, action):
+        return 1 + action.square()
+
+
+def driven(place):
+    parts = {
+        "noise": DrivenNoise(),
+        "transition": NoisyLinear(torch.eye(1)),
+        "observation": LinearObservation(torch.eye(1)),
+        "analysis": EnsembleAnalysis("etkf", sensor_key="y"),
+    }
+    order = ["noise", "transition", "observation", "analysis"]
+    order.insert(place, order.pop(0))
+    members = torch.linspace(-1, 1, 8).unsqueeze(-1)
+    return Filter({name: parts[name] for name in order}, initial=FixedEnsemble(members))
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_noise_that_depends_on_the_action_is_no_transition(float64, place):
+    torch.manual_seed(0)
+    filter = driven(place)
+    assert filter.structure.transition[0] == "transition"
+    frames = TensorDict({"y": torch.randn(2, 6, 1), "action": torch.randn(2, 6, 1)}, [2, 6])
+    out = filter.sequence(frames.copy())
+    p = float(filter.initial.members.var())
+    for row in range(2):
+        m, v, means = 0.0, p, [0.0]
+        for t in range(1, 6):
+            r = 1 + float(frames["action"][row, t - 1]) ** 2
+            m, v = m + v / (v + r) * (float(frames["y"][row, t]) - m), v * r / (v + r)
+            means.append(m)
+        assert out[MEAN][row].flatten().tolist() == pytest.approx(means, abs=1e-12)
+    frames["is_init"] = torch.zeros(2, 6, 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = True
+    torch.testing.assert_close(stepwise(filter, frames)[MEAN], out[MEAN], rtol=0, atol=1e-12)
+
+
+class Reads(SubModel):
+    """A transition that reads what another module makes of the action."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("belief", "ensemble"), ("sensor", "noise")], [("forecast", "ensemble")])
+
+    def compute(self, ensemble, variance):
+        return ensemble + variance.unsqueeze(-2)
+
+
+def test_a_transition_behind_a_module_of_the_action_is_refused():
+    parts = dict(driven(0).module.named_children())
+    parts["transition"] = Reads()
+    with pytest.raises(
+        ValueError, match=r"'transition' forecasts the belief and reads .* which 'noise' makes of the act"
+    ):
+        Filter(parts, initial=driven(0).initial)
+
+
+# ------------------------------------------------------------------------------------------------ marks, known beliefs
+
+
+def test_a_mark_at_a_known_belief_goes_on_in_a_step_as_in_a_sequence(float64):
+    """A slice of a policy's data begins with ``is_init``, as SliceSampler marks it, and with the belief before it."""
+    filter = linear_kalman()
+    row = TensorDict({"observation": torch.randn(3, 2)}, [3])
+    row["is_init"] = torch.tensor([[True], [True], [False]])
+    row["previous", "known"] = torch.tensor([[True], [False], [True]])
+    before = filter.initialise(row.copy())
+    for key in filter.carry_keys:
+        row["previous", *key] = before[key] + (1.0 if key[-1] == "mean" else 0.0)
+    step = filter(row.copy())
+    with set_recurrent_mode(True):
+        sequence = filter(row.unsqueeze(-1).copy())[:, 0]
+    for key in filter.out_keys:
+        torch.testing.assert_close(step[key], sequence[key], rtol=0, atol=1e-12)
+    fresh = filter.initialise(row.copy())
+    assert torch.equal(step[MEAN][1], fresh[MEAN][1])
+    assert not torch.equal(step[MEAN][0], fresh[MEAN][0])
+
+
+def test_an_episode_that_diverged_leaves_no_gradient_of_nan(float64):
+    """The belief before the second element is NaN, and the element begins an episode of its own."""
+    filter = linear_denkf(noisy=True)
+    weight = nn.Parameter(filter["transition"].matrix.clone())
+    del filter["transition"].matrix
+    filter["transition"].matrix = weight
+    frames = TensorDict({"observation": torch.randn(2, 4, 2)}, [2, 4])
+    for key in filter.carry_keys:
+        stored = torch.randn(2, 4, 6, 2)
+        stored[0, 2] = torch.nan
+        frames["previous", *key] = stored
+    frames["previous", "known"] = torch.ones(2, 4, 1, dtype=torch.bool)
+    frames["previous", "known"][0, 2] = False
+    frames["is_init"] = torch.zeros(2, 4, 1, dtype=torch.bool)
+    frames["is_init"][0, 2] = True
+    row = frames[:, 2].copy()
+    filter(row)[MEAN].sum().backward()
+    assert weight.grad.isfinite().all()
+    assert weight.grad.abs().sum() > 0
+    weight.grad = None
+    filter.sequence(frames[:, 2:].copy())[MEAN].sum().backward()
+    assert weight.grad.isfinite().all()
+    assert weight.grad.abs().sum() > 0
+
+
+# -------------------------------------------------------------------------------------------- readings in policies
+
+
+@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
+def test_a_policy_refuses_what_is_not_finite(make):
+    frames = TensorDict({"observation": torch.randn(2, 5, 2), "action": torch.zeros(2, 5, 1)}, [2, 5])
+    frames["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+    frames["observation"][1, 3, 0] = torch.nan
+    for reject in (False, True):
+        policy = TensorDictSequential(make(reject=reject), ReplayedFrames(frames).player())
+        env = TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy))
+        if reject:
+            with torch.no_grad():
+                rollout = env.rollout(5, policy)
+            assert rollout[MEAN].isfinite().all()
+            assert rollout["info", "rejected"].sum() == 1
+        else:
+            with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
+                env.rollout(5, policy)
+
+
+@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
+@pytest.mark.parametrize("way", ["step", "sequence", "policy", "transform"])
+def test_readings_of_several_robots_are_not_averaged(make, way):
+    filter = make()
+    frames = TensorDict({"observation": torch.randn(2, 5, 3, 2), "action": torch.zeros(2, 5, 1)}, [2, 5])
+    frames["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+    row = filter.initialise(frames[:, 0].select("is_init").copy()).update(frames[:, 0])
+    run = {
+        "step": lambda: filter.step(row),
+        "sequence": lambda: filter.sequence(frames),
+        "policy": lambda: filter(row.set("previous", row.select("belief"))),
+        "transform": lambda: TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filter)).rollout(3),
+    }
+    with pytest.raises(ValueError, match=r"The reading 'observation' is .* 1 dimension\(s\) too many. Readings of sev"):
+        run[way]()
+
+
+def test_a_group_is_filtered_robot_by_robot(float64):
+    filter = linear_kalman()
+    agents = TensorDict({"observation": torch.randn(2, 3, 5, 2)}, [2, 3, 5])
+    out = filter.sequence(agents.copy())
+    for robot in range(3):
+        alone = filter.sequence(agents[:, robot].copy())
+        torch.testing.assert_close(out[MEAN][:, robot], alone[MEAN], rtol=0, atol=1e-12)
+
+
+# ------------------------------------------------------------------------------------- an analysis of a user's own
+
+
+class Robust(SubModel):
+    """An ensemble update that trusts a reading the less, the further it is from what was predicted."""
+
+    def __init__(self, mask):
+        reads = [("forecast", "ensemble"), ("forecast", "observation"), "observation", ("sensor", "noise")]
+        writes = [("belief", name) for name in ("ensemble", "mean", "var")]
+        super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"] if mask else [])
+        self.reading_keys = self.in_keys[2:]
+        if mask == "named":
+            self.observed_key = "observed"
+
+    def compute(self, forecast, predicted, reading, variance, observed=None):
+        ensemble = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed).ensemble
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
+
+
+def robust(mask, **kwargs):
+    parts = dict(linear_denkf().module.named_children())
+    return Filter({**parts, "analysis": Robust(mask)}, initial=linear_denkf().initial, **kwargs)
+
+
+@pytest.mark.parametrize("mask", [None, "optional"])
+def test_an_analysis_that_does_not_say_its_mask_rejects_nothing_and_is_refused(mask):
+    robust(mask)
+    with pytest.raises(ValueError, match=r"Robust.*self.observed_key = \"observed\""):
+        robust(mask, reject=True)
+    with pytest.raises(ValueError, match="Robust"):
+        DEnKFTransform(robust(mask), check_finite=False)
+
+
+def test_an_analysis_that_says_its_mask_rejects(float64):
+    filter = robust("named", reject=True)
+    frames = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6])
+    frames["observation"][0, 3] = torch.nan
+    seen = frames["observation"].isfinite()
+    out = filter.sequence(frames.copy())
+    expected = robust("named").sequence(frames.copy().set("observed", seen))
+    torch.testing.assert_close(out[MEAN], expected[MEAN], rtol=0, atol=1e-12)
+    assert out["info", "rejected"].sum() == 1  # one for all that an analysis of one's own reads
+
+
+# ------------------------------------------------------------------------------------------- groups that end alone
+
+
+class Groups(EnvBase):
+    """Two robots in two environments; episodes end in the group of robots, and nowhere else."""
+
+    def __init__(self, *, each):
+        super().__init__(batch_size=[2])
+        shape = (2, 2) if each else (2,)
+        self.each, self.now = shape, torch.zeros(2)
+        self.observation_spec = Composite(
+            observation=Unbounded((2, 1)), agents=Composite(x=Unbounded((*shape, 1)), shape=shape), shape=(2,)
+        )
+        done = Composite(done=Binary(1, shape=(*shape, 1), dtype=torch.bool), shape=shape)
+        self.full_done_spec = Composite(agents=done, shape=(2,))
+        self.full_action_spec = Composite(agents=Composite(action=Unbounded((*shape, 1)), shape=shape), shape=(2,))
+        self.full_reward_spec = Composite(agents=Composite(reward=Unbounded((*shape, 1)), shape=shape), shape=(2,))
+
+    def _emit(self, done):
+        agents = TensorDict({"x": self.now.reshape(2, *[1] * len(self.each)).expand(*self.each, 1).clone()}, self.each)
+        agents["done"] = done
+        return TensorDict({"observation": self.now.unsqueeze(-1).clone(), "agents": agents}, [2])
+
+    def _reset(self, tensordict=None, **kwargs):
+        mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
+        rows = torch.ones(2, dtype=torch.bool) if mask is None else mask.reshape(2, -1).any(-1)
+        self.now = torch.where(rows, 0.0, self.now)
+        return self._emit(torch.zeros(*self.each, 1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        self.now = self.now + 10
+        done = torch.zeros(*self.each, 1, dtype=torch.bool)
+        done[0] = self.now[0] == 30
+        out = self._emit(done)
+        out["agents", "reward"] = torch.zeros(*self.each, 1)
+        return out
+
+    def _set_seed(self, seed):
+        return seed
+
+
+@pytest.mark.parametrize("each", [True, False])
+def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
+    with pytest.raises(ValueError, match=r"end in .*agents.* alone, and torchrl then keeps what stands outside"):
+        TransformedEnv(Groups(each=each), DEnKFTransform(walk())).rollout(2)
+    with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
+        TransformedEnv(Groups(each=each), walk().make_tensordict_primer()).rollout(2)
+    with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
+        TransformedEnv(Groups(each=each), LastAction({("agents", "action"): "last"})).rollout(2)
+
+
+def test_a_belief_under_the_name_of_the_group_is_reset_with_it():
+    filter = walk(prefix="agents", observation_key=("agents", "x"))
+    env = TransformedEnv(Groups(each=False), DEnKFTransform(filter))
+    rollout = env.rollout(7, break_when_any_done=False)
+    x, mean = rollout["agents", "x"].squeeze(-1), rollout["agents", "belief", "mean"].squeeze(-1)
+    assert x[0].tolist() == [0, 10, 20, 0, 10, 20, 0]
+    assert mean[0, :3].tolist() == mean[0, 3:6].tolist()
+    assert mean[0, [0, 3, 6]].tolist() == [0, 0, 0]
+    assert (mean[1].diff() > 0).all()
+
+
+# --------------------------------------------------------------------------------------------------------- messages
+
+
+def test_what_is_no_tensordict_is_named():
+    with pytest.raises(TypeError, match=r"KalmanFilter takes a tensordict, or a dictionary .*; got NoneType"):
+        walk().step(None)
+
+
+def test_a_negative_covariance_is_no_divergence():
+    row = walk().initialise(TensorDict({"observation": torch.ones(2, 1)}, [2]))
+    row["belief", "cov"] = torch.full((2, 1, 1), -5.0)
+    with pytest.raises(ValueError, match=r"negative variances in \[\('belief', 'cov'\)\]"):
+        walk().step(row)
+
+
+@pytest.mark.parametrize(
+    "mask", [torch.ones(2, 1), torch.ones(2, 3, dtype=torch.bool), torch.ones(2, dtype=torch.bool)]
+)
+def test_with_reject_a_bad_mask_is_named(mask):
+    filter = linear_kalman(reject=True)
+    row = filter.initialise(TensorDict({"observation": torch.ones(2, 2)}, [2])).set("observed", mask)
+    with pytest.raises(ValueError, match="the mask 'observed' must be"):
+        filter.step(row)
+
+
+def test_a_sensor_that_is_none_is_named_as_the_sensor():
+    parts = dict(linear_denkf().module.named_children())
+    with pytest.raises(TypeError, match=r"^sensor must be a TensorDict module"):
+        Filter({"sensor": torch.nn.Linear(2, 2), **parts}, initial=linear_denkf().initial)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"observed_key": 5}, "observed_key of KalmanFilter is a key"),
+        ({"observation_key": ()}, "observation_key of KalmanFilter is a key"),
+        ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
+        ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
+        ({"reject": "yes"}, "reject of KalmanFilter is True or False"),
+        ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
+        ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),
+    ],
+)
+def test_arguments_are_checked_under_the_name_of_the_class_that_was_called(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        walk(**arguments)
+
+
+def test_a_class_of_a_users_own_checks_its_keys_too():
+    class Own(GaussianPrior):
+        def __init__(self, *, own_key: "tuple[str, ...]" = (), **kwargs):
+            super().__init__([0.0], [1.0], **kwargs)
+
+    with pytest.raises(TypeError, match="out_keys of Own"):
+        Own(out_keys="belief")
+    assert isinstance(TensorDictModule(nn.Identity(), ["a"], ["b"]), nn.Module)
+    with pytest.raises(TypeError, match="trainable of ConstantNoise is True or False"):
+        ConstantNoise([1.0], trainable="no")

@@ -1,0 +1,195 @@
+"""What a filter writes is its own memory, and what it was given is copied."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import TransformedEnv
+
+from tests.filters.factories import linear_denkf
+from tests.filters.test_contract import FILTERS, every_filter, readings
+from tests.transforms.envs_for_tests import base_env
+from torch_denkf.filters import BackpropKF, KalmanFilter
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    FromSensor,
+    GaussianAround,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MomentPrior,
+    SubModel,
+)
+from torch_denkf.transforms import DEnKFTransform
+
+
+def memories(*tensors):
+    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.numel()}
+
+
+def check_apart(filter, written, given):
+    """Every entry that was written lies in memory of its own, and is as large as it looks."""
+    constants = memories(*filter.parameters(), *filter.buffers())
+    inputs, seen = memories(*given.values(True, True)), set()
+    for key in written:
+        value = written[key]
+        if not value.numel():
+            continue
+        place = value.untyped_storage().data_ptr()
+        assert place not in constants, f"{key} is the filter's own"
+        assert place not in inputs, f"{key} is what was given"
+        assert place not in seen, f"{key} shares its memory with another entry"
+        assert value.untyped_storage().nbytes() >= value.numel() * value.element_size(), f"{key} is expanded"
+        seen.add(place)
+
+
+def entries(tensordict, keys):
+    return {key: tensordict[key] for key in keys if tensordict.get(key, None) is not None}
+
+
+@every_filter
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_every_way_to_run_a_filter_writes_memory_of_its_own(float64, name, batch):
+    filter = FILTERS[name]()
+    frames = readings(*batch, 5)
+    first = frames.select("observation", "observed")[..., 0].clone()
+    start = filter.initialise(first.clone())
+    given = first.clone()
+    written = set(start.keys(True, True)) - set(first.keys(True, True))
+    check_apart(filter, entries(filter.initialise(given), written), first)
+    row = start.clone()
+    before = row.copy()
+    check_apart(filter, entries(filter.step(row), filter.out_keys), before)
+    out = filter.sequence(frames.copy())
+    check_apart(filter, entries(out, filter.out_keys), frames)
+    row = frames[..., 1].copy()
+    for key in filter.carry_keys:
+        row["previous", *key] = start[key].clone()
+    before = row.copy()
+    policy = filter(row)
+    keys = [*filter.out_keys, *(("next", "previous", *key) for key in filter.carry_keys)]
+    check_apart(filter, entries(policy, keys), before)
+
+
+def test_a_transform_writes_memory_of_its_own(float64):
+    filter = linear_denkf()
+    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter))
+    reset = env.reset()
+    check_apart(filter, entries(reset, filter.belief_keys), TensorDict({}))
+    row = env.rand_action(reset)
+    before = row.copy()
+    check_apart(filter, entries(env.step(row)["next"], filter.belief_keys), before)
+
+
+def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
+    one = torch.eye(1)
+    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    belief = filter.initialise(TensorDict({}, [3]))
+    belief["belief", "mean"][0] = 7.0
+    belief["belief", "cov"].mul_(100.0)
+    assert belief["belief", "mean"].flatten().tolist() == [7.0, 0.0, 0.0]
+    fresh = filter.initialise(TensorDict({}, [3]))
+    assert fresh["belief", "mean"].flatten().tolist() == [0.0, 0.0, 0.0]
+    assert fresh["belief", "var"].flatten().tolist() == [1.0, 1.0, 1.0]
+    assert one.item() == 1.0
+    step = filter.step(fresh.set("observation", torch.ones(3, 1)))
+    assert torch.allclose(step["belief", "mean"], torch.full((3, 1), 2 / 3))  # gain (1 + 1) / (1 + 1 + 1)
+
+
+def test_a_belief_around_a_state_is_not_that_state():
+    state = torch.tensor([1.0, 2.0])
+    belief = GaussianAround([0.5, 0.5])
+    filter = KalmanFilter(torch.eye(2), torch.eye(2), torch.eye(2), torch.eye(2), mean=state, cov=torch.eye(2))
+    filter.initial = belief
+    row = filter.initialise(TensorDict({"state": state}))
+    row["belief", "mean"].add_(1.0)
+    assert row["state"].tolist() == [1.0, 2.0]
+
+
+# ------------------------------------------------------------------------------------------------------- constructors
+
+MATRIX, VECTOR = (2, 2), (2,)
+#: Constructors, and the shapes of the constants that they take.
+TAKES = {
+    "KalmanFilter": (
+        lambda a, b, c, d, e, f: KalmanFilter(a, b, c, d, mean=e, cov=f),
+        [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
+    ),
+    "BackpropKF": (
+        lambda a, b, c, d, e: BackpropKF(
+            a, b, None, c, ConstantNoise([0.5, 0.5], in_key="observation"), initial=MomentPrior(d, e)
+        ),
+        [MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
+    ),
+    "GaussianPrior": (lambda a, b: GaussianPrior(a, b, ensemble_size=4), [VECTOR, VECTOR]),
+    "AroundState": (lambda a: AroundState(a), [VECTOR]),
+    "FromSensor": (lambda a, b: FromSensor([0], a, b), [VECTOR, VECTOR]),
+    "MomentPrior": (MomentPrior, [VECTOR, MATRIX]),
+    "GaussianAround": (GaussianAround, [VECTOR]),
+    "LinearTransition": (LinearTransition, [MATRIX, MATRIX]),
+    "LinearObservation": (LinearObservation, [MATRIX]),
+    "LearnedObservation": (lambda a, b: LearnedObservation(nn.Identity(), loc=a, scale=b), [VECTOR, VECTOR]),
+    "LearnedTransition": (lambda a, b: LearnedTransition(nn.Identity(), loc=a, scale=b), [VECTOR, VECTOR]),
+}
+
+
+@pytest.mark.parametrize("name", TAKES)
+@pytest.mark.parametrize("kind", ["tensor", "array"])
+def test_constructors_copy_what_they_are_given(name, kind):
+    make, shapes = TAKES[name]
+    values = [torch.eye(2) if shape == MATRIX else torch.ones(2) for shape in shapes]
+    given = values if kind == "tensor" else [value.numpy() for value in values]
+    module = make(*given)
+    before = {key: value.clone() for key, value in module.state_dict().items()}
+    for value in given:
+        value *= 100
+    after = module.state_dict()
+    assert before
+    for key, value in before.items():
+        assert torch.equal(after[key], value), key
+
+
+def test_one_matrix_for_all_is_four_matrices():
+    one = torch.eye(1)
+    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    buffers = dict(filter.named_buffers())
+    assert len(memories(*buffers.values())) == len(buffers) == 6
+
+
+def test_a_parameter_that_would_not_be_trained_is_refused():
+    learned = nn.Parameter(torch.eye(2))
+    with pytest.raises(TypeError, match="matrix requires a gradient, and would be copied into a constant"):
+        LinearObservation(learned)
+    transition = LinearTransition(learned, torch.eye(2), trainable=True)
+    assert isinstance(transition.matrix, nn.Parameter)
+    assert transition.matrix is not learned
+
+
+def test_numpy_arrays_behind_a_prior():
+    mean = np.zeros(2, dtype=np.float32)
+    prior = GaussianPrior(mean, [1.0, 1.0], ensemble_size=8)
+    mean[0] = 9.0
+    assert prior.mean.tolist() == [0.0, 0.0]
+
+
+class Foreign(SubModel):
+    """An initial belief of a user's own that hands out its constants."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [], [("belief", name) for name in ("ensemble", "mean", "var")])
+        self.register_buffer("members", torch.arange(12.0).reshape(6, 2))
+        self.ensemble_size, self.state_dim = 6, 2
+
+    def compute(self, *, batch_size):
+        return tuple(x.expand(*batch_size, *x.shape) for x in (self.members, self.members[0], self.members[1]))
+
+
+def test_an_initial_belief_of_a_users_own_may_hand_out_its_constants():
+    filter = linear_denkf(initial=Foreign())
+    row = filter.initialise(TensorDict({}, []))
+    row["belief", "ensemble"].zero_(), row["belief", "mean"].zero_()
+    assert filter.initial.members.flatten().tolist() == list(range(12))

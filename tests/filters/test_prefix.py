@@ -1,0 +1,210 @@
+"""A name in front of all that a filter writes: two filters side by side, one behind the other. Oracle: each alone."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import TransformedEnv
+from torchrl.modules import set_recurrent_mode
+from torchrl.modules.utils import get_env_transforms_from_module
+
+from tests.filters.composed import ReplayedFrames
+from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.test_contract import FILTERS, every_filter, readings
+from torch_denkf.deployment import export_step, load_step
+from torch_denkf.filters import EKF, FusedFilter, FusedSensor, Gated, KalmanFilter, Monitored
+from torch_denkf.modules import InnovationMonitor, LinearTransition, MomentPrior, MonitoredSensor, Select
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss
+from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
+from torch_denkf.transforms import DEnKFTransform
+
+MEAN, VAR = ("belief", "mean"), ("belief", "var")
+
+
+def named(name, prefix="imu"):
+    """A filter of the contract's table, twice: without and with a prefix, under one noise."""
+    plain, other = FILTERS[name](), FILTERS[name]()
+    other.prefix = prefix
+    other._sort()
+    frames = plain.draw_noise(readings(3, 6))
+    return plain, other, frames
+
+
+def moved(frames, prefix="imu"):
+    """The same frames, the noise under the prefix."""
+    out = frames.copy()
+    if out.get("noise", None) is not None:
+        out[prefix] = TensorDict({"noise": out.pop("noise")}, out.batch_size)
+    return out
+
+
+@every_filter
+def test_a_prefix_changes_names_and_nothing_else(float64, name):
+    plain, other, frames = named(name)
+    expected, out = plain.sequence(frames.copy()), other.sequence(moved(frames))
+    assert other.out_keys == [("imu", *key) for key in plain.out_keys]
+    for key in plain.out_keys:
+        torch.testing.assert_close(out["imu", *key], expected[key], rtol=0, atol=1e-12)
+    assert set(out.keys()) == set(moved(frames).keys()) | {"imu"}
+    row = frames[:, 2].copy()
+    step = plain.step(row.copy().update(expected[:, 1].select(*plain.carry_keys)))
+    own = other.step(moved(row).update(out[:, 1].select(*other.carry_keys)))
+    for key in plain.out_keys:
+        torch.testing.assert_close(own["imu", *key], step[key], rtol=0, atol=1e-12)
+
+
+def walk(**kwargs):
+    """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
+    one = torch.eye(1)
+    return KalmanFilter(one, 0.25 * one, one, one, mean=torch.zeros(1), cov=one, **kwargs)
+
+
+def by_hand(readings, q=0.25, r=1.0):
+    """A scalar Kalman filter ``[T]``; the first element is its prior."""
+    means, m, p = [0.0], 0.0, 1.0
+    for y in readings[1:]:
+        p += q
+        m, p = m + p / (p + r) * (y - m), p * r / (p + r)
+        means.append(m)
+    return means
+
+
+def frames_of(first, second):
+    frames = TensorDict({"first": first, "second": second}, first.shape[:2])
+    frames["is_init"] = torch.zeros(*first.shape[:2], 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = True
+    return frames.set("action", torch.zeros(*first.shape[:2], 1))
+
+
+@pytest.mark.parametrize("way", ["transforms", "policy"])
+def test_two_filters_of_one_environment(float64, way):
+    torch.manual_seed(0)
+    frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
+    filters = [walk(observation_key="first"), walk(observation_key="second", prefix="imu")]
+    env = ReplayedFrames(frames)
+    if way == "transforms":
+        for filter in filters:
+            env = TransformedEnv(env, DEnKFTransform(filter))
+        policy = None
+    else:
+        policy = TensorDictSequential(*filters, ReplayedFrames(frames).player())
+        env = TransformedEnv(env, get_env_transforms_from_module(policy))
+    with torch.no_grad():
+        out = env.rollout(6, policy, break_when_any_done=False)
+    for key, source in ((MEAN, "first"), (("imu", *MEAN), "second")):
+        for row in range(2):
+            expected = by_hand(frames[source][row].flatten().tolist())
+            assert out[key][row].flatten().tolist() == pytest.approx(expected, abs=1e-12)
+    if way == "policy":
+        with set_recurrent_mode(True):
+            data = out.select("first", "second", "is_init", "previous", "imu").exclude(("imu", "belief"))
+            again = TensorDictSequential(*filters)(data)
+        for key in (MEAN, ("imu", *MEAN)):
+            torch.testing.assert_close(again[key], out[key], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("way", ["transforms", "policy"])
+def test_two_filters_of_one_name_are_refused(way):
+    frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
+    filters = [walk(observation_key="first"), walk(observation_key="second")]
+    if way == "transforms":
+        env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filters[0]))
+        with pytest.raises(ValueError, match=r"emits \('belief', 'mean'\) already.*prefix="):
+            TransformedEnv(env, DEnKFTransform(filters[1])).rollout(3)
+        return
+    policy = TensorDictSequential(*filters, ReplayedFrames(frames).player())
+    with pytest.raises(ValueError, match=r"carries \('previous', 'belief', '\w+'\) already.*prefix="):
+        TransformedEnv(ReplayedFrames(frames), get_env_transforms_from_module(policy)).rollout(3, policy)
+
+
+def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
+    one, two = walk(), walk()
+    row = TensorDict({"observation": torch.ones(1)}, [])
+    row = one(row.set(("previous", *MEAN), torch.zeros(1)).set(("previous", "belief", "cov"), torch.eye(1)))
+    following = row["next"].set("observation", torch.ones(1))
+    with pytest.warns(UserWarning, match="a belief that another filter wrote"):
+        two(following.copy())
+
+
+def test_the_belief_of_one_is_the_reading_of_another(float64):
+    torch.manual_seed(0)
+    reading = torch.randn(2, 8, 1)
+    first, second = walk(prefix="inner"), walk(observation_key=("inner", *MEAN))
+    out = TensorDictSequential(first, second)
+    data = TensorDict({"observation": reading}, [2, 8])
+    with set_recurrent_mode(True):
+        out = out(data)
+    for row in range(2):
+        inner = by_hand(reading[row].flatten().tolist())
+        assert out["inner", "belief", "mean"][row].flatten().tolist() == pytest.approx(inner, abs=1e-12)
+        assert out["belief", "mean"][row].flatten().tolist() == pytest.approx(by_hand(inner), abs=1e-12)
+
+
+def test_filters_around_filters_keep_the_prefix(float64):
+    frames = TensorDict({"observation": torch.randn(2, 7, 2)}, [2, 7])
+    monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)}).double()
+    for build in (lambda f: FixedLag(f, 2), lambda f: Gated(f, 2), lambda f: Monitored(f, monitor)):
+        plain, other = build(linear_kalman()), build(linear_kalman(prefix="imu"))
+        assert other.out_keys == [("imu", *key) for key in plain.out_keys]
+        out, expected = other.sequence(frames.copy()), plain.sequence(frames.copy())
+        for key in plain.out_keys:
+            assert torch.equal(out["imu", *key], expected[key])
+
+
+@pytest.mark.parametrize("make", [lambda **k: RTSSmoother(linear_kalman(**k)), lambda **k: EnRTS(linear_denkf(**k))])
+def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
+    torch.manual_seed(0)
+    frames = TensorDict({"observation": torch.randn(2, 7, 2), "state": torch.randn(2, 7, 2)}, [2, 7])
+    plain, other = make(), make(prefix="imu")
+    out, expected = other.sequence(frames.copy()), plain.sequence(frames.copy())
+    for name in ("mean", "var"):
+        assert torch.equal(out["imu", "smoothed", name], expected["smoothed", name])
+    loss = GaussianLoss if isinstance(plain, RTSSmoother) else DEnKFLoss
+    named_loss, plain_loss = (loss(smoother.filter, nll=1.0)(frames) for smoother in (other, plain))
+    assert dict(named_loss.items()) == dict(plain_loss.items())
+    assert named_loss["loss_nll"] != 0
+
+
+def test_fused_filter_and_a_packaged_step_with_a_prefix(float64, tmp_path):
+    def make(**kwargs):
+        sensors = {"gps": FusedSensor(Select([0]), [0.5], delay=2), "wheel": FusedSensor(Select([1]), [0.3])}
+        motion = LinearTransition(torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2))
+        return FusedFilter(motion, sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)), **kwargs)
+
+    frames = TensorDict({"gps": torch.randn(3, 6, 1), "wheel": torch.randn(3, 6, 1)}, [3, 6])
+    plain, other = make(), make(prefix="base")
+    expected, out = plain.sequence(frames.copy()), other.sequence(frames.copy())
+    for key in plain.out_keys:
+        assert torch.equal(out["base", *key], expected[key])
+    example = other.initialise(frames[:, 0].copy())
+    step = load_step(export_step(other, example, tmp_path / "step.pt2", compiled=False))
+    entries = {".".join(key): example["base", *key] for key in plain.carry_keys}
+    got = step({**entries, "gps": frames["gps"][:, 1], "wheel": frames["wheel"][:, 1]})
+    # A late reading of before the episode: the second element of the sequence is this step.
+    torch.testing.assert_close(got["belief.mean"], expected["belief", "mean"][:, 1])
+
+
+def test_an_ekf_with_a_prefix_compiles(float64):
+    from tests.filters.gaussian_for_tests import linear_filter
+
+    plain, other = linear_filter("EKF"), linear_filter("EKF", prefix="imu")
+    assert isinstance(other, EKF)
+    frames = readings(3, 5)
+    expected = plain.sequence(frames.copy())
+    out = other.compile(chunk=2, backend="eager").sequence(frames.copy())
+    for key in plain.out_keys:
+        torch.testing.assert_close(out["imu", *key], expected[key], rtol=0, atol=1e-12)
+
+
+def test_a_prefix_is_a_name():
+    with pytest.raises(TypeError, match="prefix of KalmanFilter is a name"):
+        walk(prefix=3)
+
+
+def test_foreign_modules_read_what_stands_under_a_prefix():
+    filter = walk(prefix="imu")
+    double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])
+    data = TensorDict({"observation": torch.ones(4, 1)}, [4])
+    with set_recurrent_mode(True):
+        out = TensorDictSequential(filter, double)(data)
+    assert torch.equal(out["doubled"], 2 * out["imu", "belief", "mean"])

@@ -1,0 +1,133 @@
+"""An entry that a module both reads and writes is carried, or refused; a mask that nobody reads is refused."""
+
+import inspect
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+
+import torch_denkf.modules
+from tests.filters.factories import FixedEnsemble, NoisyLinear
+from tests.filters.test_contract import FILTERS, every_filter
+from torch_denkf.filters import Filter
+from torch_denkf.modules import (
+    BlackIsMissing,
+    ConstantNoise,
+    EnsembleAnalysis,
+    LinearObservation,
+    SignGate,
+    SubModel,
+    VectorSensor,
+)
+from torch_denkf.modules._running import reads_of, writes
+
+
+@every_filter
+def test_what_is_read_and_written_is_carried(name):
+    filter = FILTERS[name]()
+    modules = [module for _, module in filter.structure.modules]
+    needed, optional = reads_of(modules)
+    both = {*needed, *optional}.intersection(key for module in modules for key in writes(module))
+    assert both <= set(filter.structure.carry)
+
+
+def camera(*front, observed_key="observed", initial=None):
+    """A filter whose reading is the mean of a picture, with modules in front."""
+    return Filter(
+        {
+            **dict(front),
+            "sensor": VectorSensor(4, 1, ensemble_size=6, layer="none", in_key="flat"),
+            "noise": ConstantNoise([0.5]),
+            "transition": NoisyLinear(torch.eye(1)),
+            "observation": LinearObservation(torch.eye(1)),
+            "analysis": EnsembleAnalysis("etkf", observed_key=observed_key),
+        },
+        initial=FixedEnsemble(torch.linspace(-1, 1, 6).unsqueeze(-1)) if initial is None else initial,
+    )
+
+
+class Count(SubModel):
+    """How many frames came, in an entry of its own."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), ["flat", "count"], ["count"])
+
+    def compute(self, flat, count):
+        return count + 1
+
+
+class Counted(FixedEnsemble):
+    """An initial belief with the count at the start of an episode."""
+
+    def __init__(self, members):
+        super().__init__(members)
+        self.out_keys = [*self.out_keys, "count"]
+
+    def compute(self, *, batch_size):
+        return *super().compute(batch_size=batch_size), torch.zeros(*batch_size, 1)
+
+
+def test_a_module_of_a_users_own_that_reads_what_it_writes_is_refused():
+    with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
+        camera(("count", Count()))
+    tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])
+    with pytest.raises(ValueError, match=r"'tally' .*writes 'count'"):
+        camera(("tally", TensorDictSequential(tally)))
+
+
+def test_what_the_initial_belief_writes_is_carried():
+    filter = camera(("count", Count()), initial=Counted(torch.linspace(-1, 1, 6).unsqueeze(-1)))
+    frames = TensorDict({"flat": torch.randn(2, 5, 4)}, [2, 5])
+    assert filter.sequence(frames)["count"][..., 0].tolist() == [[0, 1, 2, 3, 4]] * 2
+
+
+@pytest.mark.parametrize("make", [BlackIsMissing, lambda: SignGate(2)])
+def test_a_mask_that_nobody_reads_is_refused(make):
+    with pytest.raises(ValueError, match="marks readings as missing in 'seen', which no module of the filter reads"):
+        camera(("front", make()))
+    assert camera(("front", make()), observed_key="seen").structure.optional
+
+
+def masks():
+    """The library's modules that make a mask of a mask."""
+    for name in torch_denkf.modules.__all__:
+        kind = getattr(torch_denkf.modules, name)
+        if inspect.isclass(kind) and "marks" in inspect.getsource(kind):
+            yield name
+
+
+def test_the_modules_that_make_masks_are_known():
+    assert sorted(name for name in masks() if name != "SubModel") == ["BlackIsMissing", "SignGate"]
+
+
+@pytest.mark.parametrize("way", ["loop", "dictionary", "policy", "sequence"])
+def test_one_black_picture_hides_one_reading(float64, way):
+    """The oracle: the same pictures, and a mask written by hand."""
+    torch.manual_seed(0)
+    flat = torch.rand(2, 7, 4)
+    flat[0, 2], flat[1, 4] = 0.0, 0.0
+    frames = TensorDict({"flat": flat, "pixels": flat.reshape(2, 7, 1, 2, 2)}, [2, 7])
+    torch.manual_seed(1)
+    expected = camera().sequence(frames.copy().set("observed", flat.amax(-1, keepdim=True) > 0))
+    torch.manual_seed(1)
+    filter = camera(("black", BlackIsMissing()), observed_key="seen")
+    assert (expected["belief", "mean"][0, 2] - expected["belief", "mean"][0, 1]).abs() < 1e-12, "it was hidden"
+    assert (expected["belief", "mean"][0, 3:] - expected["belief", "mean"][0, 2:-1]).abs().min() > 1e-6
+    if way == "sequence":
+        out = filter.sequence(frames)["belief", "mean"]
+    else:
+        row, rows = filter.initialise(frames[:, 0].copy()), []
+        rows.append(row["belief", "mean"])
+        for t in range(1, 7):
+            if way == "policy":
+                now = row.copy().update(frames[:, t])  # what a step wrote stays there, as in torchrl's rollouts
+                for key in filter.carry_keys:
+                    now["previous", *key] = row[key]
+                row = filter(now)
+            else:
+                row = filter.step(row.update(frames[:, t]))
+            rows.append(row["belief", "mean"].clone())
+        out = torch.stack(rows, 1)
+    torch.testing.assert_close(out, expected["belief", "mean"], rtol=0, atol=1e-12)

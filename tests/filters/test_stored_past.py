@@ -1,0 +1,85 @@
+"""A stored belief with a past starts a sequence or an episode again. Oracle: the run that it was taken from."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+
+from tests.filters.composed import ReplayedFrames
+from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.gaussian_for_tests import linear_filter
+from tests.filters.test_contract import fused
+from torch_denkf.smoothers import FixedLag
+from torch_denkf.smoothers.iterated import IEnKS
+from torch_denkf.transforms import DEnKFTransform
+
+FILTERS = {
+    "ensemble": lambda: FixedLag(linear_denkf(), 3),
+    "Kalman": lambda: FixedLag(linear_kalman(), 3),
+    "UKF": lambda: FixedLag(linear_filter("UKF"), 2),
+    "fused, late": lambda: fused("ensemble", late=True),
+    "fused Kalman, late": lambda: fused("Kalman", late=True),
+}
+every = pytest.mark.parametrize("name", FILTERS)
+
+
+def run(name):
+    torch.manual_seed(0)
+    filter = FILTERS[name]()
+    frames = filter.draw_noise(TensorDict({"observation": torch.randn(2, 9, 2)}, [2, 9]))
+    return filter, frames, filter.sequence(frames.copy())
+
+
+@every
+@pytest.mark.parametrize("begin", [1, 5])
+def test_a_sequence_goes_on_from_the_middle(float64, name, begin):
+    filter, frames, whole = run(name)
+    rest = frames[:, begin:].copy()
+    for key in filter.belief_keys:
+        rest[key] = whole[key][:, begin:]
+    out = filter.sequence(rest)
+    for key in filter.belief_keys:
+        torch.testing.assert_close(out[key], whole[key][:, begin:], rtol=0, atol=1e-12)
+    assert not torch.equal(whole["smoothed", "mean"][:, -1], whole["belief", "mean"][:, -1])
+
+
+@every
+def test_what_was_smoothed_follows_from_the_past(float64, name):
+    filter, frames, whole = run(name)
+    rest = frames[:, 4:].copy()
+    for key in filter.carry_keys:
+        rest[key] = whole[key][:, 4:]
+    out = filter.sequence(rest)
+    for key in filter.belief_keys:
+        torch.testing.assert_close(out[key], whole[key][:, 4:], rtol=0, atol=1e-12)
+
+
+@every
+def test_an_environment_starts_from_a_stored_belief(float64, name):
+    filter, frames, whole = run(name)
+    rest = frames[:, 4:].exclude("noise").copy()
+    rest["action"] = torch.zeros(2, 5, 1)
+    rest["is_init"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+    env = TransformedEnv(ReplayedFrames(rest), DEnKFTransform(filter))
+    stored = whole[:, 4].select(*filter.belief_keys).clone()
+    reset = env.reset(stored.clone())
+    for key in filter.belief_keys:
+        torch.testing.assert_close(reset[key], stored[key], rtol=0, atol=1e-12)
+
+
+def test_an_iterated_smoother_goes_on_too(float64):
+    plain = linear_denkf()
+    parts = [plain["transition"], None, plain["observation"], plain["noise"]]
+    filter = IEnKS(*parts, initial=plain.initial, observation_key="observation", process_noise=[0.0, 0.0])
+    frames = TensorDict({"observation": torch.randn(2, 8, 2)}, [2, 8])
+    whole = filter.sequence(frames.copy())
+    rest = frames[:, 4:].copy()
+    for key in filter.belief_keys:
+        rest[key] = whole[key][:, 4:]
+    out = filter.sequence(rest)
+    for key in filter.belief_keys:
+        torch.testing.assert_close(out[key], whole[key][:, 4:], rtol=0, atol=1e-10)
+    for key in filter.carry_keys:
+        rest = frames[:, 4:].copy().set(key, whole[key][:, 4:])
+    with pytest.raises(KeyError, match=r"\('smoothed', 'ensemble'\) does not follow .* store it beside the belief"):
+        filter.sequence(rest)
