@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -131,7 +131,7 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
     )
 
 
-def refuse_far_belief(entries: Entries, keys: Collection[NestedKey]) -> None:
+def refuse_far_belief(entries: Mapping[NestedKey, Tensor], keys: Collection[NestedKey]) -> None:
     """Raises a ``ValueError`` where a belief that is given has numbers whose squares leave float32."""
     far = [key for key in keys if key in entries and _is_far(entries[key])]
     if far:

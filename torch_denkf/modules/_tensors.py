@@ -29,8 +29,8 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
     """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
 
     Raises:
-        TypeError: if it is neither a tensor nor numbers, if it is complex, or if it requires a gradient, which would get
-            lost; ``name`` is the argument's.
+        TypeError: if it is neither a tensor nor numbers, or complex, or requires a gradient, which would get lost;
+            ``name`` is the argument's.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
