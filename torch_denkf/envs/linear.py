@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number, check_shape, check_square, check_values
 
 __all__ = ["LinearGaussianEnv"]
@@ -26,7 +27,7 @@ def _constant(name: str, value: torch.Tensor | Sequence) -> torch.Tensor:
     return constant
 
 
-class LinearGaussianEnv(EnvBase):
+class LinearGaussianEnv(Checked, EnvBase):
     r"""Simulates :math:`x_{t+1} = F x_t + B a_t + N(0, Q)`, :math:`y_t = H x_t + N(0, R)`.
 
     Emits ``"state"`` ``[*B, S]`` (the truth), ``"observation"`` ``[*B, O]`` and ``"observed"`` ``[*B, 1]``; readings

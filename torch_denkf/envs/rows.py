@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count
 
 __all__ = ["RowsEnv"]
@@ -17,7 +18,7 @@ __all__ = ["RowsEnv"]
 _FLAGS = ("is_init", "done", "terminated", "truncated")
 
 
-class RowsEnv(EnvBase):
+class RowsEnv(Checked, EnvBase):
     """Shows rows of a recording in lockstep, each element of the batch its own stretch of them.
 
     A stretch is truncated in its last row; a reset starts new stretches where ``"_reset"`` marks it. Rewards are zero.

@@ -55,7 +55,9 @@ def guards_of(
         mask = getattr(part, "observed_key", None)
         if mask is not None and _readings(part):
             mask = unravel_key(mask)
-            readers.setdefault(made_of.get(mask, mask), []).append(part)
+            while mask in made_of:
+                mask = made_of[mask]
+            readers.setdefault(mask, []).append(part)
     guards = []
     for mask, sharing in readers.items():
         whole: dict[NestedKey, None] = {}

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import in_sequences, reads, reads_of, writes
+from torch_denkf.modules._running import in_sequences, marks_of, reads, reads_of, writes
 
 __all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
 
@@ -230,14 +230,14 @@ def _refuse_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules:
 
 def _refuse_unread_masks(modules: Sequence[Placed]) -> None:
     """Raises where a module marks readings as missing, and no module looks at its mask."""
-    parts = [part for _, module in modules for part in submodels(module)]
     read = {key for _, module in modules for key in chain(*reads(module))}
-    for part in parts:
-        if part.marks is not None and part.marks not in read:
-            raise ValueError(
-                f"{type(part).__name__} marks readings as missing in {part.marks!r}, which no module of the filter "
-                f"reads: give observed_key={part.marks!r} to the filter or its analysis."
-            )
+    for place, module in modules:
+        for key in marks_of(module):
+            if key not in read:
+                raise ValueError(
+                    f"{place!r} ({type(module).__name__}) marks readings as missing in {key!r}, which no module of the "
+                    f"filter reads: give observed_key={key!r} to the filter or its analysis."
+                )
 
 
 def _forecasts(
@@ -318,13 +318,13 @@ def _guards(
             if not found.keys().isdisjoint(writes(module)):
                 found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
-    return guards_of(_in_front(parts, sources), sources, _made_of(parts))
+    return guards_of(_in_front(parts, sources), sources, _made_of(frames, parts))
 
 
-def _made_of(parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
+def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
     """The mask that each mask is made of, where a part reads one and writes another: hidden is what the first hides."""
     masks = {unravel_key(part.observed_key) for part in parts if getattr(part, "observed_key", None) is not None}
-    found = {}
+    found = {made: given for _, module in frames for made, given in marks_of(module).items()}
     for part in parts:
         own = getattr(part, "observed_key", None)
         if own is not None:

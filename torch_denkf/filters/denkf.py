@@ -25,7 +25,7 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
-from torch_denkf.modules._running import check_module
+from torch_denkf.modules._running import check_module, in_sequences, writes
 
 __all__ = ["DEnKF"]
 
@@ -102,7 +102,10 @@ class DEnKF(Filter):
         if analysis is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
-            reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
+            reading = observation_key
+            if sensor is not None and observation_key is None:
+                *_, last = in_sequences(sensor)
+                reading = writes(last)[0]
             mask = "observed" if observed_key is None else observed_key
             keys = {"sensor_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)

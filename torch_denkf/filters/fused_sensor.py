@@ -10,7 +10,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.modules import ConstantNoise, Renamed
-from torch_denkf.modules._running import writes
+from torch_denkf.modules._running import in_sequences, marks_of, writes
 
 __all__ = ["FusedSensor", "Wired", "wire"]
 
@@ -29,7 +29,8 @@ class FusedSensor:
             is in the data.
         reading: its key in the data, ``[*B, O]``; by default the sensor's name.
         observed: its mask, ``[*B, 1]`` or ``[*B, O]``, True where there is a reading; by default NAME_observed. A
-            sensor with a lower rate than the filter's has it True in every n-th step.
+            sensor with a lower rate than the filter's has it True in every n-th step. Where ``sensor`` makes a mask of
+            it, as :class:`~torch_denkf.modules.BlackIsMissing` does, the update reads that one.
         delay: by how many steps its readings come late. Each then corrects the state that it belongs to, and through
             the covariances all since.
         late: key of an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
@@ -73,8 +74,10 @@ def wire(name: str, sensor: FusedSensor) -> Wired:
     else:
         for key in writes(sensor.sensor):
             names[key] = ("sensor", name, key if isinstance(key, str) else key[-1])
-        reading = names[unravel_key(sensor.sensor.out_keys[0])]
+        *_, last = in_sequences(sensor.sensor)
+        reading = names[writes(last)[0]]
         modules[f"{name}_sensor"] = Renamed(sensor.sensor, names)
+        observed = next((names[key] for key in marks_of(sensor.sensor)), observed)
     own = ("sensor", name, "noise")
     noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
     names[writes(noise)[0]] = own

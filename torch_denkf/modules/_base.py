@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -34,7 +35,7 @@ class SubModel(Checked, TensorDictModule):
     Attributes:
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
             for one tensor without a name of its own.
-        marks: the mask that the sub-model makes where it finds readings that are missing; ``None`` if it makes none.
+        marks: masks that the sub-model makes where it finds readings that are missing, and the masks it makes them of.
 
     Example:
         >>> from tensordict import TensorDict
@@ -57,7 +58,7 @@ class SubModel(Checked, TensorDictModule):
 
     else:
         noise_names = ()
-    marks: NestedKey | None = None
+    marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):

@@ -16,6 +16,7 @@ __all__ = [
     "check_module",
     "check_network",
     "in_sequences",
+    "marks_of",
     "named_modules_of",
     "random_parts",
     "reads",
@@ -127,6 +128,12 @@ def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]
             yield from in_sequences(part)
     else:
         yield module
+
+
+def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
+    """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
+    parts = [part for part in in_sequences(module) if isinstance(part, SubModel)]
+    return {made: given for part in parts for made, given in part.marks.items()}
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:

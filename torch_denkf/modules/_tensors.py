@@ -16,8 +16,8 @@ __all__ = [
     "as_standard_deviations",
     "as_vector",
     "check_dims",
+    "mask_of",
     "mean_of_members",
-    "own_mask",
     "register_constant",
     "register_location",
     "register_scale",
@@ -154,17 +154,18 @@ def variance_and_floor(
     return variance - floor, floor.clone()
 
 
-def own_mask(observed_key: NestedKey, out_key: NestedKey) -> NestedKey:
-    """The key of a mask that a module makes of another one, unravelled.
+def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, NestedKey]:
+    """A mask that a module makes, and that of which it makes it, unravelled.
 
     Raises:
         ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
     """
-    if unravel_key(observed_key) == unravel_key(out_key):
+    given, made = unravel_key(observed_key), unravel_key(out_key)
+    if given == made:
         raise ValueError(
             f"out_key must differ from observed_key, {observed_key!r}: one black picture would hide all that follow"
         )
-    return unravel_key(out_key)
+    return {made: given}
 
 
 def mean_of_members(value: Tensor, batch_size: Sequence[int]) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_number
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._tensors import own_mask
+from torch_denkf.modules._tensors import mask_of
 
 __all__ = ["BlackIsMissing"]
 
@@ -46,7 +46,7 @@ class BlackIsMissing(SubModel):
     ):
         check_number("threshold", threshold, least=0, most=1)
         super().__init__(nn.Identity(), [image_key], [out_key], optional_keys=[observed_key])
-        self.threshold, self.marks = threshold, own_mask(observed_key, out_key)
+        self.threshold, self.marks = threshold, mask_of(observed_key, out_key)
 
     def compute(self, pixels: Tensor, before: Tensor | None = None) -> Tensor:
         """The mask ``[*B, 1]``."""

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_mask
 from torch_denkf.functional import mean_observation
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import check_module, reads, run_module, writes
+from torch_denkf.modules._running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.modules.past import InPlaceOf
 
 __all__ = ["JoinedObservation", "JoinedReading", "Renamed", "StateObservation"]
@@ -42,6 +42,7 @@ class Renamed(InPlaceOf):
         new = [[names.get(key, key) for key in group] for group in (needed, writes(module), optional)]
         super().__init__(module, new[0], new[1], optional_keys=new[2])
         self.names = names
+        self.marks = {names.get(made, made): names.get(key, key) for made, key in marks_of(module).items()}
 
     def noise_sizes(self, *values):
         """Those of the module inside."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._calibration import sign_limits
-from torch_denkf.modules._tensors import own_mask
+from torch_denkf.modules._tensors import mask_of
 
 __all__ = ["SignGate"]
 
@@ -60,7 +60,7 @@ class SignGate(SubModel):
         check_count("count", count)
         check_number("rate", rate, above=0, below=0.5)
         super().__init__(nn.Identity(), [sign_key], [out_key], optional_keys=[observed_key])
-        self.rate, self.marks = rate, own_mask(observed_key, out_key)
+        self.rate, self.marks = rate, mask_of(observed_key, out_key)
         self.register_buffer("floor", floors(floor, count))
         self.register_buffer("limits", torch.full((count,), torch.inf))
 

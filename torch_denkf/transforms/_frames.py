@@ -10,10 +10,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
+from torch_denkf._arguments import Checked
+
 CHUNK = 2**20  # values in work at a time: 4 MB in float32
 
 
-class FrameTransform(Transform):
+class FrameTransform(Checked, Transform):
     """Does something to frames, each with probability ``p``, in an environment (steps, resets) and in data.
 
     Subclasses write ``_call``. Data are never changed themselves: :meth:`forward` works on a shallow copy, since a

@@ -10,6 +10,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torch_denkf import vision
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_number
 from torch_denkf.modules._tensors import as_floating
 from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
@@ -17,7 +18,7 @@ from torch_denkf.vision import FLOW_SHAPE, KITTI_HEIGHT, ROAD_SHAPE
 __all__ = ["OpticalFlow"]
 
 
-class OpticalFlow(Transform):
+class OpticalFlow(Checked, Transform):
     """Adds what :class:`torch_denkf.modules.FlowSensor` reads, from a frame and its difference to the one before.
 
     It keeps nothing between steps: the frame before is the frame less the difference, as

@@ -8,12 +8,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from torch_denkf._arguments import Checked
 from torch_denkf.filters._steps import where_rows
 
 __all__ = ["HoldReading"]
 
 
-class HoldReading(Transform):
+class HoldReading(Checked, Transform):
     """Adds the last reading that arrived: what a network without a filter can read where readings are missing.
 
     A missing reading is NaN or zero. A filter leaves it out; an LSTM that reads NaN returns NaN from then on, without

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.reliability.case import Case
+from torch_denkf._arguments import _signature
 
 __all__ = ["Subject", "cases_of"]
 
@@ -36,10 +37,33 @@ class Subject:
     right: Mapping[str, Callable[[Any], bool]] = field(default_factory=dict)
 
 
+#: Wrong values of arguments, by their annotation.
+OF_KINDS: dict[str, dict[str, Any]] = {
+    "NestedKey": {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]},
+    "Sequence[NestedKey]": {"one key": "action", "a number": 5, "numbers": [1, 2]},
+    "bool": {"text": "yes", "a number": 2, "nothing": None},
+    "Callable": {"a number": 3, "text": "sine"},
+    "torch.Generator": {"a seed": 3, "text": "cpu"},
+}
+
+
+def of_kinds(make: Callable[..., Any]) -> dict[str, dict[str, Any]]:
+    """The keys, flags and functions that a class takes, and wrong values of each."""
+    if not isinstance(make, type):
+        return {}
+    signature, options, _ = _signature(make)
+    annotations = {name: str(one.annotation) for name, one in signature.parameters.items()} | options
+    found = {}
+    for name, text in annotations.items():
+        values = OF_KINDS.get(text.removesuffix(" | None").split("[...")[0], {})
+        found[name] = {what: value for what, value in values.items() if value is not None or "None" not in text}
+    return found
+
+
 def cases_of(border: str, subjects: Sequence[Subject]) -> Iterator[Case]:
     """A case for every wrong value of every argument."""
     for subject in subjects:
-        for argument, values in subject.damage.items():
+        for argument, values in {**of_kinds(subject.make), **subject.damage}.items():
             words = (argument, *subject.also.get(argument, ()))
             for what, value in values.items():
                 act, right = partial(_act, subject, argument, value), subject.right.get(argument)

@@ -13,6 +13,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torch_denkf._arguments import Checked
+
 if TYPE_CHECKING:
     from torch_denkf.simulation.ur5.camera import Camera
     from torch_denkf.simulation.ur5.render import Renderer
@@ -23,7 +25,7 @@ STEPS = 350
 GRIPPER_RANGE = 0.8  # rad
 
 
-class UR5TableEnv(EnvBase):
+class UR5TableEnv(Checked, EnvBase):
     """A UR5 with a two-finger gripper that picks, pushes or puts down an object, in MuJoCo, 0.08 s a step.
 
     Emits, at reset and at each step:
