@@ -29,6 +29,7 @@ __all__ = [
     "flag_value",
     "has_values",
     "read_lines",
+    "read_number",
 ]
 
 
@@ -338,6 +339,17 @@ def _end(cure: str) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------------- text
+
+
+def read_number(text: str) -> float:
+    """The number that a text is; ``1_3`` is none, although Python reads 13.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if "_" in text:
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
 
 
 def read_lines(file: Path) -> list[str]:

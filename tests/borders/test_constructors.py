@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.filters.gaussian_for_tests import linear_filter
+from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
     AroundState,
@@ -105,6 +107,27 @@ def test_kalman_filter(case):
     else:
         parts = PARTS
     refuses(lambda: KalmanFilter(**{**parts, name: value}), name, *words)
+
+
+@pytest.mark.parametrize("name", [*PARTS, "control"])
+@pytest.mark.parametrize("of", [torch.Tensor.clone, torch.Tensor.numpy, torch.Tensor.tolist])
+def test_an_imaginary_part_is_not_dropped(name, of):
+    value = of((1 + 0.5j) * PARTS.get(name, EYE))
+    refuses(lambda: KalmanFilter(**{**PARTS, name: value}), name, "complex", error=TypeError)
+
+
+def test_an_imaginary_part_is_not_dropped_elsewhere():
+    one = (1 + 0.5j) * ONE
+    for name, make in (
+        ("mean", lambda: GaussianPrior(one, ONE, ensemble_size=4)),
+        ("std", lambda: GaussianPrior(ONE, one.numpy(), ensemble_size=4)),
+        ("cov", lambda: MomentPrior(ZERO, 1j * EYE)),
+        ("matrix", lambda: LinearObservation(1j * EYE)),
+        ("observation", lambda: LinearGaussianEnv(EYE, 1j * EYE, [1.0, 1.0], [1.0, 1.0])),
+        ("transition_std", lambda: LinearGaussianEnv(EYE, EYE, one, [1.0, 1.0])),
+        ("process_noise", lambda: linear_filter("EKF", process_noise=one)),
+    ):
+        refuses(make, name, "complex", error=TypeError)
 
 
 NET = nn.Linear(2, 2)

@@ -14,7 +14,7 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf._checks import has_values
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import DEnKF, Filter, LSTMFilter, ParticleFilter, _checks
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter, _checks
 from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
@@ -321,6 +321,30 @@ def test_the_transform_of_a_package(tmp_path):
     for step in steps.values():
         with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
             rollout(packaged=step)
+
+
+@pytest.mark.parametrize("value", [1e25, -2e18])
+def test_a_belief_beyond_all_units_is_refused(value):
+    """Stored, or given to a reset; up to 1e18 the step is the exact one, K = 1/3 at P = 1 beside R = 2."""
+    one = torch.eye(2)
+    kf = KalmanFilter(one, 0 * one, one, 2 * one, mean=torch.zeros(2), cov=one)
+    rows = TensorDict({"observation": torch.zeros(3, 2)}, [3])
+    belief = kf.initialise(rows.clone())
+    belief["belief", "mean"] = torch.full((3, 2), 9e17)
+    torch.testing.assert_close(kf.step(belief.clone())["belief", "mean"], torch.full((3, 2), 6e17))
+    belief["belief", "mean"] = torch.tensor([[0.0, 0.0], [0.0, value], [0.0, 0.0]])
+    match = r"The belief has numbers of more than 1e\+18 in \[\('belief', 'mean'\)\]"
+    with pytest.raises(ValueError, match=match):
+        kf.step(belief.clone())
+    stored = torch.stack([belief, belief], 1)
+    stored["is_init"] = torch.tensor([True, False]).view(1, 2, 1).expand(3, 2, 1)
+    with pytest.raises(ValueError, match=match):
+        kf.sequence(stored)
+    env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(linear_kalman()))
+    prior = env.reset().select("belief")
+    prior["belief", "mean"] = torch.full((3, 2), value)
+    with pytest.raises(ValueError, match=match):
+        env.reset(prior)
 
 
 def test_gradients_do_not_meet_what_was_rejected():

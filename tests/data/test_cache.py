@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 import tensordict
 import torch
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import TensorDict
 
 from torch_denkf.cli.cache import main as denkf_cache
 from torch_denkf.data import cache_entry
 from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget, sweep
-from torch_denkf.data.cache_entry import END, MANIFEST, DamagedEntry, check_entry, open_entry
+from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, is_entry, open_entry
 
 ROOT = Path(__file__).parents[2]
 NAME = "drive-0123456789abcdef"
@@ -66,7 +66,7 @@ def test_an_entry_is_read_back_from_its_files(entry):
     opened = cached(entry, never)
     assert same(opened, content())
     assert opened["rows"].batch_size == (4,)
-    assert all(isinstance(opened[key], MemoryMappedTensor) for key in opened.keys(True, True) if key[1] != "empty")
+    assert all(isinstance(opened[key], CachedTensor) for key in opened.keys(True, True) if key[1] != "empty")
     files = {f"{name}.bin" for name in ("rows.state", "rows.half", "rows.observed", "rows.empty", "pixels", "time")}
     assert set(os.listdir(entry)) == {MANIFEST, *files}
     assert (entry / "time.bin").read_bytes() == content()["time"].numpy().tobytes()
@@ -113,6 +113,39 @@ def test_workers_get_the_file_and_what_was_written_to_it(entry):
     assert torch.equal(pickle.loads(pickle.dumps(opened["pixels"])), torch.Tensor(opened["pixels"]))
 
 
+def test_workers_get_the_place_of_a_view_and_a_copy_of_their_own(entry):
+    opened, wanted = cached(entry, never), content()
+    pictures, numbers = wanted["pixels"], wanted["rows", "state"]
+    views = (
+        (opened["pixels"][1:][2:4], pictures[3:5]),
+        (opened["pixels"][3, :, ::7], pictures[3, :, ::7]),
+        (opened["pixels"].permute(0, 2, 3, 1)[2], pictures.permute(0, 2, 3, 1)[2]),
+        (opened["pixels"].view(torch.int32)[..., 5], pictures.view(torch.int32)[..., 5]),
+        (opened["rows"][1:]["state"].squeeze(), numbers[1:]),
+        (opened["rows"][2:]["empty"], wanted["rows", "empty"][2:]),
+    )
+    for view, value in views:
+        data = pickle.dumps(view)
+        assert len(data) < 1000
+        other = pickle.loads(data)
+        assert other.dtype == value.dtype
+        assert other.shape == value.shape
+        assert (other == value).all()
+        other.zero_()
+        assert (view == value).all()
+    assert same(cached(entry, never), wanted)
+    check_entry(entry)
+    computed = (
+        opened["pixels"] + 1,
+        opened["pixels"][torch.tensor([2])],
+        opened["pixels"].clone(),
+        opened["time"].float(),
+    )
+    assert {type(value) for value in computed} == {torch.Tensor}
+    views[0][0][0] = 7  # what is written to a view is known of the whole
+    assert (pickle.loads(pickle.dumps(opened["pixels"]))[3] == 7).all()
+
+
 def damage(entry, how):
     file = entry / "pixels.bin"
     size = file.stat().st_size
@@ -144,6 +177,10 @@ def damage(entry, how):
     elif how == "another manifest":
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {}, "tensors": {}})
         (entry / MANIFEST).write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "content": text}))
+    elif how.startswith("a pipe"):
+        file = entry / (MANIFEST if how == "a pipe for a manifest" else "pixels.bin")
+        file.unlink()
+        os.mkfifo(file)
     elif how == "path":
         outside = {"../x": {"dtype": "uint8", "shape": [1], "bytes": 1, "crc32": 0, "ends": 0}}
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": {"": []}, "tensors": outside})
@@ -170,6 +207,8 @@ WAYS = (
     "half a manifest",
     "manifest",
     "another manifest",
+    "a pipe",
+    "a pipe for a manifest",
     "path",
 )
 
@@ -177,6 +216,7 @@ WAYS = (
 @pytest.mark.parametrize("how", WAYS)
 def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
     damage(entry, how)
+    assert is_entry(entry) == (how not in ("no manifest", "a pipe for a manifest"))
     with pytest.raises(DamagedEntry):
         open_entry(entry)
     with caplog.at_level(logging.WARNING, "torch_denkf"):

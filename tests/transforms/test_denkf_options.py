@@ -16,8 +16,9 @@ from torchrl.envs import (
     check_env_specs,
 )
 
-from tests.filters.factories import assert_equal
+from tests.filters.factories import assert_equal, linear_system
 from tests.transforms import envs_for_tests as envs
+from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.transforms import DEnKFTransform
 
 
@@ -108,6 +109,40 @@ def test_prior_given_to_reset(float64):
     assert td["belief", "ensemble"].equal(given)
     torch.testing.assert_close(td["belief", "mean"], given.mean(-2), rtol=0, atol=1e-15)
     torch.testing.assert_close(td["belief", "var"], given.var(-2), rtol=0, atol=1e-15)
+
+
+class SettableEnv(LinearGaussianEnv):
+    """Begins in a given state where it is asked to, as torchrl's own pendulum does."""
+
+    _supports_set_state = True
+
+    def _reset(self, tensordict=None, *, set_state=False, **kwargs):
+        out = super()._reset(tensordict)
+        return tensordict.copy().update(self._emit(tensordict["state"], out["step"])) if set_state else out
+
+
+def settable_env():
+    F, Q, H, R = linear_system()
+    env = SettableEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), batch_size=[3])
+    return TransformedEnv(env, DEnKFTransform(envs.known_start_filter()))
+
+
+@pytest.mark.parametrize("set_state", [False, True])
+@pytest.mark.parametrize("workers", [None, 2])
+def test_prior_given_to_reset_whether_or_not_the_state_is_set(float64, set_state, workers):
+    env = settable_env() if workers is None else SerialEnv(workers, settable_env)
+    entries = {("belief", "ensemble"): torch.randn(*env.batch_size, 6, 2), "state": torch.randn(*env.batch_size, 2)}
+    td = env.reset(TensorDict(entries, env.batch_size), set_state=set_state)
+    assert td["belief", "ensemble"].equal(entries["belief", "ensemble"])
+    torch.testing.assert_close(td["belief", "mean"], entries["belief", "ensemble"].mean(-2), rtol=0, atol=1e-15)
+    assert td["state"].equal(entries["state"]) == set_state
+    # A row that resets alone has the filter's own prior, and its neighbours keep what they were given.
+    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
+    mask.view(-1)[1] = True
+    td = env.reset(td.set("_reset", mask), set_state=set_state)
+    expected = entries["belief", "ensemble"].clone()
+    expected.view(-1, 6, 2)[1] = torch.tensor(envs.PRIOR_MEAN)
+    assert td["belief", "ensemble"].equal(expected)
 
 
 def test_reset_of_some_rows_leaves_the_others(float64):

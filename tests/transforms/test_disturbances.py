@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
 
 from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.envs import KITTIReplayEnv
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames
 
@@ -312,7 +313,7 @@ def test_in_a_replay_buffer():
 def test_whole_drives_that_are_read_only(tmp_path):
     write_drives(tmp_path, ["town"], frames=6, size=(20, 60))
     drive = read_kitti_drive(tmp_path, "town", size=(20, 60), cache=tmp_path / "cache")
-    assert isinstance(drive["image"], MemoryMappedTensor)
+    assert isinstance(drive["image"], CachedTensor)
     drive.lock_()
     before = drive["image"].clone()
     out = SaltAndPepper(0.1, in_keys=["image"], generator=rng())(drive)

@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,12 +34,12 @@ Renderer(model, (8, 8)).close()
 
 
 def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        import torch_denkf
+    for name in (package, f"{package}-nightly"):
+        with suppress(PackageNotFoundError):
+            return version(name)
+    import torch_denkf
 
-        return torch_denkf.__version__ if package == "torch_denkf" else "missing"
+    return torch_denkf.__version__ if package == "torch_denkf" else "missing"
 
 
 def _devices() -> str:

@@ -11,17 +11,18 @@ Nothing else is read, and nothing that is read can hold code.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import mmap
 import os
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDict, is_leaf_nontensor
+from tensordict import TensorDict, is_leaf_nontensor
 from torch import Tensor
 
 from torch_denkf._files import reserve, sync, write_text
@@ -56,25 +57,40 @@ class DamagedEntry(Exception):
     """What is wrong with an entry."""
 
 
-class CachedTensor(MemoryMappedTensor):
+class CachedTensor(Tensor):
     """A file of the cache as a tensor: a process that writes to it changes a copy of its own, never the file.
 
-    Workers get the name of the file, not its content.
+    Workers get the name of the file, not its content. So they do for a view of it, such as a slice; what is computed
+    from it is a plain tensor.
     """
 
+    file: Path
+
     @classmethod
-    def from_filename(cls, filename, dtype, shape, index=None) -> CachedTensor:
-        """Maps a file; where it is shorter than the tensor, that is an error, and it does not grow."""
-        shape, file = torch.Size(shape), Path(filename)
-        tensor = _map(file, dtype, shape, _MAP)
-        out = cls(tensor if index is None else tensor[index])
-        out.filename, out._handler, out.index, out.parent_shape = str(file), None, index, shape
+    def open(cls, file: Path, dtype: torch.dtype, shape: Sequence[int], *view: Any) -> CachedTensor:
+        """Maps a file that holds a tensor; ``view`` is the shape, the strides and the offset of a part of it.
+
+        Raises:
+            OSError: if the file has another size; it does not grow.
+        """
+        whole = _map(file, dtype, torch.Size(shape), _MAP)
+        out = (whole.as_strided(*view) if view else whole).as_subclass(cls)
+        out.file = file
         return out
 
-    def __reduce__(self):
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        out = Tensor.__torch_function__(func, (), args, kwargs)  # plain tensors
+        if type(out) is Tensor and args and isinstance(args[0], cls) and _place(out) == _place(args[0]):
+            out = out.as_subclass(cls)
+            out.file = args[0].file
+        return out
+
+    def __reduce_ex__(self, protocol):
         if self._version:  # it was written to: no longer what the file holds
-            return self.as_subclass(Tensor).clone().__reduce_ex__(2)
-        return super().__reduce__()
+            return self.clone().__reduce_ex__(protocol)
+        whole = (self.untyped_storage().nbytes() // self.itemsize,)
+        return self.open, (self.file, self.dtype, whole, self.shape, self.stride(), self.storage_offset())
 
 
 def reserve_entry(folder: Path, like: TensorDict) -> TensorDict:
@@ -159,7 +175,7 @@ def open_entry(folder: Path) -> TensorDict:
             written = _check(file, about, whole=False)
             if written != about.get("written"):
                 about["written"], renewed = written, True
-            out.set(tuple(name.split(".")), CachedTensor.from_filename(file, _DTYPES[about["dtype"]], about["shape"]))
+            out.set(tuple(name.split(".")), CachedTensor.open(file, _DTYPES[about["dtype"]], about["shape"]))
         for name, size in content["batch_sizes"].items():
             if name:
                 out.get(tuple(name.split("."))).batch_size = size
@@ -185,16 +201,23 @@ def check_entry(folder: Path) -> None:
 def is_entry(folder: Path) -> bool:
     """Whether a folder is one that this module writes, sound or not."""
     try:
-        with (folder / MANIFEST).open("rb") as stream:
+        with _open(folder / MANIFEST) as stream:
             return FORMAT.encode() in stream.read(_LARGEST_MANIFEST)
     except OSError:
         return False
 
 
+def _open(file: Path) -> BinaryIO:
+    """Opens a plain file; a pipe would wait for a writer."""
+    if file.exists() and not file.is_file():
+        raise OSError(errno.EINVAL, "it is no file", str(file))
+    return file.open("rb")
+
+
 def _read_manifest(folder: Path) -> dict[str, Any]:
     file = folder / MANIFEST
     try:
-        with file.open("rb") as stream:
+        with _open(file) as stream:
             sealed = json.loads(stream.read(_LARGEST_MANIFEST))
         text = sealed["content"]
         content = json.loads(text)
@@ -216,7 +239,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 def _check(file: Path, about: dict[str, Any], whole: bool) -> int:
     """Compares a file with what the manifest says; when it was written to last, ns."""
     try:
-        with file.open("rb") as stream:
+        with _open(file) as stream:
             size = os.fstat(stream.fileno()).st_size
             expected = torch.Size(about["shape"]).numel() * _DTYPES[about["dtype"]].itemsize
             if not size == about["bytes"] == expected:
@@ -285,7 +308,6 @@ def _batch_sizes(content: TensorDict) -> Iterator[tuple[tuple[str, ...], torch.S
             yield (key,) if isinstance(key, str) else key, value.batch_size
 
 
-with contextlib.suppress(AttributeError):  # workers get the name of the file
-    from multiprocessing.reduction import ForkingPickler
-
-    ForkingPickler.register(CachedTensor, lambda tensor: tensor.__reduce__())
+def _place(tensor: Tensor) -> int:
+    """Where in memory the numbers are that it is a view of."""
+    return tensor.untyped_storage().data_ptr()

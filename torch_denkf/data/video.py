@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,29 @@ def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
         yield from _by_opencv(capture)
     finally:
         capture.release()
+
+
+def say_if_cut(file: Path, times: Sequence[float]) -> None:
+    """Warns where a video ends before the end that its header announces.
+
+    Args:
+        file: the video.
+        times: s, of the frames that could be decoded, one at least.
+    """
+    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    count, rate = (capture.get(what) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+    capture.release()
+    if count <= 0 or rate <= 0:
+        return
+    # The last frame is shown for a step, and where the header has no count, OpenCV rounds one.
+    step = max(np.diff(times).max(initial=0), 1 / rate)
+    shown = times[-1] - times[0] + 1 / rate
+    if count / rate > shown + 0.6 * step:
+        warnings.warn(
+            f"{file} shows {shown:.4g} s, but announces {count / rate:.4g} s: is it cut? Copy it anew, or go on "
+            "without its end",
+            stacklevel=2,
+        )
 
 
 def _codec(capture: cv2.VideoCapture) -> str:

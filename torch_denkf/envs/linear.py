@@ -17,9 +17,12 @@ __all__ = ["LinearGaussianEnv"]
 
 def _constant(name: str, value: torch.Tensor | Sequence) -> torch.Tensor:
     try:
-        constant = torch.as_tensor(value, dtype=torch.get_default_dtype())
+        constant = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
+    if constant.is_complex():
+        raise TypeError(f"{name} must be real; got {constant.dtype}. Real and imaginary parts are two components each")
+    constant = constant.to(torch.get_default_dtype())
     check_values(name, constant)
     return constant
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
 
 from torch_denkf._checks import has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
@@ -21,6 +22,7 @@ __all__ = [
     "AbsurdReading",
     "check_inputs",
     "refuse_absurd_readings",
+    "refuse_far_belief",
     "refuse_non_finite",
     "refuse_single_readings",
     "refuse_two_precisions",
@@ -105,6 +107,7 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
     """
+    refuse_far_belief(entries, structure.carry)
     finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
     # -inf is the log-weight of a particle that is out of the question.
@@ -126,6 +129,23 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
         "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
+
+
+def refuse_far_belief(entries: Mapping[NestedKey, Tensor], keys: Collection[NestedKey]) -> None:
+    """Raises a ``ValueError`` where a belief that is given has numbers whose squares leave float32."""
+    far = [key for key in keys if key in entries and _is_far(entries[key])]
+    if far:
+        raise ValueError(
+            f"The belief has numbers of more than {LARGEST_READING:g} in {far}, with which no filter computes. Start "
+            "from filter.initialise(), and choose units in which the state is smaller. If the filter came there by "
+            "itself, it diverged. check_finite=False switches this off."
+        )
+
+
+def _is_far(value: Tensor) -> bool:
+    if not value.is_floating_point() or not has_values(value):
+        return False
+    return bool(((value.abs() > LARGEST_READING) & value.isfinite()).any())
 
 
 def _lowest_variance(key: NestedKey, value: torch.Tensor) -> float:

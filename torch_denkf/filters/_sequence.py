@@ -11,7 +11,12 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf.filters._ceiling import look_at_ceiling
-from torch_denkf.filters._checks import check_inputs, refuse_absurd_readings, refuse_missing_actions
+from torch_denkf.filters._checks import (
+    check_inputs,
+    refuse_absurd_readings,
+    refuse_far_belief,
+    refuse_missing_actions,
+)
 from torch_denkf.filters._entries import own, write
 from torch_denkf.filters._noise import draw_noise
 from torch_denkf.filters._rejection import REJECTED
@@ -110,6 +115,7 @@ def filter_rows(
     given = list(entries.values())
     check_inputs(filter, entries, rows, carry=False)
     if filter.check_finite and not filter.reject and not torch.compiler.is_compiling():
+        refuse_far_belief(entries, [name for key in structure.carry for name in (key, previous_key(key))])
         refuse_absurd_readings(structure, entries)
     say_ignored_mask(filter, rows)
     entries = filter.steps().usable(entries, call)

@@ -30,20 +30,22 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
     """A floating tensor in memory of its own: a tensor keeps its precision, everything else gets torch's default one.
 
     Raises:
-        TypeError: if it is neither a tensor nor numbers; ``name`` is the argument's.
+        TypeError: if it is neither a tensor nor numbers, or complex; ``name`` is the argument's.
         ValueError: if it asks for a gradient, which would get lost.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
         (torch.float32, torch.float64)
     """
-    if isinstance(value, Tensor):
-        refuse_trained(name, value, "it is copied into a constant")
-        return value.detach().to(value.dtype if value.is_floating_point() else torch.get_default_dtype(), copy=True)
     try:
-        return torch.as_tensor(value, dtype=torch.get_default_dtype()).clone()
+        tensor = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{name} must be numbers, in a tensor or in lists of one length; got {value!r}") from error
+    if tensor.is_complex():
+        raise TypeError(f"{name} must be real; got {tensor.dtype}. Real and imaginary parts are two components each")
+    refuse_trained(name, tensor, "it is copied into a constant")
+    keeps = isinstance(value, Tensor) and tensor.is_floating_point()
+    return tensor.detach().to(tensor.dtype if keeps else torch.get_default_dtype(), copy=True)
 
 
 def register_constant(

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from torch_denkf._checks import read_number
 from torch_denkf.data.kitti.files import read_calibration
 from torch_denkf.data.pictures import is_bomb
 
@@ -68,7 +69,7 @@ def read_camera(file: str | Path, camera: str | None = None) -> tuple[float, flo
     if missing := [name for name in _NAMES if name not in found]:
         raise ValueError(f"{file} does not say {', '.join(missing)}; write a line 'fx: 718.9' for each, in pixels")
     try:
-        fx, fy, cx, cy = (float(found[name]) for name in _NAMES)
+        fx, fy, cx, cy = (read_number(str(found[name])) for name in _NAMES)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{file}: fx, fy, cx and cy must be numbers ({error})") from error
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or min(fx, fy) <= 0:
@@ -103,7 +104,7 @@ def read_times(file: str | Path) -> list[float]:
         if words == [""]:
             continue
         try:
-            times.append(float(words[0]))
+            times.append(read_number(words[0]))
         except ValueError as error:
             raise ValueError(f"{file}:{number}: expected a time in s, got {line.strip()[:40]!r}") from error
     return times

@@ -15,7 +15,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
 from torch_denkf.filters import Filter, Monitored
-from torch_denkf.filters._checks import refuse_unguarded
+from torch_denkf.filters._checks import refuse_far_belief, refuse_unguarded
 from torch_denkf.filters._entries import own
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
@@ -264,6 +264,7 @@ class DEnKFTransform(Checked, Transform):
 
     def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
+        refuse_far_belief(entries, self.filter.structure.carry)
         finite = all(torch.isfinite(entries[key]).all() for key in self.filter.structure.carry)
         absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 
 import torch_denkf.data.kitti.drive as module
 from tests.real_data import KITTI
 from torch_denkf.data import cache_entry, list_kitti_drives, read_kitti_drive
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.kitti.files import read_calibration, read_poses
 from torch_denkf.metrics import dead_reckoning
 from torch_denkf.vision.poses import poses_to_state, state_to_poses
@@ -224,7 +224,7 @@ def test_times_are_nominal_without_a_file(tmp_path):
 def test_the_cache(tmp_path, monkeypatch):
     root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
     first = read_kitti_drive(root, "00", cache=cache)
-    assert isinstance(first["image"], MemoryMappedTensor)
+    assert isinstance(first["image"], CachedTensor)
     entries = list(cache.iterdir())
     assert len(entries) == 1
     # From now on the cache alone is read: images are not opened again.
@@ -247,7 +247,7 @@ def test_the_cache(tmp_path, monkeypatch):
     assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
     assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
     assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
-    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], MemoryMappedTensor)
+    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
 
 
 def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):
@@ -326,8 +326,49 @@ def test_errors_name_the_file(tmp_path):
     fails(ValueError, r"calib.txt:2: expected 12 finite numbers \(a 3x4 projection")
     calibration.write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     fails(ValueError, r"calib.txt has no row 'P2:', the projection of image_2")
+    calibration.write_text("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nP1: 1\nP2: 2 0 0 0 0 2 0 0 0 0 1 0\n")
+    fails(ValueError, r"calib.txt:3: 'P2:' is there 2 times")
     calibration.unlink()
     fails(FileNotFoundError, r"no calibration at .*calib.txt")
+
+
+@pytest.mark.parametrize(
+    ("file", "row", "text", "match"),
+    [
+        (
+            "poses/00.txt",
+            3,
+            "1 0 0 1000000 0 1 0 0 0 0 1 3",
+            r"00.txt:4: the position is 1e\+06 m from .*, 0.1 s earlier",
+        ),
+        ("poses/00.txt", 0, "1 0 0 0 0 1 0 0 0 0 1 -31", r"00.txt:2: the position is 32 m from that of the row before"),
+        ("poses/00.txt", 3, "1 0 0 0 0 1 0 0 0 0 1 1_3", r"00.txt:4: expected 12 finite numbers"),
+        ("sequences/00/calib.txt", 2, "P2: 7_0 0 0 0 0 9 0 0 0 0 1 0", r"calib.txt:3: expected 12 finite numbers"),
+        ("sequences/00/times.txt", 3, "0_3", r"times.txt:4: expected 1 finite number \(seconds\), got 1 words: '0_3'"),
+        (
+            "sequences/00/times.txt",
+            None,
+            "0\n103\n206\n309\n412\n515\n",
+            r"times is 103 s, .*; write the times in seconds",
+        ),
+    ],
+)
+def test_what_cannot_be_a_drive_is_refused(tmp_path, file, row, text, match):
+    """A leap, numbers that Python alone reads as such, and times in ms."""
+    path = make(tmp_path) / file
+    lines = path.read_text().splitlines()
+    path.write_text(text if row is None else "\n".join([*lines[:row], text, *lines[row + 1 :]]))
+    with pytest.raises(ValueError, match=match):
+        read_kitti_drive(tmp_path, "00", cache=None)
+
+
+def test_a_leap_over_a_gap_is_none(tmp_path):
+    """60 m in 6 s."""
+    root = make(tmp_path, poses=[0, 1, 2, 62, 63, 64])
+    (root / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n6.2\n6.3\n6.4\n")
+    with pytest.warns(UserWarning, match="1 gaps"):
+        drive = read_kitti_drive(tmp_path, "00", cache=None)
+    torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 10.0))
 
 
 # Real frames ---------------------------------------------------------------------------------------------------------

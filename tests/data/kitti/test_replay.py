@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
@@ -21,6 +20,7 @@ from torch_denkf.data import (
     with_motion,
     write_drives,
 )
+from torch_denkf.data.cache_entry import CachedTensor
 
 SIZE = (12, 36)
 LENGTHS = {"hill": 14, "lane": 9, "town": 23}
@@ -190,7 +190,7 @@ def test_the_cache_is_mapped_and_opens_without_decoding(root, tmp_path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(kitti_module, "_decode", None)
         again = open_dataset(root, **options)
-    assert all(isinstance(drive["image"], MemoryMappedTensor) for drive in again._drives)
+    assert all(isinstance(drive["image"], CachedTensor) for drive in again._drives)
     assert (again[:] == first[:]).all()
     assert "pixels" not in again._storage[:]
     assert sum(value.nbytes for value in again._storage[:].values(True, True)) < 120 * len(again)

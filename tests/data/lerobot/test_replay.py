@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 
@@ -25,6 +24,7 @@ from tests.data.lerobot.lerobot_folder import (
     write_version_3,
 )
 from torch_denkf.data import LeRobotReplay
+from torch_denkf.data.cache_entry import CachedTensor
 
 LENGTHS = [9, 6, 12, 7, 8]
 TESTS = {4, 8, 11, 19, 24}  # of 25 episodes
@@ -201,7 +201,7 @@ def test_the_second_open_reads_the_cache(root, tmp_path, monkeypatch):
         patch.setattr(recording_module, "read_table", None)
         again = LeRobotReplay(root, size=SIZE, cache=tmp_path, split="all")
         parts = [LeRobotReplay(root, size=SIZE, cache=tmp_path, split=s) for s in ("train", "test")]
-    assert isinstance(again._images.stores[0], MemoryMappedTensor)
+    assert isinstance(again._images.stores[0], CachedTensor)
     assert again._images.stores[0].dtype == torch.uint8
     assert "pixels" not in again._storage[:]
     assert (again[:] == first[:]).all()

@@ -1,5 +1,6 @@
 """Pictures of videos whose rate varies, of folders with other files, and copies of data sets."""
 
+import warnings
 from copy import deepcopy
 from fractions import Fraction
 from pickle import dumps, loads
@@ -7,7 +8,7 @@ from pickle import dumps, loads
 import numpy as np
 import pytest
 
-from tests.data.recordings.own_files import SIZE, grey, write_csv, write_images
+from tests.data.recordings.own_files import SIZE, grey, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
 from torch_denkf.envs import ReplayEnv
 
@@ -32,6 +33,23 @@ def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
     np.testing.assert_allclose(data[:]["time"].squeeze(-1), times, atol=1e-6)
     red = [int(grey(number)[0, 0, 0]) for number in range(43)]
     assert (data[:]["pixels"][:, 0, 0, 0] * 255).round().int().tolist() == red
+
+
+@pytest.mark.parametrize("name", ["run.mkv", "run.avi"])
+def test_a_video_that_lost_its_end_is_told(tmp_path, name):
+    file = tmp_path / name
+    write_video(file, 12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(Video(file).read(SIZE, None, False)) == 12
+    data = file.read_bytes()
+    for share in (0.95, 0.9, 0.8):
+        file.write_bytes(data[: int(share * len(data))])
+        with pytest.warns(UserWarning, match=rf"{name} shows .* s, but announces 1.2 s: is it cut\?"):
+            left = Video(file).read(SIZE, None, False)
+        assert len(left) < 12
+        shown = (10 * left["time"]).round().int().tolist()
+        assert (left["pixels"].numpy() == np.stack([grey(k).transpose(2, 0, 1) for k in shown])).all()
 
 
 def test_hidden_files_are_no_pictures(tmp_path):

@@ -1,5 +1,6 @@
 """Rows of one's own recordings are the numbers in their files, on the clock that was asked for."""
 
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -7,7 +8,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -15,6 +15,7 @@ import torch_denkf.data.recordings.frames as frames_module
 from tests.data import replay_for_tests as shared
 from tests.data.recordings.own_files import SIZE, pixels, write_csv, write_images, write_video
 from torch_denkf.data import Images, Recording, RecordingReplay, Table, Video
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.filters import DEnKF
@@ -151,6 +152,29 @@ def test_images_are_in_the_order_of_their_numbers(tmp_path):
     assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
 
 
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["img_0", "img_1", "img_3", "img_4"], [0, 1, 3, 4]),  # number 2 is missing
+        (["000005", "000010", "000025", "000030"], [0, 1, 4, 5]),  # each fifth was kept; 15 and 20 are missing
+        (["9_left", "10_left", "12_left", "13_left"], [0, 1, 3, 4]),
+        (["0", "33", "67", "100"], [0, 1, 2, 3]),  # stamps, not counts
+        (["run1_8", "run1_9", "run2_0", "run2_5"], [0, 1, 2, 3]),
+        (["1_3", "2_0", "13_1", "14_1"], [0, 1, 2, 3]),  # 1_3 is not 13
+    ],
+)
+def test_a_missing_image_moves_no_other_one(tmp_path, names, times):
+    write_images(tmp_path / "run", [f"{name}.png" for name in names])
+    missing = times[-1] + 1 - len(times)
+    warned = pytest.warns(
+        UserWarning, match=f"by their numbers {missing} images are missing, the first after {names[1]}"
+    )
+    with warned if missing else nullcontext():
+        data = open_runs(Recording(eye=Images(tmp_path / "run", rate=10.0, start=2.0)))
+    np.testing.assert_allclose(data[:]["time"].flatten(), np.array(times) / 10, atol=1e-12)
+    assert (data[:]["pixels"].numpy() == np.stack([pixels(k) for k in range(4)])).all()
+
+
 def test_a_damaged_image_blinds_its_row_alone(tmp_path):
     write_images(tmp_path / "run", [f"{k}.png" for k in range(5)])
     (tmp_path / "run/2.png").write_bytes((tmp_path / "run/2.png").read_bytes()[:60])
@@ -210,7 +234,7 @@ def test_pictures_are_decoded_once(runs, run, tmp_path, monkeypatch):
         again = cached(runs, split="all")
         other = cached(Recording(**streams(run)), clock=25.0)  # another clock, the same pictures
     assert (again[:] == first[:]).all()
-    assert isinstance(again._pictures.stores[0], MemoryMappedTensor)
+    assert isinstance(again._pictures.stores[0], CachedTensor)
     assert other[0]["pixels"].equal(torch.from_numpy(pixels(1)))
     assert "pixels" not in video._storage[:]
     cached(runs, size=(12, 16))

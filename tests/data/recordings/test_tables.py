@@ -1,5 +1,7 @@
 """Tables as others write them: what is read, and what is refused with its place."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,17 @@ def test_what_is_read(tmp_path, text, options):
 def test_what_is_refused(tmp_path, text, match):
     with pytest.raises(ValueError, match=match):
         read(tmp_path, text)
+
+
+def test_many_columns_take_no_longer_than_their_number(tmp_path):
+    """A pass over all columns for each of them would take 20 minutes."""
+    count = 200_000
+    rows = (["time", *(f"c{k}" for k in range(count))], *([str(row + k) for k in range(count + 1)] for row in range(2)))
+    started = time.monotonic()
+    readings = read(tmp_path, "\n".join(map(",".join, rows)))
+    assert time.monotonic() - started < 60
+    np.testing.assert_array_equal(readings.values, np.arange(2)[:, None] + np.arange(1, count + 1))
+    assert readings.columns[-1] == f"c{count - 1}"
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])

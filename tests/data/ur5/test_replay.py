@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 from torchrl.data import SamplerWithoutReplacement
 from torchrl.data.datasets import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import ObservationNorm
@@ -14,6 +13,7 @@ from torchrl.envs.transforms import ObservationNorm
 from tests.data import replay_for_tests as shared
 from tests.data.ur5.ur5_demos import LENGTHS, SIZE, make_demo, ten_demos, write_folder
 from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.data.ur5 import cache
 from torch_denkf.data.ur5.files import read_demo
 from torch_denkf.data.ur5.rows import is_for_tests
@@ -132,7 +132,7 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "read_demo", count)
     first = UR5ExperienceReplay(folder, split="all", cache=place)
     assert len(decoded) == 1 + 4  # the first one also tells the size
-    assert isinstance(first._frames["pixels"], MemoryMappedTensor)
+    assert isinstance(first._frames["pixels"], CachedTensor)
     decoded.clear()
     for split in ("all", "train"):
         again = UR5ExperienceReplay(folder, split=split, cache=place)

@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_denkf._checks import read_lines
+from torch_denkf._checks import read_lines, read_number
 from torch_denkf.data.times import MOST_WRONG, filled, sound
 from torch_denkf.vision.poses import KITTI_DT
 
 __all__ = ["GAP", "Times", "read_times"]
 
 GAP = 1.5  # a step that is longer, in median steps, is a gap: no image pair reaches over it
-SHORTEST, LONGEST = 1e-5, 1e4  # s between frames: beyond, the times are not in seconds
+SHORTEST, LONGEST = 1e-3, 2.0  # s between frames: beyond, the times are not in seconds, or no flow can be seen
 
 
 class Times(NamedTuple):
@@ -82,7 +82,7 @@ def read_times(file: Path, rows: int) -> Times:
 def _seconds(file: Path, number: int, line: str) -> float:
     try:
         (word,) = line.split()
-        value = float(word)
+        value = read_number(word)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):

@@ -28,7 +28,7 @@ from tensordict import TensorDict
 
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.kitti.clock import read_times
-from torch_denkf.data.kitti.files import read_calibration, read_poses, scale_calibration
+from torch_denkf.data.kitti.files import check_speeds, read_calibration, read_poses, scale_calibration
 from torch_denkf.data.pictures import check_size, is_bomb, text_of_size
 from torch_denkf.vision.poses import poses_to_state
 
@@ -117,9 +117,10 @@ def read_kitti_drive(
 
     Raises:
         FileNotFoundError: without the sequence's folder, images, poses or calibration.
-        ValueError: for malformed rows, matrices that are no rotations, focal lengths that are not positive, times more
-            than a tenth of which do not increase, images of other names, images without any pose, drives none of whose
-            images can be read, drives whose images differ in size, and sizes that are not positive.
+        ValueError: for malformed rows, matrices that are no rotations, positions that leap, focal lengths that are not
+            positive, times more than a tenth of which do not increase or that are not in seconds, images of other
+            names, images without any pose, drives none of whose images can be read, drives whose images differ in size,
+            and sizes that are not positive.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -217,6 +218,7 @@ def _read(
     clock = read_times(folder / "times.txt", last + 1)
     dt = clock.dt[first:].copy()
     dt[0] = clock.median
+    check_speeds(poses_file, poses[: last + 1], np.maximum(clock.dt[1:], clock.median))
     state = poses_to_state(poses[: last + 1], clock.dt[1:])[first:]
     if colour is None:
         colour = _is_colour(files[number] for number in numbers)

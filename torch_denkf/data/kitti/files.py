@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from torch_denkf._checks import read_lines
+from torch_denkf._checks import read_lines, read_number
 from torch_denkf._files import replacing
 
 FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart
 LONGEST_FOCAL = 1e6  # pixels: a view of a minute of arc
 ROTATION = 0.01  # how far R R^T may be from I: files of two digits pass
+FASTEST = 300.0  # m/s: no robot that takes pictures of its road is faster
 
 
 def read_poses(file: Path) -> np.ndarray:
@@ -78,9 +79,30 @@ def _check_poses(file: Path, poses: np.ndarray) -> None:
         )
 
 
+def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
+    """Refuses poses that no robot goes through.
+
+    Args:
+        file: that they are from.
+        poses: ``[N, 3, 4]``, of its first rows.
+        dt: s between each two of them, ``[N - 1]``.
+
+    Raises:
+        ValueError: naming file and line, if one is farther from the one before than 300 m/s allow.
+    """
+    ways = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
+    wrong = np.flatnonzero(ways > FASTEST * dt)
+    if len(wrong):
+        row = int(wrong[0])
+        raise ValueError(
+            f"{file}:{row + 2}: the position is {ways[row]:g} m from that of the row before, {dt[row]:g} s earlier; "
+            f"expected metres, and at most {FASTEST:g} m/s. Correct the row, or write the poses anew"
+        )
+
+
 def _numbers(words: list[str], count: int | None, where: str, meaning: str) -> np.ndarray:
     try:
-        values = np.array(words, dtype=np.float64)
+        values = np.array([read_number(word) for word in words])
         good = (count is None or len(values) == count) and bool(np.isfinite(values).all())
     except ValueError:
         good = False
@@ -108,28 +130,31 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: where the camera's row is missing or malformed, a focal length is not positive, or no camera has
-            such numbers.
+        ValueError: where the camera's row is missing, there twice or malformed, a focal length is not positive, or no
+            camera has such numbers.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no calibration at {file}; expected rows 'P0: ...' to 'P3: ...' of 12 numbers")
     key = f"P{camera.removeprefix('image_')}:"
-    for number, line in enumerate(read_lines(file), start=1):
-        words = line.split()
-        if words and words[0] == key:
-            matrix = _numbers(words[1:], 12, f"{file}:{number}", "a 3x4 projection matrix, row by row")
-            if not 0 < min(matrix[0], matrix[5]) <= max(matrix[0], matrix[5]) <= LONGEST_FOCAL:
-                raise ValueError(
-                    f"{file}:{number}: the focal lengths fx and fy must be positive pixels, up to {LONGEST_FOCAL:g}, "
-                    f"got {matrix[0]:g} and {matrix[5]:g}; they are the first and the sixth number of {key!r}"
-                )
-            if max(abs(matrix[2]), abs(matrix[6])) > LONGEST_FOCAL:
-                raise ValueError(
-                    f"{file}:{number}: the principal point ({matrix[2]:g}, {matrix[6]:g}) is in pixels, up to "
-                    f"{LONGEST_FOCAL:g} from the corner; cx and cy are the third and the seventh number of {key!r}"
-                )
-            return matrix[[0, 5, 2, 6]]
-    raise ValueError(f"{file} has no row {key!r}, the projection of {camera}; add it or choose another camera")
+    rows = [(number, line.split()) for number, line in enumerate(read_lines(file), start=1)]
+    rows = [(number, words[1:]) for number, words in rows if words and words[0] == key]
+    if not rows:
+        raise ValueError(f"{file} has no row {key!r}, the projection of {camera}; add it or choose another camera")
+    number, words = rows[-1]
+    if len(rows) > 1:
+        raise ValueError(f"{file}:{number}: {key!r} is there {len(rows)} times; keep the row of this drive's camera")
+    matrix = _numbers(words, 12, f"{file}:{number}", "a 3x4 projection matrix, row by row")
+    if not 0 < min(matrix[0], matrix[5]) <= max(matrix[0], matrix[5]) <= LONGEST_FOCAL:
+        raise ValueError(
+            f"{file}:{number}: the focal lengths fx and fy must be positive pixels, up to {LONGEST_FOCAL:g}, "
+            f"got {matrix[0]:g} and {matrix[5]:g}; they are the first and the sixth number of {key!r}"
+        )
+    if max(abs(matrix[2]), abs(matrix[6])) > LONGEST_FOCAL:
+        raise ValueError(
+            f"{file}:{number}: the principal point ({matrix[2]:g}, {matrix[6]:g}) is in pixels, up to "
+            f"{LONGEST_FOCAL:g} from the corner; cx and cy are the third and the seventh number of {key!r}"
+        )
+    return matrix[[0, 5, 2, 6]]
 
 
 def scale_calibration(calibration: np.ndarray, native: tuple[int, int], size: tuple[int, int]) -> np.ndarray:

@@ -7,42 +7,38 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = ["Way", "interpolate", "last_reading", "nearest_reading", "row_times"]
+__all__ = ["Span", "Way", "interpolate", "last_reading", "nearest_reading", "row_times", "rows_ago"]
 
 Way = Literal["last", "nearest", "linear"]
+Span = Literal["common", "all"]
 SLACK = 1e-6  # s: times that differ by less are the same
 MOST_ROWS = 10**8  # of one recording: eleven days at 100 Hz
 
 
-def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarray:
-    """Times of the rows, in s: those at which every stream has begun and none has ended.
+def row_times(streams: Mapping[str, np.ndarray], clock: str | float, span: Span = "common") -> np.ndarray:
+    """Times of the rows, in s.
 
     Args:
         streams: times of each stream's readings, s, ascending.
         clock: the stream whose times are the rows', or a rate in Hz.
+        span: ``"common"`` for those at which every stream has begun and none has ended; ``"all"`` for all times of the
+            clock, which a rate has from the first begin to the last end of a stream.
 
     Raises:
         ValueError: if the streams do not overlap by two rows, or by so many that the times cannot be in s.
 
     Examples:
-        >>> row_times({"camera": np.array([0.0, 0.5, 1.0, 1.5]), "state": np.array([0.4, 1.1])}, "camera")
-        array([0.5, 1. ])
+        >>> streams = {"camera": np.array([0.0, 0.5, 1.0, 1.5]), "state": np.array([0.4, 1.1])}
+        >>> row_times(streams, "camera"), row_times(streams, "camera", "all")
+        (array([0.5, 1. ]), array([0. , 0.5, 1. , 1.5]))
         >>> row_times({"state": np.array([0.0, 0.9])}, 4.0)
         array([0.  , 0.25, 0.5 , 0.75])
     """
-    begin, end = max(times[0] for times in streams.values()), min(times[-1] for times in streams.values())
-    rows = np.zeros(0)
-    if end >= begin:
-        if isinstance(clock, str):
-            times = streams[clock]
-            rows = times[(times >= begin - SLACK) & (times <= end + SLACK)]
-        else:
-            if (end - begin) * clock > MOST_ROWS:
-                raise ValueError(
-                    f"{clock:g} rows a second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a "
-                    "lower clock=, or unit= for tables whose times are not in s"
-                )
-            rows = begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
+    begins, ends = ([times[at] for times in streams.values()] for at in (0, -1))
+    begin, end = max(begins), min(ends)
+    if span == "all" and begin <= end + SLACK:
+        begin, end = min(begins), max(ends)
+    rows = _between(begin, end, streams, clock)
     if len(rows) < 2:
         spans = ", ".join(f"{name} from {times[0]:.15g} to {times[-1]:.15g} s" for name, times in streams.items())
         raise ValueError(
@@ -52,13 +48,30 @@ def row_times(streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarr
     return rows
 
 
-def last_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """For each row the last reading before it, or at it, and whether it arrived since the row before.
+def _between(begin: float, end: float, streams: Mapping[str, np.ndarray], clock: str | float) -> np.ndarray:
+    if end < begin:
+        return np.zeros(0)
+    if isinstance(clock, str):
+        times = streams[clock]
+        return times[(times >= begin - SLACK) & (times <= end + SLACK)]
+    if (end - begin) * clock > MOST_ROWS:
+        raise ValueError(
+            f"{clock:g} rows a second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a lower "
+            "clock=, or unit= for tables whose times are not in s"
+        )
+    return begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
+
+
+def last_reading(
+    times: np.ndarray, rows: np.ndarray, tolerance: float | None, taken: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each row the last reading that arrived before it, or at it, and whether it arrived since the row before.
 
     Args:
-        times: of the readings, s, ascending, ``[m]``.
+        times: when the readings arrived, s, ascending, ``[m]``.
         rows: times of the rows, s, ascending, ``[n]``.
         tolerance: s; an older reading is none.
+        taken: when the readings were taken, s, ``[m]``; by default they arrive at once.
 
     Returns:
         Its index ``[n]``, -1 where there is none, and whether it is new, bool ``[n]``.
@@ -69,9 +82,31 @@ def last_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -
     """
     index = np.searchsorted(times, rows + SLACK, side="right") - 1
     if tolerance is not None:
-        index = np.where(rows - times[index.clip(0)] > tolerance + SLACK, -1, index)
+        age = rows - (times if taken is None else taken)[index.clip(0)]
+        index = np.where(age > tolerance + SLACK, -1, index)
     new = np.diff(index, prepend=-1) != 0
     return index, new & (index >= 0)
+
+
+def rows_ago(taken: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """By how many rows a reading is late that a row shows: those since the first row at, or after, it was taken.
+
+    Args:
+        taken: s, ``[n]``.
+        rows: times of the rows that show it, s, ascending, ``[n]``. Where a reading was taken before the first, the
+            rows are thought to go on there.
+
+    Returns:
+        int64 ``[n]``.
+
+    Examples:
+        >>> rows_ago(np.array([-0.5, 0.5, 0.4, 3.0]), np.arange(4.0))
+        array([0, 0, 1, 0])
+        >>> rows_ago(np.array([-3.5, -3.5]), np.arange(2.0))
+        array([3, 4])
+    """
+    before = np.ceil((taken - rows[0] - SLACK) / np.median(np.diff(rows))).clip(max=0)
+    return np.arange(len(rows)) - np.searchsorted(rows, taken - SLACK) - before.astype(np.int64)
 
 
 def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_number, read_number
 from torch_denkf._files import clear_errors
 from torch_denkf._progress import progress_bar
 from torch_denkf.data.cache import cache_folder, cached, stamp
 from torch_denkf.data.pictures import CURE, decode_picture, scaled, text_of_size, unnamed_file
 from torch_denkf.data.recordings.tables import SECONDS, Unit, check_stream, check_times, read_numbers
-from torch_denkf.data.video import NOT_DECODED, decoded_frames
+from torch_denkf.data.video import NOT_DECODED, decoded_frames, say_if_cut
 
 __all__ = ["Frames", "Images", "Video"]
 
@@ -161,8 +161,12 @@ class Video(Frames):
         return [source]
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
+        times = []
         for number, (time, pixels) in enumerate(decoded_frames(files[0])):
+            times.append(time)
             yield time, pixels, f"frame {number} of {files[0]}"
+        if times:
+            say_if_cut(files[0], times)
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,8 @@ class Images(Frames):
     """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
 
     Args:
-        rate: pictures a second, from ``start`` on, in the place of ``times`` and of the numbers in the names.
+        rate: pictures a second, from ``start`` on, in the place of ``times``. Where the images are numbered, a number
+            that is missing is a picture that is missing; a warning counts them.
 
     Raises:
         ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` beside it.
@@ -209,7 +214,7 @@ class Images(Frames):
     def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
         place = stored["place"].numpy()
         if self.rate is not None:
-            return place / self.rate
+            return _counted(source, self._files(source))[place] / self.rate
         times = [_number(file) for file in self._files(source)]
         if None in times:
             name = self._files(source)[times.index(None)].name
@@ -220,10 +225,29 @@ class Images(Frames):
         return np.array(times)[place] * SECONDS[self.unit]
 
 
+def _counted(source: Path, files: list[Path]) -> np.ndarray:
+    """How many pictures a camera of steady rate took before each: where names end in numbers, one may be missing."""
+    numbers = np.array([_number(file) or float((re.findall(r"\d+", file.stem) or "0")[-1]) for file in files])
+    steps = np.diff(numbers)
+    least = steps.min(initial=np.inf)
+    if least <= 0 or not np.allclose(steps / least, (steps / least).round(), rtol=0, atol=1e-6):
+        return np.arange(len(files))  # names that do not count
+    counted = ((numbers - numbers[0]) / least).round()
+    missing = int(counted[-1]) + 1 - len(files)
+    if missing:
+        first = files[int(np.flatnonzero(np.diff(counted) > 1)[0])].name
+        warnings.warn(
+            f"{source}: by their numbers {missing} images are missing, the first after {first}; the others keep their "
+            "times",
+            stacklevel=6,
+        )
+    return counted
+
+
 def _number(file: Path) -> float | None:
     """The number that a file is called."""
     try:
-        return float(file.stem)
+        return read_number(file.stem)
     except ValueError:
         return None
 

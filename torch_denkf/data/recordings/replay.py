@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_denkf.data.episodes import Episode, hashed_tests
 from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
-from torch_denkf.data.recordings.clock import interpolate, last_reading, nearest_reading, row_times
+from torch_denkf.data.recordings.clock import Span, interpolate, last_reading, nearest_reading, row_times, rows_ago
 from torch_denkf.data.recordings.frames import Frames
 from torch_denkf.data.recordings.tables import Readings, Table
 from torch_denkf.data.replay import EpisodeReplay
@@ -26,7 +26,8 @@ from torch_denkf.data.statistics import picture_statistics
 __all__ = ["Recording", "RecordingReplay"]
 
 _LITTLE = 0.2  # a share of readings: fewer of them in the common time are a mistake in the unit, more often than not
-_LOST = 0.02  # a share of readings that may be lost without a word
+_LOST = 0.02  # a share of readings, or of time, that may be lost without a word
+_LONG = 1.0  # s, of a recording however long, likewise
 _PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
 _TAKEN = (
     "episode",
@@ -78,7 +79,8 @@ class Recording:
             if not isinstance(stream, (Frames, Table)):
                 raise TypeError(f"stream {key!r} is a Video, Images or Table, got {type(stream).__name__}")
             taken = key in _TAKEN or key.startswith("_")
-            if key.endswith("_observed") or (taken and not isinstance(stream, Frames)):
+            late = key.endswith("_late") and _comes_late(streams.get(key.removesuffix("_late")))
+            if late or key.endswith("_observed") or (taken and not isinstance(stream, Frames)):
                 raise ValueError(
                     f"the data set, or an environment or a filter that reads it, has an entry {key!r} of its own; give "
                     "the stream another name"
@@ -116,10 +118,12 @@ class RecordingReplay(EpisodeReplay):
     NAME                  [n,C]        float32: the columns of the table ``NAME``, such as ``state``; zero where
                                        missing
     ``NAME_observed``     [n,1]        bool: the row has a reading of its own
+    ``NAME_late``         [n,1]        int64, for tables with ``arrived``: by how many rows the reading is late
     ===================== ============ ===========================================================================
 
     Rows are the times of the stream ``clock``, or of a rate, from where all streams have begun to where the first one
-    ends. Each other stream comes onto them by its ``sample``:
+    ends: ``episodes[k].begin`` is the time of the first. So a pose that is known of an earlier time is not that of the
+    first row, unless ``span="all"`` keeps the rows before it. Each other stream comes onto them by its ``sample``:
 
     * ``"last"``, the default, holds the last value until the next one arrives. It never looks into the future.
     * ``"nearest"`` and ``"linear"`` do, by up to one reading. They suit a ``state`` that is known afterwards.
@@ -127,7 +131,8 @@ class RecordingReplay(EpisodeReplay):
     A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
     So a filter with ``observed_key="imu_observed"`` does not count one reading twice, and a model that is driven by the
     held value, such as an ``action``, reads it in all rows. ``"observed"``, the filters' default, is the camera's.
-    With ``"linear"`` every value counts as observed.
+    With ``"linear"`` every value counts as observed. Readings that come late, of a :class:`~torch_denkf.data.Table`
+    with ``arrived``, are observed in the first row after they arrived.
 
     Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read anew each time.
 
@@ -135,6 +140,9 @@ class RecordingReplay(EpisodeReplay):
         recordings: one, or several with the same streams; each is an episode.
         clock: name of the stream whose times the rows have, or a rate in Hz; by default the camera's, or else the
             first stream's.
+        span: ``"common"``: rows from where all streams have begun to where the first one ends; a warning says how much
+            is left out. ``"all"``: all times of the ``clock``, a rate's from where the first stream begins to where the
+            last one ends. A stream is zero and not observed before it begins, and not observed after its end.
         size: (H, W) to scale the pictures to, whatever their aspect.
         test_share: share of the recordings that are for tests, by a hash of their names; none by default.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
@@ -146,8 +154,9 @@ class RecordingReplay(EpisodeReplay):
     Raises:
         FileNotFoundError: without a stream's file or folder.
         ImportError: for Parquet files, without pyarrow.
-        ValueError: for tables that lack columns, hold what is no number, or whose times do not ascend; pictures that
-            cannot be decoded; streams without common times; recordings that differ in their streams or share a name.
+        ValueError: for another ``span``; tables that lack columns, hold what is no number, or whose times do not
+            ascend; pictures that cannot be decoded; streams without common times; recordings that differ in their
+            streams or share a name.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -168,6 +177,7 @@ class RecordingReplay(EpisodeReplay):
         recordings: Recording | Sequence[Recording],
         *,
         clock: str | float | None = None,
+        span: Span = "common",
         size: tuple[int, int] = (96, 128),
         test_share: float = 0.0,
         **options: Unpack[ReplayOptions],
@@ -177,6 +187,8 @@ class RecordingReplay(EpisodeReplay):
         recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
         size = check_size(size)
         clock = _check(recordings, clock)
+        if span not in ("common", "all"):
+            raise ValueError(f"span is 'common' or 'all', got {span!r}")
         cache, progress = options.get("cache", True), options.get("progress", True)
         rows: list[TensorDict] = []
         episodes: list[RecordingEpisode] = []
@@ -188,7 +200,7 @@ class RecordingReplay(EpisodeReplay):
                 for key, stream in recording.streams.items()
             }
             self._check_columns(recording, streams)
-            part, begin = _on_clock(recording, streams, clock)
+            part, begin = _on_clock(recording, streams, clock, span)
             if recording.camera is not None:
                 frame = part[_PICTURE]
                 part[_PICTURE] = torch.where(frame >= 0, frame + sum(map(len, pictures)), -1)
@@ -249,6 +261,12 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
                 f"recording {recording.name!r} has the streams {list(recording.streams)}, {first.name!r} has "
                 f"{list(first.streams)}; recordings of one data set have the same"
             )
+        for key, stream in recording.streams.items():
+            if _comes_late(stream) != _comes_late(first.streams[key]):
+                raise ValueError(
+                    f"the table {key!r} has arrived= in one of the recordings {recording.name!r} and {first.name!r}; "
+                    "recordings of one data set have the same"
+                )
     if clock is None:
         return first.camera or next(iter(first.streams))
     if isinstance(clock, str) and clock not in first.streams:
@@ -277,31 +295,64 @@ def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np
         )
 
 
-def _on_clock(recording: Recording, streams: Mapping[str, Any], clock: str | float) -> tuple[TensorDict, float]:
+def _warn_of_lost_rows(recording: str, times: Mapping[str, np.ndarray], clock: str | float, rows: np.ndarray) -> None:
+    """Warn where the clock had begun before some other stream, or went on after it."""
+    own = [times[clock]] if isinstance(clock, str) else list(times.values())
+    begin, end = rows[0] - min(of[0] for of in own), max(of[-1] for of in own) - rows[-1]
+    step = float(np.median(np.diff(rows)))
+    if max(begin, end) > step + min(_LONG, _LOST * (rows[-1] - rows[0])):
+        late, early = max(times, key=lambda key: times[key][0]), min(times, key=lambda key: times[key][-1])
+        warnings.warn(
+            f"recording {recording!r}: {begin:.3g} s before its first row and {end:.3g} s after its last one are left "
+            f"out, because {late!r} begins at {times[late][0]:.10g} s and {early!r} ends at {times[early][-1]:.10g} s; "
+            f"what is known of the beginning, such as a pose, is not that of the first row, {rows[0]:.10g} s. Pass "
+            "span='all' to keep them: a stream is not observed before it begins",
+            stacklevel=5,
+        )
+
+
+def _on_clock(
+    recording: Recording, streams: Mapping[str, Any], clock: str | float, span: Span
+) -> tuple[TensorDict, float]:
     """Rows of a recording, with the number of each one's picture, and the time of the first, s."""
-    times = {
+    taken = {
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }
+    came = {key: stream.arrived if _comes_late(stream) else taken[key] for key, stream in streams.items()}
+    times = {key: np.unique(of) for key, of in came.items()}
     try:
-        rows = row_times(times, clock)
+        rows = row_times(times, clock, span)
     except ValueError as error:
         raise ValueError(f"recording {recording.name!r}: {error}") from error
+    if span == "common":
+        _warn_of_lost_rows(recording.name, times, clock, rows)
     out: dict[str, Tensor] = {}
     for key, stream in recording.streams.items():
         read = streams[key]
         if stream.sample == "linear":
-            values, seen = interpolate(times[key], read.values, rows, stream.tolerance)
+            values, seen = interpolate(taken[key], read.values, rows, stream.tolerance)
         else:
-            choose = last_reading if stream.sample == "last" else nearest_reading
-            index, seen = choose(times[key], rows, stream.tolerance)
-            _warn_of_lost_readings(recording.name, key, times[key], rows, seen)
+            if stream.sample == "nearest":
+                index, seen = nearest_reading(taken[key], rows, stream.tolerance)
+            else:
+                order = np.argsort(came[key], kind="stable")  # a reading may overtake others
+                index, seen = last_reading(came[key][order], rows, stream.tolerance, taken[key][order])
+                index = np.where(index >= 0, order[index], -1)
+            _warn_of_lost_readings(recording.name, key, np.sort(came[key]), rows, seen)
             if not isinstance(read, Readings):
                 out[_PICTURE] = torch.from_numpy(np.where(seen, index, -1))
                 out["observed"] = torch.from_numpy(seen[:, None])
                 continue
             values = np.where((index >= 0)[:, None], read.values[index], 0.0)
+            if _comes_late(read):
+                late = np.where(index >= 0, rows_ago(taken[key][index], rows), 0)
+                out[f"{key}_late"] = torch.from_numpy(late[:, None])
         out[key] = torch.from_numpy(values.astype(np.float32))
         out[f"{key}_observed"] = torch.from_numpy(seen[:, None])
     out["step"] = torch.arange(len(rows)).unsqueeze(-1)
     out["time"] = torch.from_numpy(rows[:, None] - rows[0])
     return TensorDict(out, [len(rows)]), float(rows[0])
+
+
+def _comes_late(stream: Any) -> bool:
+    return getattr(stream, "arrived", None) is not None

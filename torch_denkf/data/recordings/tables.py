@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_number, read_number
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.recordings.clock import Way
 
@@ -27,14 +28,16 @@ class Readings(NamedTuple):
     """What a table holds.
 
     Attributes:
-        times: s, ascending, ``[n]``.
+        times: when they were taken, s, ascending, ``[n]``.
         values: ``[n, C]``.
         columns: names of the values.
+        arrived: when they could be read, s, ``[n]``; None where that is when they were taken.
     """
 
     times: np.ndarray
     values: np.ndarray
     columns: tuple[str, ...]
+    arrived: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,11 @@ class Table:
 
     Args:
         file: ends in ``.csv``, ``.txt`` or ``.tsv`` (tabs), or ``.parquet``.
-        columns: names of the columns to read, in this order; by default all but the time.
-        time: name of the column of times; they ascend.
+        columns: names of the columns to read, in this order; by default all but the times.
+        time: name of the column of times, when each reading was taken; they ascend.
+        arrived: name of a column of times at which the readings arrived, on the same clock, where they come late. A row
+            of the data set shows the last one that had arrived, and ``NAME_late`` says by how many rows it is late, as
+            :class:`~torch_denkf.filters.FusedSensor` reads it. With ``sample="last"`` alone.
         unit: of the times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
         sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next.
             These two look into the future: ``"nearest"``, the nearest in time, before or after; ``"linear"``, straight
@@ -54,15 +60,16 @@ class Table:
             readings that are farther apart; by default there always is one.
 
     Raises:
-        ValueError: for an unknown ``unit`` or ``sample``, and tolerances that are not positive.
+        ValueError: for an unknown ``unit`` or ``sample``, tolerances that are not positive, and ``arrived`` beside
+            another ``sample`` than ``"last"``.
 
     Examples:
         >>> from tempfile import mkdtemp
         >>> file = Path(mkdtemp()) / "imu.csv"
         >>> _ = file.write_text("t,wx,wy\n0,1,2\n10,3,4\n")
-        >>> Table(file, ["wy"], time="t", unit="ms").read()
-        Readings(times=array([0.  , 0.01]), values=array([[2.],
-               [4.]]), columns=('wy',))
+        >>> Table(file, ["wy"], time="t", unit="ms").read().values
+        array([[2.],
+               [4.]])
     """
 
     file: str | Path
@@ -71,9 +78,15 @@ class Table:
     unit: Unit = "s"
     sample: Way = "last"
     tolerance: float | None = None
+    arrived: str | None = None
 
     def __post_init__(self):
         check_stream(self.sample, ("last", "nearest", "linear"), self.tolerance, self.unit)
+        if self.arrived is not None and self.sample != "last":
+            raise ValueError(
+                f"arrived={self.arrived!r} says when a reading can be known, which sample={self.sample!r} does not "
+                "wait for; pass sample='last', or leave arrived out"
+            )
 
     def read(self) -> Readings:
         """The whole table.
@@ -81,20 +94,35 @@ class Table:
         Raises:
             FileNotFoundError: without the file.
             ImportError: for Parquet, without pyarrow.
-            ValueError: for columns that are not there, values that are no finite numbers, and times that do not
-                ascend; names the file, the line and the column.
+            ValueError: for columns that are not there, values that are no finite numbers, times that do not ascend, and
+                readings that arrive before they are taken; names the file, the line and the column.
         """
         if self.columns is not None and not isinstance(self.columns, Sequence):
             raise TypeError(f"columns is a list of names, or None; got {self.columns!r}")
         columns = None if self.columns is None else list(self.columns)
         if isinstance(self.columns, str):
             raise ValueError(f"columns is a list of names, such as [{self.columns!r}]; got {self.columns!r}")
+        if self.arrived is not None and columns is not None:
+            columns = [*columns, self.arrived]
         names, numbers, place = read_numbers(Path(self.file).expanduser(), self.time, columns)
+        times, values, arrived = numbers[:, 0] * SECONDS[self.unit], numbers[:, 1:], None
+        check_times(times, place, self.time)
+        if self.arrived is not None:
+            if self.arrived not in names:
+                raise ValueError(f"{self.file} lacks the column {self.arrived!r} of arrivals; it has {list(names)}")
+            at = names.index(self.arrived) if columns is None else len(names) - 1
+            names, arrived = names[:at] + names[at + 1 :], values[:, at] * SECONDS[self.unit]
+            values = np.delete(values, at, 1)
+            early = np.flatnonzero(arrived < times)
+            if len(early):
+                row = int(early[0])
+                raise ValueError(
+                    f"{place(row)}: {self.arrived!r} is {arrived[row]:.15g} s, before {self.time!r}, {times[row]:.15g} "
+                    "s; a reading arrives after it was taken: exchange the two columns, or correct them"
+                )
         if not names:
             raise ValueError(f"{self.file} has no column to read beside {self.time!r}; leave the stream out")
-        times = numbers[:, 0] * SECONDS[self.unit]
-        check_times(times, place, self.time)
-        return Readings(times, numbers[:, 1:], names)
+        return Readings(times, values, names, arrived)
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str) -> None:
@@ -152,10 +180,11 @@ def read_numbers(
 
 def _choose(file: Path, there: Sequence[str], time: str, columns: Sequence[str] | None) -> list[str]:
     names = [time, *([name for name in there if name != time] if columns is None else columns)]
-    missing = [name for name in names if name not in there]
+    count = Counter(there)
+    missing = [name for name in names if not count[name]]
     if missing:
         raise ValueError(f"{file} lacks the columns {missing}; it has {list(there)}: {_hint(there, time, missing)}")
-    twice = [name for name in names if there.count(name) > 1]
+    twice = [name for name in names if count[name] > 1]
     if twice:
         raise ValueError(f"{file} has two columns {twice[0]!r}; give one another name, or pass columns= without it")
     return names
@@ -173,10 +202,10 @@ def _hint(there: Sequence[str], time: str, missing: Sequence[str]) -> str:
 def _number(text: str) -> float:
     """A finite number that float32 can hold; NaN for what is none."""
     try:
-        number = float(text)
+        number = read_number(text)
     except ValueError:
         return math.nan
-    return number if abs(number) <= LARGEST and "_" not in text else math.nan
+    return number if abs(number) <= LARGEST else math.nan
 
 
 def _is_number(text: str) -> bool:
@@ -201,7 +230,8 @@ def _read_csv(file: Path, time: str, columns: Sequence[str] | None):
             filled = (row for row in reader if any(map(str.strip, row)))
             there = [name.strip() for name in next(filled, [])]
             names = _choose(file, there, time, columns)
-            where = [there.index(name) for name in names]
+            places = {name: place for place, name in enumerate(there)}
+            where = [places[name] for name in names]
             for row in filled:
                 place = f"{file}:{reader.line_num}"
                 if any(map(str.strip, row[len(there) :])):
