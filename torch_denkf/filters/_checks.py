@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
 
 from torch_denkf._checks import has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
@@ -85,11 +86,9 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
     """
-    finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
+    finite = all(_is_finite(key, written[key]) for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
-    # -inf is the log-weight of a particle that is out of the question.
-    lost = [key for key in structure.carry if key in entries and not bool((entries[key] < torch.inf).all())]
-    if finite and not absurd and not lost:
+    if finite and not absurd and all(_is_finite(key, entries[key]) for key in structure.carry if key in entries):
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
     bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
@@ -103,6 +102,11 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
         "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
+
+
+def _is_finite(key: NestedKey, value: Tensor) -> bool:
+    """Whether an entry of a belief is finite; -inf is the log-weight of a particle that is out of the question."""
+    return bool((value < torch.inf).all()) if key[-1] == "log_weight" else bool(value.isfinite().all())
 
 
 def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:
