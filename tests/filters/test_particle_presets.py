@@ -80,7 +80,7 @@ def test_a_raw_reading_is_read_where_the_key_says(float64, preset):
 def test_a_likelihood_of_ones_own_has_the_key_itself():
     parts = toy_parts()
     likelihood = LearnedLikelihood(M, OBS, num_cells=(8,), encoding_key="measurement")
-    with pytest.raises(ValueError, match="give them to yours instead, the key as .* encoding_key="):
+    with pytest.raises(ValueError, match=r"give them to yours instead, the key as .* encoding_key="):
         DPF(**parts, likelihood=likelihood, observation_key="measurement")
 
 
