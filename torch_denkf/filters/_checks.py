@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsurdReading",
     "check_inputs",
+    "is_finite",
     "refuse_absurd_readings",
     "refuse_non_finite",
     "refuse_single_readings",
@@ -86,12 +87,12 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
     """
-    finite = all(_is_finite(key, written[key]) for key in structure.carry if key in written)
+    finite = all(is_finite(key, written[key]) for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
-    if finite and not absurd and all(_is_finite(key, entries[key]) for key in structure.carry if key in entries):
+    if finite and not absurd and all(is_finite(key, entries[key]) for key in structure.carry if key in entries):
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
-    bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
+    bad = [key for key, value in given.items() if not is_finite(key, value)]
     if absurd and not set(absurd) & set(bad):
         why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
     else:
@@ -104,7 +105,7 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
     )
 
 
-def _is_finite(key: NestedKey, value: Tensor) -> bool:
+def is_finite(key: NestedKey, value: Tensor) -> bool:
     """Whether an entry of a belief is finite; -inf is the log-weight of a particle that is out of the question."""
     return bool((value < torch.inf).all()) if key[-1] == "log_weight" else bool(value.isfinite().all())
 
