@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,14 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 import torch_denkf
-from torch_denkf._files import replacing
+from torch_denkf._files import sync, write_bytes, write_text
+from torch_denkf._lock import locked
 
 __all__ = ["load_folder", "read_folder_config", "save_folder"]
 
 FORMAT = "torch_denkf.filter/1"
 WEIGHTS, CONFIG = "weights.safetensors", "config.json"
+_UNSETTLED = re.compile(r"weights-[0-9a-f]{64}\.safetensors")
 
 
 def save_folder(
@@ -37,7 +42,8 @@ def save_folder(
 
     Args:
         model: the model.
-        folder: made where it is not there; a model in it is replaced.
+        folder: made where it is not there; a model in it is replaced, whole or not at all, also by a process that is
+            killed.
         builder: name of the function that builds such a model from the settings.
         settings: plain values.
         training: command, seed, drives: plain values, for the record alone.
@@ -46,7 +52,8 @@ def save_folder(
         The folder.
 
     Raises:
-        OSError: if the folder cannot be written to, or the disk is full; a model in it is then as it was.
+        OSError: if the folder cannot be written to, the disk is full, or another process saves to it; a model in it is
+            then as it was.
         TypeError: if settings or training hold what JSON does not know.
 
     Example:
@@ -69,10 +76,32 @@ def save_folder(
     # Copies: safetensors refuses tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()
-    with replacing(folder / WEIGHTS) as part, replacing(folder / CONFIG) as part_of_config:
-        part.write_bytes(weights)
-        part_of_config.write_text(json.dumps(config, indent=1) + "\n")
+    with locked(folder, ".saving", "is saving to it"):
+        _settle(folder)
+        try:  # the new weights lie beside the old ones until one rename, that of the description, changes the model
+            write_bytes(_unsettled(folder, config["sha256"]), weights)
+            write_text(folder / CONFIG, json.dumps(config, indent=1) + "\n")
+        finally:
+            _settle(folder)
     return folder
+
+
+def _unsettled(folder: Path, sha256: object) -> Path:
+    """Where new weights are until a description of them has taken the place of the old one."""
+    return folder / f"weights-{sha256}.safetensors"
+
+
+def _settle(folder: Path) -> None:
+    """Gives weights that are described their name, and removes those that never were."""
+    described = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        described = _unsettled(folder, json.loads((folder / CONFIG).read_text()).get("sha256"))
+    for file in [file for file in folder.iterdir() if _UNSETTLED.fullmatch(file.name)]:
+        if file == described:
+            os.replace(file, folder / WEIGHTS)
+        else:
+            file.unlink()
+    sync(folder)
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
@@ -123,7 +152,9 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
         model = builders[config["builder"]](**values)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder / CONFIG} does not make a filter: {error}") from error
-    file = folder / WEIGHTS
+    file = _unsettled(folder, config.get("sha256"))
+    if not _UNSETTLED.fullmatch(file.name) or not file.is_file():
+        file = folder / WEIGHTS
     if not file.is_file():
         raise FileNotFoundError(f"no weights {file}; restore the file from a copy, or train anew")
     if _sha256(file) != config.get("sha256"):
