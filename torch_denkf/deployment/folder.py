@@ -19,6 +19,7 @@ from torch import Tensor, nn
 import torch_denkf
 from torch_denkf._files import sync, write_bytes, write_text
 from torch_denkf._lock import locked
+from torch_denkf.deployment.rebuilt import build_from, refuse_another
 
 __all__ = ["load_folder", "read_folder_config", "save_folder"]
 
@@ -34,6 +35,7 @@ def save_folder(
     builder: str,
     settings: Mapping[str, Any],
     training: Mapping[str, Any] | None = None,
+    build: Callable[..., nn.Module] | None = None,
 ) -> Path:
     """Writes a model to a folder.
 
@@ -47,6 +49,7 @@ def save_folder(
         builder: name of the function that builds such a model from the settings.
         settings: plain values.
         training: command, seed, drives: plain values, for the record alone.
+        build: that function, to make sure that it builds such a model; ``None`` for no look.
 
     Returns:
         The folder.
@@ -55,6 +58,7 @@ def save_folder(
         OSError: if the folder cannot be written to, the disk is full, or another process saves to it; a model in it is
             then as it was.
         TypeError: if settings or training hold what JSON does not know.
+        ValueError: if ``build`` makes another model; the message names what differs.
 
     Example:
         >>> import tempfile
@@ -73,6 +77,8 @@ def save_folder(
         json.dumps(config, allow_nan=False)  # before anything is written
     except (TypeError, ValueError) as error:
         raise TypeError(f"settings and training are plain values, as JSON knows them: {error}") from error
+    if build is not None:
+        refuse_another(model, builder, build, json.loads(json.dumps(config["settings"])))
     # Copies: safetensors refuses tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()
@@ -148,8 +154,7 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     folder = Path(folder).expanduser()
     config = read_folder_config(folder, builders)
     try:
-        values = {name: _as_tuples(value) for name, value in config["settings"].items()}
-        model = builders[config["builder"]](**values)
+        model = build_from(builders[config["builder"]], config["settings"])
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder / CONFIG} does not make a filter: {error}") from error
     file = _unsettled(folder, config.get("sha256"))
@@ -192,7 +197,3 @@ def _fits(value: Tensor, made: Tensor) -> bool:
 
 def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _as_tuples(value: Any) -> Any:
-    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
