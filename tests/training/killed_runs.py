@@ -32,12 +32,6 @@ KILLS = {
 #: A run without tensorboard, whose files are named after the time: ten kills, one in each run.
 TEN_KILLS = [("sample", 2)] * 5
 TEN_KILLS += [("before replace", 2), ("log", 2), ("validate", 2), ("sample", 4), ("after replace", 1)]
-    ("before replace", 2),
-    ("log", 2),
-    ("validate", 2),
-    ("sample", 4),
-    ("after replace", 1),
-]
 
 
 def fork(out, kill, environment, loggers=("csv", "tensorboard")):
