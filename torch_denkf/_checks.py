@@ -166,12 +166,12 @@ def check_number(
         raise ValueError(f"{name} must be {_range(above, least, below, most)}; got {value!r}" + _end(cure))
 
 
-def check_count(name: str, value: Any, *, least: int = 1, cure: str = "") -> None:
-    """Raise unless ``value`` is a whole number, at least so large.
+def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None, cure: str = "") -> None:
+    """Raise unless ``value`` is a whole number, at least so large, and at most so large where ``most`` says so.
 
     Raises:
         TypeError: if it is no whole number.
-        ValueError: if it is too small.
+        ValueError: if it is too small or too large.
 
     Example:
         >>> check_count("ensemble_size", -3)
@@ -185,6 +185,8 @@ def check_count(name: str, value: Any, *, least: int = 1, cure: str = "") -> Non
         )
     if value < least:
         raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}" + _end(cure))
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be a whole number, at most {most}; got {value!r}" + _end(cure))
 
 
 def check_values(

@@ -26,7 +26,6 @@ from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
-    GaussianLikelihood,
     GaussianPrior,
     LearnedLikelihood,
     LearnedObservation,
@@ -101,7 +100,7 @@ filters = {
     "DEnKF, sakov": ensemble(EnsembleAnalysis("sakov", sensor_key="reading")),
     "DEnKF, local": ensemble(LocalEnsembleAnalysis(torch.ones(2, 1), sensor_key="reading")),
     "ParticleFilter": ParticleFilter(
-        motion, None, side, GaussianLikelihood(sensor_key="reading"), noise=noise, initial=particles, process_noise=wind
+        motion, None, side, noise=noise, initial=particles, process_noise=wind, observation_key="reading"
     ),
     "DPF": DPF(windy, None, side, likelihood, initial=particles),
     "LSTMFilter": LSTMFilter(None, features=1, state_dim=2, encoding_key="reading", hidden_size=32, scale=[0.35, 0.7]),

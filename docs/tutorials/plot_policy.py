@@ -187,8 +187,9 @@ plt.show()
 # %%
 # From here
 # ---------
-# * With torchrl's losses write ``TensorDictSequential(filter, actor)`` for DDPG and SAC, and
-#   ``ProbabilisticTensorDictSequential(filter, *actor)`` for PPO: see :doc:`/start/three_ways`.
+# * Policies that draw their actions, as those of SAC and PPO do, are
+#   ``ProbabilisticTensorDictSequential(filter, *actor)``. What torchrl's losses then need, and a program with SAC:
+#   :doc:`/start/three_ways`.
 # * Put a filter that is trained already into the environment. Put it into the policy where it is to learn from the
 #   reward. The same filter belongs into one of both places.
 # * The true motion, learned from recordings: :doc:`plot_training`.

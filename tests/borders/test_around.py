@@ -19,7 +19,7 @@ from torch_denkf.envs import ReplayEnv
 from torch_denkf.modules import LearnedTransition, MemberGain, NoisyTransition
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
 from torch_denkf.odometry import car_filter, evaluate_car_filter, track, train_car_filter
-from torch_denkf.pretrained import from_pretrained, save_pretrained
+from torch_denkf.pretrained import from_pretrained, reacher, save_pretrained
 from torch_denkf.simulation.lorenz96 import lorenz96_step
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
@@ -95,7 +95,7 @@ WRONG_TYPES = {
     "settings": (lambda: car_filter(colour="red"), "colour", "dt"),
     "a number for a name": (lambda: from_pretrained(3), "name_or_folder", "3"),
     "text for settings": (
-        lambda: save_pretrained(torch.nn.Linear(1, 1), "nowhere", builder="x", settings="x"),
+        lambda: save_pretrained(torch.nn.Linear(1, 1), "nowhere", builder=reacher, settings="x"),
         "settings",
         "'x'",
     ),

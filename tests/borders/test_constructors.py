@@ -181,6 +181,7 @@ REFUSED = {
     "ess": (lambda: ResampledTransition(LearnedTransition(NET), ess_threshold=NAN), "ess_threshold", "got nan"),
     "likelihood": (lambda: LearnedLikelihood(2, 2, scale=0.0), "scale", "got 0.0"),
     "memory": (lambda: LSTMUpdate(2, features=2, hidden_size=0), "hidden_size", "got 0"),
+    "endless layers": (lambda: LSTMUpdate(2, features=2, num_layers=2**63), "num_layers", "at most 1000", f"{2**63}"),
     "ceiling": (lambda: KalmanFilter(**PARTS, variance_ceiling=-1.0), "variance_ceiling", "got -1.0"),
     "Table I": (lambda: DEnKF.paper(state_dim=2, observation_dim=2, ensemble_size=-1), "ensemble_size", "got -1"),
 }

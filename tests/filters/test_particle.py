@@ -127,7 +127,8 @@ def test_the_default_likelihood_heeds_a_mask_of_another_name(float64):
     prior = GaussianPrior([1.0, -1.0], [1.0, 1.4], ensemble_size=20)
     noise = ConstantNoise(R.sqrt(), in_key=("sensor", "ensemble"), out_key=("camera", "r"))
     parts = (NoisyLinear(F, torch.linalg.cholesky(Q)), None, LinearObservation(H))
-    usual, renamed = (ParticleFilter(*parts, initial=prior, noise=noise, **key) for key in ({}, {"observed_key": "up"}))
+    options = {"initial": prior, "noise": noise, "observation_key": ("sensor", "ensemble")}
+    usual, renamed = (ParticleFilter(*parts, **options, **key) for key in ({}, {"observed_key": "up"}))
     frames = TensorDict({"sensor": {"ensemble": torch.randn(3, 8, 1, 2)}}, [3, 8])
     frames["observed"] = torch.rand(3, 8, 2) < 0.6
     frames = usual.draw_noise(frames)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import OBS, M, toy_frames
-from tests.filters.particle_for_tests import E, toy_parts
+from tests.filters.factories import OBS, M, NoisyLinear, assert_equal, linear_system, toy_frames
+from tests.filters.particle_for_tests import BELIEF, E, bootstrap, toy_parts
 from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
     AroundState,
@@ -15,6 +15,7 @@ from torch_denkf.modules import (
     DiagonalNoise,
     GaussianLikelihood,
     LearnedLikelihood,
+    LinearObservation,
     NoisyTransition,
     PairObservation,
     ResampledTransition,
@@ -56,6 +57,31 @@ def test_pfm(learned):
     assert all(p.grad is None or p.grad.isfinite().all() for p in filter.parameters())
     with pytest.raises(ValueError, match="its Gaussian likelihood, or a learned_likelihood"):
         MixtureParticleFilter(**toy_parts())
+
+
+@pytest.mark.parametrize("preset", [ParticleFilter, MixtureParticleFilter])
+def test_a_raw_reading_is_read_where_the_key_says(float64, preset):
+    """Against the filter whose likelihood names the reading: the same belief, bit for bit."""
+    F, Q, H, R = linear_system()
+    scheme = "soft" if preset is MixtureParticleFilter else "systematic"
+    expected = bootstrap(50, resampling=scheme, observed_key="up")
+    motion = NoisyLinear(F, torch.linalg.cholesky(Q))
+    noise = ConstantNoise(R.sqrt(), in_key="observation")
+    options = {"initial": expected.initial, "observed_key": "up"}
+    found = preset(motion, None, LinearObservation(H), noise=noise, observation_key="observation", **options)
+    td = TensorDict({"observation": torch.randn(3, 9, 2), "up": torch.rand(3, 9, 2) < 0.7}, [3, 9])
+    td = expected.draw_noise(td)
+    assert_equal(found.sequence(td.copy()), expected.sequence(td.copy()), BELIEF)
+
+    with pytest.raises(ValueError, match="say where the reading is: observation_key="):
+        preset(motion, None, LinearObservation(H), noise=noise, **options)
+
+
+def test_a_likelihood_of_ones_own_has_the_key_itself():
+    parts = toy_parts()
+    likelihood = LearnedLikelihood(M, OBS, num_cells=(8,), encoding_key="measurement")
+    with pytest.raises(ValueError, match=r"give them to yours instead, the key as .* encoding_key="):
+        DPF(**parts, likelihood=likelihood, observation_key="measurement")
 
 
 def test_what_is_there_already_is_kept():

@@ -20,6 +20,7 @@ from torch_denkf.functional import (
     weighted_mean,
     weighted_var,
 )
+from torch_denkf.functional.weighted import weighted_median
 
 E, S = 6, 2
 BATCHES = [(), (3,), (2, 2)]
@@ -58,6 +59,16 @@ def test_equal_weights_give_the_ensembles_moments():
     torch.testing.assert_close(weighted_mean(particles, equal), ensemble_mean(particles))
     torch.testing.assert_close(weighted_var(particles, equal), ensemble_var(particles))
     torch.testing.assert_close(effective_sample_size(equal), torch.full((3,), float(E)))
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_median_of_rational_weights_is_that_of_repeated_particles(batch):
+    particles = torch.randn(*batch, 4, S)
+    particles[..., 2, :] = torch.inf  # without weight
+    counts = torch.tensor([2, 3, 0, 4])
+    repeated = particles.repeat_interleave(counts, -2)
+    found = weighted_median(particles, (counts / 9).log().expand(*batch, 4))
+    torch.testing.assert_close(found, repeated.median(-2).values, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("batch", BATCHES)
@@ -331,3 +342,16 @@ def test_gradient_of_jitter_is_that_of_finite_differences():
         return jitter_copies(particles[:, [0, 0, 1, 1, 3]], particles, raw.log_softmax(-1), normal, factor=0.8)
 
     assert torch.autograd.gradcheck(jitter, (particles, log_weights))
+
+
+def test_transport_does_not_look_where_particles_without_weight_are():
+    particles, log_weights = problem((20,), size=40)
+    near, far = particles.clone(), particles.clone()
+    log_weights[:, :3] = -torch.inf
+    log_weights = log_weights.log_softmax(-1)
+    near[:, :3], far[:, :3] = weighted_mean(particles, log_weights).unsqueeze(-2), 1e6
+    expected, _ = transport_resample(near, log_weights)
+    found, _ = transport_resample(far, log_weights)
+    torch.testing.assert_close(found, expected)
+    # Not all the spread is lost to the regularisation, as it is where one scale must do for 1 and 1e6.
+    assert ensemble_var(found).mean() > 0.7 * weighted_var(far, log_weights).mean()

@@ -2,15 +2,18 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Independent, Normal
 from torchrl.envs import TransformedEnv
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator, set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 from torchrl.objectives import ClipPPOLoss, DDPGLoss, SACLoss
 
 from tests.filters.composed import A, B, ReplayedFrames, S, T, compose, frames_for
+from tests.filters.factories import toy_denkf, toy_frames
+from tests.test_docs import BLOCK, ROOT
 
 MEAN = ("belief", "mean")
 
@@ -187,7 +190,145 @@ def test_sac(float64):
     assert_same_gradients(actor_loss, by_hand, [filter, head])
 
 
-def q_of(loss, mean, action):
-    params = loss.qvalue_network_params[0].detach()
+def q_of(loss, mean, action, number=0):
+    params = loss.qvalue_network_params[number].detach()
     with params.to_module(loss.qvalue_network):
         return loss.qvalue_network.module(mean, action)
+
+
+def filtered(filter, batch):
+    """Puts what the filter believes now in the place of what it believed while it collected, as on the page."""
+    with set_recurrent_mode(True):
+        filter(batch)
+        for key in filter.carry_keys:
+            batch["next", "previous", *key] = batch[key].detach()
+        with torch.no_grad():
+            filter(batch["next"])
+    return batch
+
+
+def with_other_beliefs(data):
+    """As if the policy had believed something else while it collected."""
+    out = data.clone()
+    out["belief"].apply_(lambda value: value.fill_(50.0))
+    return out
+
+
+def sac(filter, *, inside, **options):
+    """SAC on what a filter believes; with the filter in the actor, or in front of it."""
+    head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor())
+    own = TensorDictModule(head, [MEAN], ["loc", "scale"])
+    actor = ProbabilisticActor(
+        TensorDictSequential(filter, own) if inside else own,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    options = {"fixed_alpha": True, "alpha_init": 0.3, "target_entropy": -2.0, "loss_function": "l2", **options}
+    return actor, head, options
+
+
+def test_sac_on_what_the_filter_believes_now(float64):
+    """Both losses written out, with the beliefs of each step by hand; what was stored must not matter."""
+    filter, frames = filter_and_frames()
+    data = collected(filter, frames)
+    actor, head, options = sac(filter, inside=False)
+    loss = SACLoss(actor, q_network(), **options)
+    loss.make_value_estimator(gamma=0.9)
+    with torch.no_grad():  # it has learned since
+        for parameter in filter.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    found = []
+    for stored in (data, with_other_beliefs(data)):
+        torch.manual_seed(3)
+        found.append(loss(filtered(filter, stored.clone())))
+    assert found[0]["loss_qvalue"].equal(found[1]["loss_qvalue"])
+    assert found[0]["loss_actor"].equal(found[1]["loss_actor"])
+
+    roots, nexts = beliefs_by_hand(filter, data)
+    assert not torch.allclose(roots, data[MEAN], atol=1e-3), "the stored beliefs are old"
+    torch.manual_seed(3)
+    ahead = TanhNormal(*head(nexts.detach()))
+    action = ahead.rsample()
+    worth = torch.stack([q_of(loss, nexts, action, number) for number in (0, 1)]).min(0).values
+    worth = worth - 0.3 * ahead.log_prob(action).unsqueeze(-1)
+    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
+    seen = [q_of(loss, roots, data["action"], number) for number in (0, 1)]
+    by_hand = sum((q - target.detach()).square().mean() for q in seen)
+    torch.testing.assert_close(found[0]["loss_qvalue"], by_hand)
+    assert_same_gradients(found[0]["loss_qvalue"], by_hand, [filter])
+
+    now = TanhNormal(*head(roots))
+    action = now.rsample()
+    worth = torch.stack([q_of(loss, roots, action, number) for number in (0, 1)]).min(0).values
+    by_hand = (0.3 * now.log_prob(action).unsqueeze(-1) - worth).mean()
+    torch.testing.assert_close(found[0]["loss_actor"], by_hand)
+    assert_same_gradients(found[0]["loss_actor"], by_hand, [filter, head])
+
+
+def test_the_sac_of_the_page_does_not_look_at_what_was_believed(tmp_path, monkeypatch):
+    """The program of the page Three ways, as it stands there."""
+    monkeypatch.chdir(tmp_path)
+    code = [match["code"] for match in BLOCK.finditer((ROOT / "docs/start/three_ways.md").read_text())][-1]
+    names = {}
+    exec(compile(code, "three_ways.md", "exec"), names)
+    rows = names["buffer"].sample().reshape(-1, 10)
+    losses = []
+    for stored in (rows, with_other_beliefs(rows)):
+        torch.manual_seed(3)
+        losses.append(names["loss"](names["filtered"](stored.clone())))
+    for name in ("loss_qvalue", "loss_actor"):
+        assert losses[0][name].equal(losses[1][name])
+    assert losses[0]["loss_qvalue"] > 0
+
+
+@pytest.mark.parametrize("vmap", [True, False])
+def test_sac_with_the_filter_in_the_critic_too(float64, vmap):
+    """``separate_losses`` alone leaves the filter its weights; otherwise torchrl draws a critic's weights anew."""
+    filter, frames = filter_and_frames()
+    data = collected(filter, frames)
+    actor, head, options = sac(filter, inside=True)
+    critic = TensorDictSequential(filter, q_network())
+    loss = SACLoss(actor, critic, separate_losses=True, deactivate_vmap=not vmap, **options)
+    loss.make_value_estimator(gamma=0.9)
+    loss.set_vmap_randomness("different")
+    found = []
+    for stored in (data, with_other_beliefs(data)):
+        torch.manual_seed(3)
+        found.append(loss.qvalue_v2_loss(stored.clone())[0])
+    assert found[0].equal(found[1])
+    roots, nexts = beliefs_by_hand(filter, data)
+    torch.manual_seed(3)
+    ahead = TanhNormal(*head(nexts.detach()))
+    action = ahead.rsample()
+    of_critic = [params.detach()["module", "1"] for params in loss.qvalue_network_params.unbind(0)]
+
+    def q_by_hand(number, mean, action):
+        with of_critic[number].to_module(critic[1]):
+            return critic[1].module(mean, action)
+
+    worth = torch.stack([q_by_hand(number, nexts, action) for number in (0, 1)]).min(0).values
+    worth = worth - 0.3 * ahead.log_prob(action).unsqueeze(-1)
+    target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * worth
+    seen = [q_by_hand(number, roots, data["action"]) for number in (0, 1)]
+    torch.testing.assert_close(found[0].mean(), sum((q - target.detach()).square().mean() for q in seen))
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+@pytest.mark.parametrize("randomness", ["different", "same"])
+def test_a_filter_with_dropout_runs_under_vmap(float64, randomness):
+    """An ensemble of filters, as torchrl runs an ensemble of critics: each draws its own masks, or all the same."""
+    filter = toy_denkf()
+    frames = toy_frames((2, 5), resets=False)
+    weights = TensorDict.from_module(filter).expand(3).clone()
+
+    def mean(weights):
+        with weights.to_module(filter, preserve_module_state=False), set_recurrent_mode(True):
+            return filter(frames.copy())[MEAN]
+
+    means = torch.vmap(mean, randomness=randomness)(weights)
+    apart = (means[1:] - means[:1]).abs().amax((1, 2, 3))
+    assert (apart > 1e-3).all() if randomness == "different" else (apart == 0).all()
+    one = torch.stack([filter.sequence(frames.copy())[MEAN] for _ in range(50)])
+    error = (means - one.mean(0)).abs().amax() / one.std(0).amax()
+    assert error < 5, "draws of the same distribution"

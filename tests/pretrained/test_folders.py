@@ -1,6 +1,7 @@
 """Filters by name and from folders: what is saved comes back; what is damaged, changed or unknown is named."""
 
 import hashlib
+import inspect
 import json
 import shutil
 from pathlib import Path
@@ -11,7 +12,15 @@ from tensordict import TensorDict
 
 import torch_denkf
 from torch_denkf import from_pretrained, save_pretrained
-from torch_denkf.filters import KalmanFilter
+from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.modules import (
+    ConstantNoise,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    StochasticMLP,
+)
 from torch_denkf.odometry import load_car_filter
 from torch_denkf.pretrained import reacher, ur5_table
 
@@ -76,15 +85,81 @@ def test_own_builders(tmp_path):
         eye = torch.eye(size)
         return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
 
-    with pytest.raises(ValueError, match=r"not known what builds this KalmanFilter; pass builder=NAME"):
+    with pytest.raises(ValueError, match=r"not known what builds this KalmanFilter; pass builder=FUNCTION"):
         save_pretrained(still(2), tmp_path)
-    save_pretrained(still(2), tmp_path, builder="still", settings={"size": 2})
+    save_pretrained(still(2), tmp_path, builder=still, settings={"size": 2})
     with pytest.raises(ValueError, match="is of a filter that 'still' builds"):
         from_pretrained(tmp_path)
     assert isinstance(from_pretrained(tmp_path, builders={"still": still}), KalmanFilter)
     with pytest.raises(TypeError, match="JSON"):
-        save_pretrained(still(2), tmp_path / "none", builder="still", settings={"size": torch.ones(1)})
+        save_pretrained(still(2), tmp_path / "none", builder=still, settings={"size": torch.ones(1)})
     assert not (tmp_path / "none").exists()
+
+
+def ball(
+    members=8, cells=(8,), scheme="perturbed", std=0.5, seen=(0,), gain=1.0, start=1.0, ceiling=1e12, key="camera"
+):
+    """A filter each of whose settings changes what it believes, or where it reads; few of them are stored numbers."""
+    return DEnKF(
+        LearnedTransition(StochasticMLP(2, 2, cells)),
+        None,
+        LearnedObservation(lambda state: gain * state[..., list(seen)]),
+        ConstantNoise([std] * len(seen), in_key=key),
+        EnsembleAnalysis(scheme, sensor_key=key),
+        initial=GaussianPrior([0.0, 0.0], [start, 1.0], ensemble_size=members),
+        process_noise=0.1,
+        variance_ceiling=ceiling,
+    )
+
+
+CHANGED = {
+    "members": 32,
+    "cells": (16,),
+    "scheme": "etkf",
+    "std": 0.25,
+    "seen": (1,),
+    "gain": 2.0,
+    "start": 3.0,
+    "ceiling": 2.0,
+    "key": "lidar",
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_settings_that_build_another_filter_are_refused(tmp_path, name):
+    torch.manual_seed(0)
+    model, settings = ball(), {name: CHANGED[name]}
+    stored = name in ("std", "start")  # a number in a buffer comes back with the weights
+    if not stored:
+        with pytest.raises(ValueError, match=rf"ball\({name}=.*\) builds another model than the one to be stored"):
+            save_pretrained(model, tmp_path, builder=ball, settings=settings)
+        assert list(tmp_path.iterdir()) == []
+        settings = {name: inspect.signature(ball).parameters[name].default}
+    save_pretrained(model, tmp_path, builder=ball, settings=settings)
+    again = from_pretrained(tmp_path, builders={"ball": ball})
+    frames = TensorDict({"camera": torch.randn(3, 6, 1)}, [3, 6])
+    frames = model.draw_noise(frames)  # one noise for both
+    believed, expected = (filter.sequence(frames.copy())["belief", "ensemble"] for filter in (again, model))
+    assert torch.equal(believed, expected)
+
+
+def test_what_differs_is_named_and_saving_draws_no_random_numbers(tmp_path):
+    model = ball()
+    with pytest.raises(ValueError, match=r"initial.ensemble_size is 8, built: 32"):
+        save_pretrained(model, tmp_path, builder=ball, settings={"members": 32})
+    with pytest.raises(ValueError, match=r"transition.* is torch.float64 .*, built: torch.float32"):
+        save_pretrained(ball().double(), tmp_path, builder=ball, settings={})
+    changed = ball()
+    changed["analysis"].inflation = 1.1
+    with pytest.raises(ValueError, match=r"\.inflation is 1.1, built: 1.0"):
+        save_pretrained(changed, tmp_path, builder=ball, settings={})
+    with pytest.raises(TypeError, match="a function with a name"):
+        save_pretrained(model, tmp_path, builder=lambda: ball(), settings={})
+    torch.manual_seed(3)
+    save_pretrained(model.compile(), tmp_path, builder=ball, settings={})
+    after = torch.rand(3)
+    torch.manual_seed(3)
+    assert torch.equal(torch.rand(3), after)
 
 
 def test_mistakes_are_named(tmp_path):

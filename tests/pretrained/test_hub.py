@@ -37,7 +37,7 @@ def test_a_folder_of_the_mixin_is_one_of_the_library(tmp_path):
 
 @pytest.mark.skipif(not INSTALLED, reason="pip install 'torch_denkf[hub]'")
 def test_a_filter_of_ones_own_keeps_its_builder(tmp_path):
-    HubFilter(still(2), builder="still", settings={"size": 2}).save_pretrained(tmp_path / "a")
+    HubFilter(still(2), builder=still, settings={"size": 2}).save_pretrained(tmp_path / "a")
     again = HubFilter.from_pretrained(tmp_path / "a", builders={"still": still})
     again.save_pretrained(tmp_path / "b")
     assert from_pretrained(tmp_path / "b", builders={"still": still}).carry_keys == still(2).carry_keys

@@ -29,7 +29,12 @@ KILLS = {
 }
 
 
-def fork(out, kill, environment):
+#: A run without tensorboard, whose files are named after the time: ten kills, one in each run.
+TEN_KILLS = [("sample", 2)] * 5
+TEN_KILLS += [("before replace", 2), ("log", 2), ("validate", 2), ("sample", 4), ("after replace", 1)]
+
+
+def fork(out, kill, environment, loggers=("csv", "tensorboard")):
     """Trains in a new process; returns its number."""
     child = os.fork()
     if child:
@@ -37,7 +42,7 @@ def fork(out, kill, environment):
     status = 1
     try:
         os.environ.update(environment)
-        trainer = make_trainer(out, kill=kill, loggers=("csv", "tensorboard"))
+        trainer = make_trainer(out, kill=kill, loggers=loggers)
         trainer.fit()
         torch.save(trainer.model.state_dict(), Path(out) / f"final_{trainer.processes.rank}.pt")
         status = 0
@@ -47,7 +52,7 @@ def fork(out, kill, environment):
         os._exit(status)
 
 
-def run(out, kill=(), processes=1):
+def run(out, kill=(), processes=1, **options):
     """Trains; returns how the first process ended: 0, or minus the signal."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -55,7 +60,7 @@ def run(out, kill=(), processes=1):
     address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(processes)}
     children = [
         # Only the first process is killed; the others lose their partner and fail.
-        fork(out, kill if rank == 0 else (), {**address, "RANK": str(rank)} if processes > 1 else {})
+        fork(out, kill if rank == 0 else (), {**address, "RANK": str(rank)} if processes > 1 else {}, **options)
         for rank in range(processes)
     ]
     codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
@@ -72,6 +77,10 @@ def main(folder):
             code = run(folder / name, kill, processes)
             assert code == -9, f"{name}: {kill} ended with {code}"
         assert run(folder / name, processes=processes) == 0, name
+    assert run(folder / "plain", loggers=("csv",)) == 0
+    for kill in TEN_KILLS:
+        assert run(folder / "ten_kills", kill, loggers=("csv",)) == -9, kill
+    assert run(folder / "ten_kills", loggers=("csv",)) == 0
 
 
 if __name__ == "__main__":

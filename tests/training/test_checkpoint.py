@@ -22,6 +22,19 @@ def test_what_was_written_is_read(file):
     assert [f.name for f in file.parent.iterdir()] == ["last.pt"]
 
 
+def test_equal_content_gives_equal_bytes(tmp_path):
+    """Of texts that are one object here, and two equal ones there; likewise of a list."""
+    word, shared = "learning", [1, 2]
+    equal = "".join(["lear", "ning"])
+    assert equal is not word
+    written = []
+    for first, second, mine, yours in ((word, word, shared, shared), (word, equal, [1, 2], shared)):
+        write_checkpoint(tmp_path / "last.pt", {first: [second, mine, yours], "inside": ({second: torch.ones(2)},)})
+        written.append((tmp_path / "last.pt").read_bytes())
+    assert written[0] == written[1]
+    assert read_checkpoint(tmp_path / "last.pt")[word] == [word, [1, 2], [1, 2]]
+
+
 @pytest.mark.parametrize("size", [0, 10, 2000])
 def test_a_file_cut_short(file, size):
     file.write_bytes(file.read_bytes()[:size])

@@ -12,6 +12,7 @@ from torchrl.envs import (
     Compose,
     RenameTransform,
     SerialEnv,
+    Transform,
     TransformedEnv,
     check_env_specs,
 )
@@ -19,6 +20,7 @@ from torchrl.envs import (
 from tests.filters.factories import assert_equal, linear_system
 from tests.transforms import envs_for_tests as envs
 from torch_denkf.envs import LinearGaussianEnv
+from torch_denkf.filters import KalmanFilter
 from torch_denkf.transforms import DEnKFTransform
 
 
@@ -267,3 +269,43 @@ def test_in_a_replay_buffer(float64):
     sample = buffer.sample()
     expected = filter.sequence(frames[sample["number"][:, 0]].clone())
     assert_equal(sample, expected, envs.BELIEF, atol=1e-14)
+
+
+class Doubled(Transform):
+    """Twice the observation; it declares what it writes, unless it is told not to."""
+
+    def __init__(self, declares=True):
+        super().__init__()
+        self.declares = declares
+
+    def _call(self, next_tensordict):
+        return next_tensordict.set("doubled", 2 * next_tensordict["observation"])
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        if self.declares:
+            observation_spec["doubled"] = observation_spec["observation"].clone()
+        return observation_spec
+
+
+def test_a_function_that_writes_an_entry_does_not_declare_it():
+    """torchrl takes a function in the place of a transform, and no one knows what it writes: the message says so."""
+    one = torch.eye(2)
+
+    def kalman(scale, key):
+        options = {"mean": torch.zeros(2), "cov": one, "observation_key": key}
+        return DEnKFTransform(KalmanFilter(0.9 * one, one, scale * one, scale**2 * one, **options))
+
+    for undeclared in (lambda td: td.set("doubled", 2 * td["observation"]), Doubled(declares=False)):
+        env = TransformedEnv(envs.base_env(), Compose(undeclared, kalman(2, "doubled")))
+        with pytest.raises(KeyError, match=r"declare it, in its transform_observation_spec; a function .* nothing"):
+            env.rollout(2)
+
+    rollouts = []  # twice the reading, with twice its deviation, says what the reading says
+    for transforms in ((kalman(1, "observation"),), (Doubled(), kalman(2, "doubled"))):
+        env = TransformedEnv(envs.base_env(), Compose(*transforms))
+        env.set_seed(0)
+        rollouts.append(env.rollout(5)["next"])
+    assert_equal(*rollouts, [("belief", "mean"), ("belief", "cov")], atol=1e-6)

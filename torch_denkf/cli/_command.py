@@ -7,10 +7,13 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NoReturn
 
-__all__ = ["Command", "filled", "path", "say", "whole"]
+from torch_denkf._lock import locked
+
+__all__ = ["Command", "alone_in", "filled", "path", "say", "whole"]
 
 
 class _Parser(argparse.ArgumentParser):
@@ -144,6 +147,23 @@ def path(text: str) -> Path:
         'car'
     """
     return Path(filled(text))
+
+
+def alone_in(out: Path) -> AbstractContextManager[None]:
+    """A folder is this command's alone while it works: two would leave files of both.
+
+    Raises:
+        OSError: if another command writes to it, or it cannot be written to; names the folder and the process.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with alone_in(folder), alone_in(folder):
+        ...     pass
+        Traceback (most recent call last):
+        OSError: cannot use ...: another process is writing to it (process ...); wait for it to end, or choose ...
+    """
+    return locked(out, ".denkf", "is writing to it")
 
 
 def say(text: str) -> None:

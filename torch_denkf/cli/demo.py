@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -48,6 +48,12 @@ def _run(args: argparse.Namespace) -> None:
 
     if find_spec("matplotlib") is None or find_spec("PIL") is None:  # before a minute of work
         raise ImportError('pictures need matplotlib and pillow: pip install "torch_denkf[plots]"')
+    with alone_in(args.out):
+        _leave(args)
+
+
+def _leave(args: argparse.Namespace) -> None:
+    """Renders, tracks and draws."""
     import cv2
     import torch
 
@@ -84,7 +90,6 @@ def _run(args: argparse.Namespace) -> None:
     images = [image.permute(1, 2, 0).numpy() for image in drive["image"]]
     shown = [image if image is not None else 0 * images[0] + 225 for image in fail_frames(images, failures)]
     spans = [NamedSpan(_NAMES[failure.kind], failure.first, failure.last) for failure in failures]
-    args.out.mkdir(parents=True, exist_ok=True)
     title = "Where is the car? One camera, which fails three times"
     with replacing(args.out / "demo.png") as beside:
         drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)

@@ -10,9 +10,10 @@ See :func:`torch_denkf.odometry.evaluate_car_filter`, which does the work.
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 
 from torch_denkf._files import write_text
-from torch_denkf.cli._command import Command, filled, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, filled, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -58,26 +59,27 @@ def _run(args: argparse.Namespace) -> None:
             f"no drive below --root {args.root} has both images and poses; expected images in sequences/NAME/image_2 "
             f"and {lacking or 'poses/NAME.txt'}"
         )
-    rows, _ = evaluate_car_filter(
-        car,
-        args.root,
-        drives,
-        cache=True if args.out is None else args.out / "cache",
-        camera=args.camera,
-        size=None if args.size is None else tuple(args.size),
-        height=args.height,
-        pitch=args.pitch,
-        missing=args.missing,
-        draws=args.draws,
-        window=args.window,
-        seed=args.seed,
-    )
-    table = markdown_table(rows)
-    say(table)
-    if args.out is not None:
-        write_rows(rows, args.out / "evaluation.csv")
-        write_text(args.out / "evaluation.md", f"`{args.command_line}`\n\n{table}")
-        say(f"{args.out / 'evaluation.csv'}, {args.out / 'evaluation.md'}")
+    with nullcontext() if args.out is None else alone_in(args.out):
+        rows, _ = evaluate_car_filter(
+            car,
+            args.root,
+            drives,
+            cache=True if args.out is None else args.out / "cache",
+            camera=args.camera,
+            size=None if args.size is None else tuple(args.size),
+            height=args.height,
+            pitch=args.pitch,
+            missing=args.missing,
+            draws=args.draws,
+            window=args.window,
+            seed=args.seed,
+        )
+        table = markdown_table(rows)
+        say(table)
+        if args.out is not None:
+            write_rows(rows, args.out / "evaluation.csv")
+            write_text(args.out / "evaluation.md", f"`{args.command_line}`\n\n{table}")
+            say(f"{args.out / 'evaluation.csv'}, {args.out / 'evaluation.md'}")
 
 
 main = Command(

@@ -21,7 +21,7 @@ from pathlib import Path
 from statistics import median
 
 from torch_denkf._progress import progress_bar
-from torch_denkf.cli._command import Command, filled, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, filled, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -69,8 +69,7 @@ def _run(args: argparse.Namespace) -> None:
     import torch
 
     from torch_denkf.cli._car import load_car
-    from torch_denkf.data import write_trajectory
-    from torch_denkf.odometry import read_camera, read_frames, track, write_path
+    from torch_denkf.odometry import read_camera, read_frames, track
 
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
@@ -93,15 +92,26 @@ def _run(args: argparse.Namespace) -> None:
         black_level=args.black_level,
         seed=args.seed,
     )
+    with alone_in(args.out):
+        _leave(beliefs, args.out, pictures=not args.no_pictures)
+
+
+def _leave(beliefs, out: Path, *, pictures: bool) -> None:
+    """Writes the path, as it comes, and what follows from it."""
+    import torch
+
+    from torch_denkf.data import write_trajectory
+    from torch_denkf.odometry import write_path
+
     means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading
-    for belief in write_path(beliefs, args.out / "path.csv"):
+    for belief in write_path(beliefs, out / "path.csv"):
         means.append(belief.mean)
         seconds.append(belief.time)
         blind += not belief.observed
         doubt = float(belief.var[:2].sum().sqrt())
     states = torch.stack(means)
-    write_trajectory(args.out / "path_kitti.txt", states, layout="kitti")
-    write_trajectory(args.out / "path_tum.txt", states, torch.tensor(seconds, dtype=torch.float64), layout="tum")
+    write_trajectory(out / "path_kitti.txt", states, layout="kitti")
+    write_trajectory(out / "path_tum.txt", states, torch.tensor(seconds, dtype=torch.float64), layout="tum")
     way = float(states[1:, :2].sub(states[:-1, :2]).norm(dim=-1).sum())
     say(
         f"{way:.1f} m in {seconds[-1] - seconds[0]:.1f} s, {len(states)} steps, {blind} without a reading; "
@@ -109,14 +119,14 @@ def _run(args: argparse.Namespace) -> None:
         f"{math.degrees(float(states[-1, 2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
     )
     files = ["path.csv", "path_kitti.txt", "path_tum.txt"]
-    if not args.no_pictures:
+    if pictures:
         try:
             from torch_denkf.cli.plot import draw
 
-            files += [file.name for file in draw(args.out / "path.csv", args.out)]
+            files += [file.name for file in draw(out / "path.csv", out)]
         except ImportError as error:
             say(f"no pictures: {error}")
-    say(f"{args.out}: {', '.join(files)}")
+    say(f"{out}: {', '.join(files)}")
 
 
 def _times(file: Path | None, source) -> Sequence[float] | None:

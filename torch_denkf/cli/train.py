@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 
-from torch_denkf.cli._command import Command, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, path, say, whole
 from torch_denkf.vision.camera import KITTI_HEIGHT
 
 __all__ = ["main"]
@@ -52,21 +52,22 @@ def _run(args: argparse.Namespace) -> None:
         raise ValueError(f"--device {args.device} cannot be used here: {str(error).splitlines()[0]}") from error
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
-    train_car_filter(
-        args.out,
-        root=args.root,
-        drives=args.drives,
-        leave_out=args.test,
-        rendered=args.rendered,
-        frames=args.frames,
-        size=tuple(args.size),
-        height=args.height,
-        updates=Updates(args.sensor_updates, args.filter_updates, args.end_to_end_updates, args.length),
-        seed=args.seed,
-        device=args.device,
-        processes=args.processes,
-        command=args.command_line,
-    )
+    with alone_in(args.out):
+        train_car_filter(
+            args.out,
+            root=args.root,
+            drives=args.drives,
+            leave_out=args.test,
+            rendered=args.rendered,
+            frames=args.frames,
+            size=tuple(args.size),
+            height=args.height,
+            updates=Updates(args.sensor_updates, args.filter_updates, args.end_to_end_updates, args.length),
+            seed=args.seed,
+            device=args.device,
+            processes=args.processes,
+            command=args.command_line,
+        )
     config = read_config(args.out)
     training = config["training"]
     say(f"{args.out}: trained; roles: " + "; ".join(f"{k}: {' '.join(v)}" for k, v in training["roles"].items()))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,15 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 import torch_denkf
-from torch_denkf._files import replacing
+from torch_denkf._files import sync, write_bytes, write_text
+from torch_denkf._lock import locked
+from torch_denkf.deployment.rebuilt import build_from, refuse_another
 
 __all__ = ["load_folder", "read_folder_config", "save_folder"]
 
 FORMAT = "torch_denkf.filter/1"
 WEIGHTS, CONFIG = "weights.safetensors", "config.json"
+_UNSETTLED = re.compile(r"weights-[0-9a-f]{64}\.safetensors")
 
 
 def save_folder(
@@ -29,6 +35,7 @@ def save_folder(
     builder: str,
     settings: Mapping[str, Any],
     training: Mapping[str, Any] | None = None,
+    build: Callable[..., nn.Module] | None = None,
 ) -> Path:
     """Writes a model to a folder.
 
@@ -37,17 +44,21 @@ def save_folder(
 
     Args:
         model: the model.
-        folder: made where it is not there; a model in it is replaced.
+        folder: made where it is not there; a model in it is replaced, whole or not at all, also by a process that is
+            killed.
         builder: name of the function that builds such a model from the settings.
         settings: plain values.
         training: command, seed, drives: plain values, for the record alone.
+        build: that function, to make sure that it builds such a model; ``None`` for no look.
 
     Returns:
         The folder.
 
     Raises:
-        OSError: if the folder cannot be written to, or the disk is full; a model in it is then as it was.
+        OSError: if the folder cannot be written to, the disk is full, or another process saves to it; a model in it is
+            then as it was.
         TypeError: if settings or training hold what JSON does not know.
+        ValueError: if ``build`` makes another model; the message names what differs.
 
     Example:
         >>> import tempfile
@@ -66,13 +77,37 @@ def save_folder(
         json.dumps(config, allow_nan=False)  # before anything is written
     except (TypeError, ValueError) as error:
         raise TypeError(f"settings and training are plain values, as JSON knows them: {error}") from error
+    if build is not None:
+        refuse_another(model, builder, build, json.loads(json.dumps(config["settings"])))
     # Copies: safetensors refuses tensors that share memory.
     weights = save({name: value.detach().cpu().clone().contiguous() for name, value in model.state_dict().items()})
     config["sha256"] = hashlib.sha256(weights).hexdigest()
-    with replacing(folder / WEIGHTS) as part, replacing(folder / CONFIG) as part_of_config:
-        part.write_bytes(weights)
-        part_of_config.write_text(json.dumps(config, indent=1) + "\n")
+    with locked(folder, ".saving", "is saving to it"):
+        _settle(folder)
+        try:  # the new weights lie beside the old ones until one rename, that of the description, changes the model
+            write_bytes(_unsettled(folder, config["sha256"]), weights)
+            write_text(folder / CONFIG, json.dumps(config, indent=1) + "\n")
+        finally:
+            _settle(folder)
     return folder
+
+
+def _unsettled(folder: Path, sha256: object) -> Path:
+    """Where new weights are until a description of them has taken the place of the old one."""
+    return folder / f"weights-{sha256}.safetensors"
+
+
+def _settle(folder: Path) -> None:
+    """Gives weights that are described their name, and removes those that never were."""
+    described = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        described = _unsettled(folder, json.loads((folder / CONFIG).read_text()).get("sha256"))
+    for file in [file for file in folder.iterdir() if _UNSETTLED.fullmatch(file.name)]:
+        if file == described:
+            os.replace(file, folder / WEIGHTS)
+        else:
+            file.unlink()
+    sync(folder)
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
@@ -119,11 +154,12 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     folder = Path(folder).expanduser()
     config = read_folder_config(folder, builders)
     try:
-        values = {name: _as_tuples(value) for name, value in config["settings"].items()}
-        model = builders[config["builder"]](**values)
+        model = build_from(builders[config["builder"]], config["settings"])
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder / CONFIG} does not make a filter: {error}") from error
-    file = folder / WEIGHTS
+    file = _unsettled(folder, config.get("sha256"))
+    if not _UNSETTLED.fullmatch(file.name) or not file.is_file():
+        file = folder / WEIGHTS
     if not file.is_file():
         raise FileNotFoundError(f"no weights {file}; restore the file from a copy, or train anew")
     if _sha256(file) != config.get("sha256"):
@@ -161,7 +197,3 @@ def _fits(value: Tensor, made: Tensor) -> bool:
 
 def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _as_tuples(value: Any) -> Any:
-    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value

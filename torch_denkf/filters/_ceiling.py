@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torch_denkf._checks import flag_value
 from torch_denkf.filters._said import say_once
+from torch_denkf.functional.weighted import weighted_mean, weighted_median
 from torch_denkf.modules._call import Entries
 
 if TYPE_CHECKING:
@@ -25,11 +26,17 @@ _FARTHEST = 1000.0
 
 def say_ceiling(filter: Filter, key: NestedKey) -> None:
     """Warns that the variance ``key`` is held at the ceiling, once."""
+    why = "nothing observes what grows."
+    if (*key[:-1], "log_weight") in filter.structure.carry:
+        why = (
+            "some particles have run away, or nothing observes what grows. Particles are held near their weighted "
+            "median until a reading takes their weight. If the motion throws single particles away, start from a "
+            "narrower belief, or bound the motion."
+        )
     say_once(
         filter,
         "ceiling",
-        f"The variance in {key!r} has reached variance_ceiling={filter.variance_ceiling:g} and is held there: "
-        "nothing observes what grows.",
+        f"The variance in {key!r} has reached variance_ceiling={filter.variance_ceiling:g} and is held there: {why}",
     )
 
 
@@ -37,6 +44,9 @@ def hold_variances(
     written: Entries, belief: Iterable[NestedKey], ceiling: float, say: Callable[[NestedKey], None]
 ) -> None:
     """Holds the variances at the ceiling, in place of the entries ``written``; the correlations stay.
+
+    An ensemble moves as a whole. Of weighted particles only those move that lie so far from the weighted median that
+    they make the variance too large: the others are what is known, and a reading will tell.
 
     Args:
         written: what a step wrote; changed.
@@ -59,8 +69,14 @@ def hold_variances(
         if mean is None:
             continue
         factor = (variance / ceiling).clamp(min=1).rsqrt()
-        held = mean.clamp(-farthest, farthest)
         written[key] = variance * factor.square()
+        log_weight = written.get((*prefix, "log_weight"))
+        if log_weight is not None:
+            particles = _held_particles(written[*prefix, "ensemble"], log_weight, factor < 1, ceiling, farthest)
+            written[mean_key] = torch.where(factor < 1, weighted_mean(particles, log_weight), mean)
+            written[*prefix, "ensemble"] = particles
+            continue
+        held = mean.clamp(-farthest, farthest)
         written[mean_key] = held
         cov = written.get((*prefix, "cov"))
         if cov is not None:
@@ -72,6 +88,15 @@ def hold_variances(
             # Where nothing is held, nothing moves, not even by rounding.
             same = ((factor == 1) & (held == mean)).unsqueeze(-2)
             written[*prefix, "ensemble"] = torch.where(same, ensemble, limited)
+
+
+def _held_particles(
+    particles: Tensor, log_weights: Tensor, exceeded: Tensor, ceiling: float, farthest: float
+) -> Tensor:
+    """Particles within one largest deviation of their weighted median, in the components that exceed the ceiling."""
+    centre = weighted_median(particles, log_weights).clamp(-farthest, farthest).unsqueeze(-2)
+    held = particles.clamp(centre - sqrt(ceiling), centre + sqrt(ceiling))
+    return torch.where(exceeded.unsqueeze(-2), held, particles)
 
 
 def look_at_ceiling(filter: Filter, written: Entries) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsurdReading",
     "check_inputs",
+    "is_finite",
     "refuse_absurd_readings",
     "refuse_far_belief",
     "refuse_non_finite",
@@ -108,14 +109,12 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         reject: whether readings that are not finite were rejected, and are no mistake.
     """
     refuse_far_belief(entries, structure.carry)
-    finite = all(torch.isfinite(written[key]).all() for key in structure.carry if key in written)
+    finite = all(is_finite(key, written[key]) for key in structure.carry if key in written)
     absurd = [] if reject else rejected_keys(structure.guards, entries)
-    # -inf is the log-weight of a particle that is out of the question.
-    lost = [key for key in structure.carry if key in entries and not bool((entries[key] < torch.inf).all())]
-    if finite and not absurd and not lost:
+    if finite and not absurd and all(is_finite(key, entries[key]) for key in structure.carry if key in entries):
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
-    bad = [key for key, value in given.items() if not torch.isfinite(value).all()]
+    bad = [key for key, value in given.items() if not is_finite(key, value)]
     negative = [key for key, value in given.items() if key[-1] in ("cov", "var") and _lowest_variance(key, value) < 0]
     if negative and not bad:
         why = f"negative variances in {negative}"
@@ -148,9 +147,14 @@ def _is_far(value: Tensor) -> bool:
     return bool(((value.abs() > LARGEST_READING) & value.isfinite()).any())
 
 
-def _lowest_variance(key: NestedKey, value: torch.Tensor) -> float:
+def _lowest_variance(key: NestedKey, value: Tensor) -> float:
     variance = value.diagonal(dim1=-2, dim2=-1) if key[-1] == "cov" and value.ndim > 1 else value
     return float(variance.min()) if variance.numel() else 0.0
+
+
+def is_finite(key: NestedKey, value: Tensor) -> bool:
+    """Whether an entry of a belief is finite; -inf is the log-weight of a particle that is out of the question."""
+    return bool((value < torch.inf).all()) if key[-1] == "log_weight" else bool(value.isfinite().all())
 
 
 def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:

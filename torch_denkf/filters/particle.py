@@ -36,7 +36,8 @@ class ParticleFilter(Filter):
     Args:
         transition: forecasts ``("forecast", "ensemble")``; its randomness is the motion noise, see
             :class:`~torch_denkf.modules.NoisyTransition`. Without any, particles become copies of one.
-        sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where ``likelihood`` reads the tensordict.
+        sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where the reading is in the tensordict, under
+            ``observation_key``, or where ``likelihood`` says.
         observation: writes the predicted observations ``("forecast", "observation")``.
         likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
         analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default. With a Gaussian likelihood that
@@ -54,12 +55,13 @@ class ParticleFilter(Filter):
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         angles: components of the observation that are angles in radians, for the default likelihood.
+        observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
-        ValueError: on an unknown ``resampling``.
+        ValueError: on an unknown ``resampling``, or if it is not clear where the reading is.
 
     Example:
         >>> import torch
@@ -70,7 +72,7 @@ class ParticleFilter(Filter):
         ...     LearnedTransition(StochasticMLP(2, 2)),
         ...     None,
         ...     LinearObservation(torch.eye(2)),
-        ...     GaussianLikelihood(sensor_key="position"),
+        ...     observation_key="position",
         ...     noise=ConstantNoise([0.1, 0.1], in_key="position"),
         ...     initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=100),
         ... )
@@ -97,6 +99,7 @@ class ParticleFilter(Filter):
         jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
+        observation_key: NestedKey | None = None,
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
@@ -112,10 +115,16 @@ class ParticleFilter(Filter):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
         if likelihood is None:
+            if observation_key is None and sensor is None:
+                raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
+            reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
             keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
-            likelihood = GaussianLikelihood(angles=angles, observed_key=observed_key, **keys)
-        elif angles:
-            raise ValueError("angles are for the default likelihood; give them to yours instead.")
+            likelihood = GaussianLikelihood(angles=angles, sensor_key=reading, observed_key=observed_key, **keys)
+        elif angles or observation_key is not None:
+            raise ValueError(
+                "angles and observation_key are for the default likelihood; give them to yours instead, the key as "
+                "sensor_key= of a GaussianLikelihood, or as encoding_key= or reading_key= of a LearnedLikelihood."
+            )
         if analysis is None:
             analysis = ParticleAnalysis(likelihood if isinstance(likelihood, GaussianLikelihood) else None)
         if not isinstance(transition, ResampledTransition):
@@ -209,14 +218,15 @@ class MixtureParticleFilter(ParticleFilter):
 
     Args:
         transition: forecasts ``("forecast", "ensemble")``.
-        sensor: writes ``("sensor", "ensemble")``, or the encoding that ``learned_likelihood`` reads.
+        sensor: writes ``("sensor", "ensemble")``, or the encoding that ``learned_likelihood`` reads; ``None`` where the
+            reading is in the tensordict, under ``observation_key``.
         observation: writes ``("forecast", "observation")``.
         noise: writes ``("sensor", "noise")``, of the Gaussian likelihood; not needed with a learned one.
         learned_likelihood: a :class:`~torch_denkf.modules.LearnedLikelihood`, theirs is ``bound="clipped"``;
             ``None`` for the Gaussian one.
         initial: the initial belief.
         alpha: share of the uniform distribution in soft resampling.
-        **kwargs: of :class:`ParticleFilter`.
+        **kwargs: of :class:`ParticleFilter`, such as ``observation_key``.
 
     Raises:
         ValueError: if neither ``noise`` nor ``learned_likelihood`` is given.

@@ -62,11 +62,15 @@ def random_bytes(
         (torch.uint8, tensor(True))
     """
     size = prod(shape)
+    count = (size + 7) // 8
     if torch.compiler.is_exporting():  # random_() over the whole range cannot be written into a graph: one number less
-        words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, ((size + 7) // 8,), device=device)
+        words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, (count,), device=device)
     else:
-        words = torch.empty((size + 7) // 8, dtype=torch.int64, device=device)
-        words.random_(_INT64_MIN, None, generator=generator)
+        try:
+            words = torch.empty(count, dtype=torch.int64, device=device)
+            words.random_(_INT64_MIN, None, generator=generator)
+        except RuntimeError:  # under torch.vmap only what is made there can differ from row to row
+            words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, (count,), device=device, generator=generator)
     return words.view(torch.uint8)[:size].view(tuple(shape))
 
 

@@ -60,9 +60,10 @@ def transport_resample(
         raise ValueError(f"epsilon and iterations must be positive; got {epsilon} and {iterations}.")
     size = particles.shape[-2]
     mean = weighted_mean(particles, log_weights).unsqueeze(-2)
-    anomalies = particles - mean
+    # A particle without weight is moved like any other, but where it has been says nothing, however far off it was.
+    anomalies = torch.where(log_weights.exp().unsqueeze(-1) > 0, particles - mean, 0)
     # Not the weighted one: where a single particle has all the weight, it would be zero, and Sinkhorn would stall.
-    variance = particles.var(-2, keepdim=True)
+    variance = anomalies.var(-2, keepdim=True)
     scale = torch.where(variance > 0, 2 * variance, 1).sqrt()
     scaled = anomalies / scale
     # ||a - b||^2 from its three parts: no [E, E, S] tensor.

@@ -58,6 +58,34 @@ def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
     return weighted_mean(anomalies.square(), log_weights) * (size / (size - 1))
 
 
+def weighted_median(particles: Tensor, log_weights: Tensor) -> Tensor:
+    """The weighted median of each component: half of the weight is at or below it, as far as particles can share it.
+
+    Unlike the mean it stays where most of the weight is when a few particles run away, however far.
+
+    Args:
+        particles: X, ``[*B, E, S]``, in the state's units.
+        log_weights: log wⁱ, normalised, ``[*B, E]``.
+
+    Returns:
+        The medians, ``[*B, S]``: each is the component of a particle, the lower of two where both would do.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> weighted_median(torch.tensor([[1.0], [2.0], [1e30]]), torch.tensor([0.4, 0.4, 0.2]).log())
+        tensor([2.])
+    """
+    check_particles(particles, log_weights)
+    ordered, order = particles.sort(-2)
+    below = log_weights.exp().unsqueeze(-1).expand_as(particles).gather(-2, order).cumsum(-2)
+    # Relative to the last sum: rounding must not leave it below the half.
+    index = (below < below[..., -1:, :] / 2).sum(-2, keepdim=True)
+    return ordered.gather(-2, index).squeeze(-2)
+
+
 def weighted_innovation(
     predicted: Tensor, log_weights: Tensor, observation: Tensor, noise: Tensor, *, observed: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -87,6 +87,10 @@ class ResampledTransition(SubModel):
     Only frames that are observed change weights, so that only in front of those there is something to resample; over
     missing frames particles and weights go on as they are.
 
+    A particle that the motion throws out of the numbers (so far that its cube would leave the precision) loses its
+    weight to the others, and goes on beside the heaviest. ``"transport"`` averages particles: one that runs away while
+    it has weight takes the others with it.
+
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
             kept.
@@ -207,7 +211,9 @@ class ResampledTransition(SubModel):
             weights = torch.where(wanted, weights, log_weights)
             picked = None if past is None else torch.where(wanted[..., None, None], picked, past)
         written = run_module(self.module, {**entries, key: moved, weight_key: weights}, call.part("transition"))
-        written = {**written, out_weight_key: weights}
+        out_key = unravel_key(self.out_keys[0])
+        forecast, weights = _without_lost(written[out_key], weights)
+        written = {**written, out_key: forecast, out_weight_key: weights}
         return written if past is None else {**written, unravel_key(self.out_keys[-1]): picked}
 
     def with_past(self, past_key: NestedKey, out_past_key: NestedKey) -> ResampledTransition:
@@ -255,6 +261,21 @@ class ResampledTransition(SubModel):
         if self.jitter:
             picked = jitter_copies(picked, particles, log_weights, noise["normal"], factor=self.jitter)
         return picked, weights, past
+
+
+def _without_lost(forecast: torch.Tensor, log_weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Takes the weight of particles that the motion has thrown out of the numbers; the heaviest takes their place.
+
+    Those are the ones whose cube would leave the precision: 7e12 in float32, 6e102 in float64. Infinity with no weight
+    would still be NaN in each sum, in the next step, and in every gradient. Where all particles are lost, the motion
+    has failed, and they stay as they are for the filter's checks to say.
+    """
+    lost = ~(forecast.detach().abs() <= torch.finfo(forecast.dtype).max ** (1 / 3)).all(-1)
+    lost = lost & ~lost.all(-1, keepdim=True)
+    left = torch.where(lost, -math.inf, log_weights)
+    heaviest = left.argmax(-1, keepdim=True).unsqueeze(-1).expand_as(forecast[..., :1, :])
+    forecast = torch.where(lost.unsqueeze(-1), forecast.gather(-2, heaviest), forecast)
+    return forecast, torch.where(lost.any(-1, keepdim=True), left.log_softmax(-1), log_weights)
 
 
 class ParticleAnalysis(SubModel):

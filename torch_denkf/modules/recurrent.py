@@ -26,6 +26,7 @@ __all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
 
 _MEMORY = ("hidden", "cell")
 _MOMENTS = ("mean", "cov")
+_MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memory ends
 
 
 class WithMemory(SubModel):
@@ -176,8 +177,9 @@ class LSTMUpdate(SubModel):
         if encoding_key is None and observation_key is None:
             raise ValueError("An LSTM needs something to read: give encoding_key and features, or observation_key.")
         in_size = features + observation_dim + (observation_dim or 1) + extra_features
-        for name, size in (("state_dim", state_dim), ("hidden_size", hidden_size), ("num_layers", num_layers)):
-            check_count(name, size)
+        check_count("state_dim", state_dim)
+        check_count("hidden_size", hidden_size)
+        check_count("num_layers", num_layers, most=_MOST_LAYERS)
         check_number("floor", floor, least=0)
         check_number("inflation", inflation, above=0)
         cells = [LSTMCell(hidden_size if layer else in_size, hidden_size) for layer in range(num_layers)]

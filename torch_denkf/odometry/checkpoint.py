@@ -29,6 +29,7 @@ def save_car_filter(car: CarFilter, folder: str | Path, *, training: Mapping[str
     Raises:
         OSError: if the folder cannot be written to.
         TypeError: if ``training`` holds what JSON does not know.
+        ValueError: if the filter was changed otherwise, so that its settings build another one.
 
     Example:
         >>> import tempfile
@@ -37,7 +38,8 @@ def save_car_filter(car: CarFilter, folder: str | Path, *, training: Mapping[str
         >>> load_car_filter(folder).settings.ensemble_size
         8
     """
-    return save_folder(car, folder, builder=car.builder, settings=asdict(car.settings), training=training)
+    settings = asdict(car.settings)
+    return save_folder(car, folder, builder=car.builder, settings=settings, training=training, build=car_filter)
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:

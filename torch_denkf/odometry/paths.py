@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf._checks import read_lines
-from torch_denkf._files import clear_errors, sync
+from torch_denkf._files import replacing
 from torch_denkf.functional import ensemble_cov
 from torch_denkf.odometry.tracking import TrackedBelief
 
@@ -27,9 +26,10 @@ PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name
 def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
     """Writes beliefs to a CSV file as they come, and hands them on.
 
-    Rows are in ``FILE.part`` while they come, each when its belief does. That file takes the place of ``file`` at the
-    end, or when the work is broken off: what was written is there, and what was there before is not lost to a full
-    disk. Numbers have nine digits, which float32 needs to be exact.
+    Rows are in a hidden file beside ``file`` while they come, each when its belief does. That takes the place of
+    ``file`` at the end, or when the work is broken off: what was written is there, and what was there before is not
+    lost to a full disk. What a killed process left goes when the next file is written there. Numbers have nine digits,
+    which float32 needs to be exact.
 
     Args:
         beliefs: from :func:`torch_denkf.odometry.track`.
@@ -50,28 +50,24 @@ def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[T
         >>> read_path(file)["belief", "var"]
         tensor([[4., 4., 4., 4., 4.]], dtype=torch.float64)
     """
-    file = Path(file)
-    part, sound = file.with_name(f"{file.name}.part"), False
-    with clear_errors(file, beside=part):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    broken_off: BaseException | None = None
+    sound = False
+    with replacing(file) as part, part.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(PATH_COLUMNS)
         try:
-            with part.open("w", newline="") as stream:
-                writer = csv.writer(stream)
-                writer.writerow(PATH_COLUMNS)
-                for belief in beliefs:
-                    sound = False
-                    writer.writerow(_row(belief))
-                    stream.flush()
-                    sound = True
-                    yield belief
-            sound = True
-        finally:
-            if sound:
-                sync(part)
-                os.replace(part, file)
-                sync(file.parent)
-            else:
-                part.unlink(missing_ok=True)
+            for belief in beliefs:
+                sound = False
+                writer.writerow(_row(belief))
+                stream.flush()
+                sound = True
+                yield belief
+        except BaseException as error:
+            if not sound:  # the file itself could not be written
+                raise
+            broken_off = error
+    if broken_off is not None:
+        raise broken_off
 
 
 def _row(belief: TrackedBelief) -> list[Any]:

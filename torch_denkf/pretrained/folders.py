@@ -71,10 +71,13 @@ def save_pretrained(
     *,
     training: Mapping[str, Any] | None = None,
     card: str | None = None,
-    builder: str | None = None,
+    builder: Callable[..., Filter] | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes a filter to a folder that :func:`from_pretrained` reads.
+
+    The filter is built anew from its settings, and compared with the one that is to be stored: numbers of members,
+    keys, schemes, shapes, whatever does not come back with the weights. Where the two differ, nothing is written.
 
     Args:
         model: one that a function of this library built from settings, such as :func:`torch_denkf.odometry.car_filter`.
@@ -82,17 +85,19 @@ def save_pretrained(
         folder: gets ``weights.safetensors`` and ``config.json``; a filter in it is replaced.
         training: command, seed, data: plain values, for the record alone.
         card: text of ``card.md``, for people: data, command, scores, limits, licence.
-        builder: name of your function of the settings that builds such a filter; pass the function itself to
-            :func:`from_pretrained`.
+        builder: your function of the settings that builds such a filter. The folder holds its name alone: pass the
+            function to :func:`from_pretrained`, too.
         settings: its arguments, plain values.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: if it is not known what builds the filter.
+        ValueError: if it is not known what builds the filter, or another filter is built; the message names what
+            differs.
         OSError: if the folder cannot be written to.
-        TypeError: if ``training`` or ``settings`` hold what JSON does not know.
+        TypeError: if ``training`` or ``settings`` hold what JSON does not know, or ``builder`` is no function with a
+            name.
 
     Example:
         >>> import tempfile, torch
@@ -100,19 +105,22 @@ def save_pretrained(
         >>> def still(size):
         ...     eye = torch.eye(size)
         ...     return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
-        >>> folder = save_pretrained(still(2), tempfile.mkdtemp(), builder="still", settings={"size": 2})
+        >>> folder = save_pretrained(still(2), tempfile.mkdtemp(), builder=still, settings={"size": 2})
         >>> from_pretrained(folder, builders={"still": still}).carry_keys
         [('belief', 'mean'), ('belief', 'cov')]
     """
     own = getattr(model, "settings", None)
     if builder is None and settings is None and is_dataclass(own) and not isinstance(own, type):
-        builder, settings = getattr(model, "builder", None), asdict(own)
+        builder, settings = BUILDERS.get(getattr(model, "builder", "")), asdict(own)
     if builder is None or settings is None:
         raise ValueError(
-            f"it is not known what builds this {type(model).__name__}; pass builder=NAME and settings={{...}} of a "
-            "function of yours, which from_pretrained then gets as builders={NAME: function}"
+            f"it is not known what builds this {type(model).__name__}; pass builder=FUNCTION and settings={{...}}, a "
+            "function of yours and its arguments; from_pretrained then gets it as builders={NAME: function}"
         )
-    folder = save_folder(model, folder, builder=builder, settings=settings, training=training)
+    name = next((name for name, known in BUILDERS.items() if known is builder), getattr(builder, "__name__", ""))
+    if name not in BUILDERS and not name.isidentifier():
+        raise TypeError(f"builder is a function with a name, which the folder holds; got {builder!r}")
+    folder = save_folder(model, folder, builder=name, settings=settings, training=training, build=builder)
     if card is not None:
         write_text(folder / "card.md", card)
     return folder

@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torch_denkf.deployment.folder import read_folder_config
 from torch_denkf.filters import Filter
 from torch_denkf.pretrained.folders import from_pretrained, save_pretrained
+from torch_denkf.pretrained.models import BUILDERS
 
 try:
     from huggingface_hub import ModelHubMixin, snapshot_download
@@ -45,7 +47,7 @@ class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):
         self,
         filter: Filter,
         *,
-        builder: str | None = None,
+        builder: Callable[..., Filter] | None = None,
         settings: Mapping[str, Any] | None = None,
         card: str | None = None,
     ):
@@ -60,12 +62,13 @@ class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):
         *,
         model_id: str,
         builders: Mapping[str, Callable[..., Filter]] | None = None,
-        builder: str | None = None,
-        settings: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> HubFilter:
         """From a folder, or from the Hub; ``builders`` as of :func:`~torch_denkf.pretrained.from_pretrained`."""
         known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
         download = {name: options[name] for name in known if name in options}
-        folder = model_id if Path(model_id).is_dir() else snapshot_download(model_id, **download)
-        return cls(from_pretrained(Path(folder), builders=builders), builder=builder, settings=settings)
+        folder = Path(model_id if Path(model_id).is_dir() else snapshot_download(model_id, **download))
+        filter = from_pretrained(folder, builders=builders)
+        config = read_folder_config(folder, {**BUILDERS, **(builders or {})})
+        builder = (builders or {}).get(config["builder"])  # a filter of the library knows what builds it
+        return cls(filter, builder=builder, settings=config["settings"] if builder else None)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,8 @@ _FORMAT = "torch_denkf.training/1"
 def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
     """Writes ``content`` beside ``file`` and then puts it in its place: a kill leaves the old file or the new one.
 
+    Equal content gives equal bytes.
+
     Args:
         file: path; its folder is made.
         content: tensors, state dicts and plain values, nested as you like.
@@ -39,8 +42,21 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
         {'weight': tensor([1.])}
     """
     memory = io.BytesIO()  # torch.save to a disk that is full fails with another error, or ends the process
-    torch.save({"format": _FORMAT, **content}, memory)
+    torch.save(_alone({"format": _FORMAT, **content}), memory)
     write_bytes(file, memory.getbuffer())
+
+
+def _alone(content: Any) -> Any:
+    """The content in containers of its own, with one object for each text.
+
+    Pickle writes an object that it has met before as a reference to the first. So the same words and numbers give other
+    bytes where two equal texts are two objects, as they are once one of them has been read from a file.
+    """
+    if isinstance(content, dict):
+        return {_alone(key): _alone(value) for key, value in content.items()}
+    if type(content) in (list, tuple):
+        return type(content)(map(_alone, content))
+    return sys.intern(content) if type(content) is str else content
 
 
 def read_checkpoint(file: Path | str) -> dict[str, Any]:

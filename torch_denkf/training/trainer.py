@@ -41,7 +41,8 @@ class FilterTrainer(HookPoints):
     starts from the best parameters of the one before, and those of the last are in the model at the end.
 
     **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
-    CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; on a GPU, as far as
+    CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; so are the checkpoint
+    files, where no tensorboard's files, which are named after the time, are among the logs. On a GPU, as far as
     its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
     outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
     logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an

@@ -15,7 +15,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
 from torch_denkf.filters import Filter, Monitored
-from torch_denkf.filters._checks import refuse_far_belief, refuse_unguarded
+from torch_denkf.filters._checks import is_finite, refuse_far_belief, refuse_unguarded
 from torch_denkf.filters._entries import own
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
@@ -255,7 +255,8 @@ class DEnKFTransform(Checked, Transform):
                 raise KeyError(
                     f"The filter reads {key!r}, which {owner} does not hold; it holds "
                     f"{sorted(map(str, source.keys(True, True)))}. Rename the key in the filter's sub-model, or put a "
-                    "transform that writes it before DEnKFTransform."
+                    "transform that writes it before DEnKFTransform. It must also declare it, in its "
+                    "transform_observation_spec; a function in the place of a transform declares nothing."
                 )
             if isinstance(target, dict):
                 target[key] = value
@@ -265,7 +266,7 @@ class DEnKFTransform(Checked, Transform):
     def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
         refuse_far_belief(entries, self.filter.structure.carry)
-        finite = all(torch.isfinite(entries[key]).all() for key in self.filter.structure.carry)
+        finite = all(is_finite(key, entries[key]) for key in self.filter.structure.carry)
         absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
         if finite and not absurd:
             return

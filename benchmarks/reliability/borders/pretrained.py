@@ -19,7 +19,7 @@ from benchmarks.reliability.case import Case
 from benchmarks.reliability.damage import BYTES, copied, gone, same, written
 from benchmarks.reliability.hostile import npz_of_zeros, ran
 from torch_denkf.odometry import load_car_filter
-from torch_denkf.pretrained import from_pretrained, save_pretrained
+from torch_denkf.pretrained import from_pretrained, reacher, save_pretrained
 
 CONFIG, WEIGHTS = "config.json", "weights.safetensors"
 FOLDERS = Path(torch_denkf.pretrained.__file__).parent / "weights"
@@ -200,12 +200,16 @@ def cases() -> Iterator[Case]:
         words = (str(value), "config.json", "name_or_folder", "trained filter")
         yield Case(border, f"from_pretrained({what})", words, lambda folder, value=value: from_pretrained(value))
     model = torch.nn.Linear(2, 2)
+    own = {"builder": reacher, "settings": {}}
     saves: dict[str, tuple[str, dict[str, Any]]] = {
         "no builder": ("builder", {}),
-        "settings that JSON does not know": ("settings", {"builder": "x", "settings": {"a": object()}}),
-        "settings with NaN": ("settings", {"builder": "x", "settings": {"a": NAN}}),
-        "settings of text": ("settings", {"builder": "x", "settings": "x"}),
-        "training that JSON does not know": ("training", {"builder": "x", "settings": {}, "training": {"a": object()}}),
+        "settings that JSON does not know": ("settings", {"builder": reacher, "settings": {"a": object()}}),
+        "settings with NaN": ("settings", {"builder": reacher, "settings": {"a": NAN}}),
+        "settings of text": ("settings", {"builder": reacher, "settings": "x"}),
+        "training that JSON does not know": (
+            "training",
+            {**own, "training": {"a": object()}},
+        ),
     }
     for what, (word, given) in saves.items():
         yield Case(

@@ -1,0 +1,74 @@
+"""A model in a folder: killed at any call, a save leaves the old model or the new one."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from torch import nn
+
+from tests.deployment.killed_saves import line, save
+from torch_denkf.deployment import folder as module
+from torch_denkf.deployment.folder import load_folder, save_folder
+
+ROOT = Path(__file__).parents[2]
+FILES = ["config.json", "weights.safetensors"]
+
+
+def test_a_killed_save_leaves_the_old_model_or_the_new_one(tmp_path):
+    command = [sys.executable, "-m", "tests.deployment.killed_saves", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    old, new = [2.0] * 2, [3.0] * 3
+    there = [each["there"] for each in found]
+    changes = there.index(new)
+    assert there == [old] * changes + [new] * (len(there) - changes)
+    assert 0 < changes < len(there) - 1, "killed before and after"
+    assert [each["code"] for each in found] == [-signal.SIGKILL] * (len(found) - 1) + [0]
+    assert all(each["later"] == FILES for each in found), "what a kill left goes with the next save"
+
+
+def test_a_save_that_fails_leaves_the_old_model_alone(tmp_path, monkeypatch):
+    save(tmp_path, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "write_text", lambda *_: (_ for _ in ()).throw(OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            save(tmp_path, 3)
+    assert load_folder(tmp_path, {"line": line}).in_features == 2
+    assert sorted(os.listdir(tmp_path)) == FILES
+
+
+def test_two_savers_at_a_time(tmp_path, monkeypatch):
+    """The second is told to wait, and does not mix its weights into the first one's folder."""
+    inside, go_on = threading.Event(), threading.Event()
+    write = module.write_text
+
+    def slowly(*args):
+        inside.set()
+        go_on.wait()
+        write(*args)
+
+    monkeypatch.setattr(module, "write_text", slowly)
+    first = threading.Thread(target=save, args=(tmp_path, 3))
+    first.start()
+    inside.wait()
+    with pytest.raises(OSError, match=rf"cannot use {tmp_path}: another process is saving to it"):
+        save_folder(nn.Linear(2, 1), tmp_path, builder="line", settings={"size": 2})
+    go_on.set()
+    first.join()
+    assert load_folder(tmp_path, {"line": line}).in_features == 3
+
+
+def test_a_description_does_not_lead_out_of_the_folder(tmp_path):
+    save(tmp_path / "here", 2)
+    config = json.loads((tmp_path / "here/config.json").read_text())
+    (tmp_path / "here/weights-").mkdir()
+    for sha256 in ("/../../there", 3, None):
+        (tmp_path / "here/config.json").write_text(json.dumps({**config, "sha256": sha256}))
+        with pytest.raises(ValueError, match=r"here/weights\.safetensors is damaged, or not the file"):
+            load_folder(tmp_path / "here", {"line": line})
