@@ -183,9 +183,9 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
         raise TypeError(
             f"{name} must be a whole number, at least {least}; got {value!r} ({type(value).__name__})" + _end(cure)
         )
-    if value < least:
+    if int(value) < least:
         raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}" + _end(cure))
-    if most is not None and value > most:
+    if most is not None and int(value) > most:
         raise ValueError(f"{name} must be a whole number, at most {most}; got {value!r}" + _end(cure))
 
 

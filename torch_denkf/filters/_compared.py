@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -67,8 +68,10 @@ def refuse_other_numbers(
         labels += [f"gradient by {name!r}" for name in [names[index] for index in by]]
         labels += [f"gradient by the parameter {name}" for name in trained]
 
+    learned = [] if parameters is None else [parameters[name] for name in trained]
+
     def run(function: Callable, values: Sequence[Tensor], seed: int = 0) -> list[Tensor]:
-        return _results(function, inputs, values, by, [parameters[name] for name in trained], seed)
+        return _results(function, inputs, values, by, learned, seed)
 
     same = all(one is other for one, other in zip(given, telling, strict=True))
     for values in [given] if same else [given, telling]:
@@ -78,7 +81,7 @@ def refuse_other_numbers(
         for nudge in range(1, _NUDGES + 1):
             if _fits(off, allowed):
                 break
-            step = step or _NUDGE * _coarsest_rounding(lambda values=values: run(eager, values))
+            step = step or _NUDGE * _coarsest_rounding(partial(run, eager, values))
             near = run(eager, [_nudged(value, step, nudge) for value in values], nudge)
             spread = map(_distance, near, theirs)
             allowed = [torch.maximum(most, 2 * far) for most, far in zip(allowed, spread, strict=True)]
