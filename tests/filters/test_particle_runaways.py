@@ -173,14 +173,14 @@ def test_where_all_particles_are_lost_the_filter_says_so():
     readings, observed, _ = drive()
     frame = filter.initialise(frames(readings, observed)[0])
     frame["belief", "ensemble"] = torch.full((8, 1), 1e8)  # 1e24 after the motion: the cube is beyond all numbers
-    with pytest.raises(ValueError, match="a divergence: all inputs are finite"):
+    with pytest.raises(ValueError, match="it diverged"):
         filter.step(filter.step(frame))
 
 
 def test_one_lost_particle_gives_its_weight_to_the_others():
     """By hand: three particles with weights 1/2, 1/4, 1/4, of which the second runs away, are two with 2/3, 1/3."""
     filter = cubic_filter(3, None, variance_ceiling=None)
-    entries = {"belief": {"ensemble": torch.tensor([[0.0], [1e20], [1.0]])}, "reading": torch.zeros(1)}
+    entries = {"belief": {"ensemble": torch.tensor([[0.0], [1e10], [1.0]])}, "reading": torch.zeros(1)}
     entries["belief"]["log_weight"] = torch.tensor([0.5, 0.25, 0.25]).log()
     frame = TensorDict({**entries, "observed": torch.tensor([False])})
     frame["noise", "transition.transition"] = torch.zeros(3, 1)

@@ -131,8 +131,11 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
 
 
 def refuse_far_belief(entries: Mapping[NestedKey, Tensor], keys: Collection[NestedKey]) -> None:
-    """Raises a ``ValueError`` where a belief that is given has numbers whose squares leave float32."""
-    far = [key for key in keys if key in entries and _is_far(entries[key])]
+    """Raises a ``ValueError`` where a belief that is given has numbers whose squares leave float32.
+
+    Log-weights may: such a particle has none.
+    """
+    far = [key for key in keys if key in entries and key[-1] != "log_weight" and _is_far(entries[key])]
     if far:
         raise ValueError(
             f"The belief has numbers of more than {LARGEST_READING:g} in {far}, with which no filter computes. Start "
