@@ -134,7 +134,7 @@ def correct(mean, cov, h, reading, r):
 
 
 def oracle(features, frames):
-    """Mean, variance, smoothed mean of the oldest state that is carried, and the monitor's p-value, ``[ROWS, T, ...]``."""
+    """Mean, variance, smoothed mean of the oldest state carried, and the monitor's p-value, ``[ROWS, T, ...]``."""
     has, lag = features.__contains__, 3 if "joint past" in features else 2 * ("late reading" in features)
     found = {name: np.zeros((ROWS, T, 2)) for name in ("mean", "var", "smoothed")} | {"p": np.ones((ROWS, T, 1))}
     for row in range(ROWS):
@@ -199,7 +199,7 @@ def weighted(readings, noise, mean, cov):
 
 
 def run(way, filter, frames, start=None, tmp_path=None):
-    """What the filter writes on ``[ROWS, T]``; from a stored belief, if there is one, which is that of the first element."""
+    """What the filter writes on ``[ROWS, T]``; from a stored belief, if there is one: that of the first element."""
     if way in ("sequence", "compiled"):
         if way == "compiled":
             filter.compile(chunk=2, backend="eager")
@@ -212,7 +212,7 @@ def run(way, filter, frames, start=None, tmp_path=None):
         env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filter, diagnostics=further(filter)))
         reset = env.reset() if start is None else env.reset(start.select(*filter.carry_keys).clone())
         rollout = env.rollout(frames.shape[1], break_when_any_done=False, tensordict=reset, auto_reset=False)
-        last = rollout["next"][:, -1:].select(*(key for key in rollout["next"].keys() if key not in ("done", "reward")))
+        last = rollout["next"][:, -1:].exclude("done", "reward")
         return torch.cat([rollout.select(*last.keys(True, True), strict=False), last], 1)[:, : frames.shape[1]]
     if way in ("policy", "recurrent mode"):
         return by_policy(way, filter, frames, start)
@@ -283,7 +283,7 @@ def packaged(filter, frames, first, tmp_path):
     inner = {filter.outer(key): ".".join(key) for key in (*filter.structure.belief, *filter.structure.carry)}
     entries, rows = {name: first[key] for key, name in inner.items()}, [first.select(*inner)]
     for t in range(1, frames.shape[1]):
-        now = {name: frames[:, t][name].clone() for name in frames.keys() if name in step.inputs}
+        now = {name: value.clone() for name, value in frames[:, t].items() if name in step.inputs}
         entries = step({**entries, **now})
         row = TensorDict({}, [ROWS])
         for key, name in inner.items():
