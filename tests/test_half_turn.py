@@ -38,7 +38,6 @@ from torch_denkf.modules import (
     MomentPrior,
     Select,
     SensorAttention,
-    ShardedEnsembleAnalysis,
     SubModel,
     UKFTransition,
 )
@@ -122,25 +121,21 @@ def frames(turn):
     return data
 
 
-def noise(key="observation"):
-    return ConstantNoise(R, in_key=key)
+def noise():
+    return ConstantNoise(R, in_key=("sensor", "ensemble"))
 
 
-def denkf(analysis, turn):
-    parts = {"transition": NoisyLinear(MOVE, Q.diag()), "sensor": None, "observation": Heading()}
-    return DEnKF(**parts, noise=noise(analysis.in_keys[2]), analysis=analysis, initial=members(turn))
+def denkf(analysis, turn, reads="observation"):
+    parts = {"transition": NoisyLinear(MOVE, Q.diag()), "sensor": Sensor(reads), "observation": Heading()}
+    return DEnKF(**parts, noise=noise(), analysis=analysis, initial=members(turn))
 
 
-def ensemble(scheme="etkf", key="observation", angles=(0,), **options):
-    return lambda turn: denkf(EnsembleAnalysis(scheme, sensor_key=key, angles=angles, **options), turn)
+def ensemble(scheme="etkf", reads="observation", **options):
+    return lambda turn: denkf(EnsembleAnalysis(scheme, angles=[0], **options), turn, reads)
 
 
 def local(**options):
-    return lambda turn: denkf(LocalEnsembleAnalysis(NEAR, sensor_key="samples", angles=[0], **options), turn)
-
-
-def sharded(turn):
-    return denkf(ShardedEnsembleAnalysis("etkf", sensor_key="observation", angles=[0]), turn).requires_grad_(False)
+    return lambda turn: denkf(LocalEnsembleAnalysis(NEAR, angles=[0], **options), turn, "samples")
 
 
 def kalman(turn):
@@ -151,11 +146,11 @@ def kalman(turn):
 
 def gaussian(kind):
     def make(turn):
-        options = {"initial": moments(turn), "angles": [0], "observation_key": "samples"}
+        options = {"initial": moments(turn), "angles": [0]}
         if kind is BackpropKF:
-            return BackpropKF(MOVE, Q.square().diag(), None, torch.eye(2), noise("samples"), **options)
+            return BackpropKF(MOVE, Q.square().diag(), Sensor("samples"), torch.eye(2), noise(), **options)
         walk = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
-        return kind(NoisyLinear(MOVE), walk, None, Heading(), noise("samples"), **options)
+        return kind(NoisyLinear(MOVE), walk, Sensor("samples"), Heading(), noise(), **options)
 
     return make
 
@@ -163,11 +158,8 @@ def gaussian(kind):
 def particles(likelihood=None):
     def make(turn):
         options = {"angles": [0]} if likelihood is None else {"likelihood": likelihood()}
-        motion = NoisyLinear(MOVE, Q.diag())
-        sensor_noise = ConstantNoise(R, in_key=("sensor", "ensemble"))
-        return ParticleFilter(
-            motion, Sensor("observation"), Heading(), noise=sensor_noise, initial=members(turn), **options
-        )
+        parts = NoisyLinear(MOVE, Q.diag()), Sensor("observation"), Heading()
+        return ParticleFilter(*parts, noise=noise(), initial=members(turn), **options)
 
     return make
 
@@ -183,7 +175,7 @@ def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
 
     def make(turn):
         sensors = {
-            "compass": FusedSensor(Heading(1), R[:1], angles=[0], delay=delay),
+            "compass": FusedSensor(Heading(1), R[:1], sensor=Sensor("compass"), angles=[0], delay=delay),
             "other": FusedSensor(Select([1]), R[1:]),
         }
         torch.manual_seed(4)
@@ -223,7 +215,6 @@ FILTERS = {
     "ensemble with a lag": lambda turn: FixedLag(ensemble()(turn), 3),
     "local": local(inflation=1.1),
     "local with a lag": lambda turn: FixedLag(local()(turn), 3),
-    "sharded": sharded,
     "Kalman": kalman,
     **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
     "particles": particles(),
@@ -241,7 +232,7 @@ FILTERS = {
     },
     **{
         f"gated {name}, {gate}, {parts}": gated(make, **options, **by)
-        for name, make in {"ensemble": ensemble(), "samples": ensemble(key="samples"), "local": local()}.items()
+        for name, make in {"ensemble": ensemble(), "samples": ensemble(reads="samples"), "local": local()}.items()
         for gate, options in GATES.items()
         for parts, by in OF_ENSEMBLES.items()
     },
@@ -321,24 +312,18 @@ ANGLES = {"angles": [0]}
 BOTH = {**ANGLES, "observation_angles": [0]}
 
 
-def with_sensor(turn):
-    """A filter whose sensor draws samples."""
-    parts = {"transition": NoisyLinear(MOVE, Q.diag()), "observation": Heading(), "noise": noise("samples")}
-    return DEnKF(sensor=Sensor("samples"), analysis=EnsembleAnalysis(angles=[0]), initial=members(turn), **parts)
-
+SAMPLED = ensemble("sensor", "samples")  # a filter whose sensor draws samples
 
 LOSSES = {
-    **{f"DEnKFLoss, {score}": (DEnKFLoss, with_sensor, {**BOTH, "score": score}) for score in ("crps", "mse")},
-    "DEnKFLoss, nll": (DEnKFLoss, with_sensor, {**BOTH, "nll": 1.0, "observation": 1.0}),
-    **{
-        f"GaussianLoss, {score}": (GaussianLoss, gaussian(EKF), {**ANGLES, "score": score}) for score in ("crps", "nll")
-    },
-    "GaussianLoss, dims": (GaussianLoss, gaussian(UKF), {**ANGLES, "dims": [1, 0]}),
+    **{f"DEnKFLoss, {score}": (DEnKFLoss, SAMPLED, {**BOTH, "score": score}) for score in ("crps", "mse")},
+    "DEnKFLoss, nll": (DEnKFLoss, SAMPLED, {**BOTH, "nll": 1.0, "observation": 1.0}),
+    **{f"GaussianLoss, {score}": (GaussianLoss, gaussian(EKF), {**BOTH, "score": score}) for score in ("crps", "nll")},
+    "GaussianLoss, dims": (GaussianLoss, gaussian(UKF), {**BOTH, "dims": [1, 0]}),
     "MixtureLoss": (MixtureLoss, particles(), ANGLES),
-    "TransitionLoss": (TransitionLoss, with_sensor, ANGLES),
+    "TransitionLoss": (TransitionLoss, SAMPLED, ANGLES),
     "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), ANGLES),
-    "SensorLoss": (SensorLoss, with_sensor, {"observation_angles": [0]}),
-    "ObservationLoss": (ObservationLoss, with_sensor, {"observation_angles": [0]}),
+    "SensorLoss": (SensorLoss, SAMPLED, {"observation_angles": [0]}),
+    "ObservationLoss": (ObservationLoss, SAMPLED, {"observation_angles": [0]}),
 }
 
 

@@ -21,6 +21,7 @@ from torch_denkf.modules import (
     NoisyTransition,
     Select,
     SensorAttention,
+    SubModel,
 )
 from torch_denkf.smoothers import FixedLag
 
@@ -95,6 +96,16 @@ class Folded(nn.Module):
         return torch.atan2(angle.sin(), angle.cos())
 
 
+class Given(SubModel):
+    """A sensor that draws what stands in the data."""
+
+    def __init__(self, key):
+        super().__init__(nn.Identity(), [key], [("sensor", "ensemble")])
+
+    def compute(self, samples):
+        return samples
+
+
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
 @pytest.mark.parametrize("samples", [False, True])
 def test_an_innovation_of_angles_is_the_shorter_way_round(float64, kind, samples):
@@ -103,7 +114,8 @@ def test_an_innovation_of_angles_is_the_shorter_way_round(float64, kind, samples
     members = members - members.mean() + 3.1
     assert (members.max(), members.min()) > (torch.pi, 0)
     network, one = Constant(1.0), torch.eye(1)
-    compass = {"compass": FusedSensor(LearnedObservation(Folded()), [0.3], angles=[0])}
+    sensor = Given("compass") if samples else None  # one that draws samples, or the reading itself
+    compass = {"compass": FusedSensor(LearnedObservation(Folded()), [0.3], sensor=sensor, angles=[0])}
     if kind == "Kalman":
         motion, initial = LinearTransition(one, 0 * one), MomentPrior(members.mean(0), members.var(0).diag())
     else:

@@ -16,6 +16,7 @@ from torch_denkf.modules import (
     LinearObservation,
     Select,
     StochasticMLP,
+    SubModel,
 )
 from torch_denkf.smoothers import FixedLag, IEnKS
 
@@ -48,12 +49,22 @@ def test_without_process_noise_it_is_the_kalman_smoother(float64, iterations):
     assert_equal(out, expected, [("smoothed", "age")])
 
 
+class Given(SubModel):
+    """A sensor that draws what stands in the data."""
+
+    def compute(self, samples):
+        return samples
+
+
 def test_of_samples_the_mean_is_the_reading(float64):
-    frames = drive(3, 7)
-    expected = linear(6, initial=linear_denkf("etkf").initial).sequence(frames.copy())
+    F, _, H, R = linear_system()
+    frames, initial = drive(3, 7), linear_denkf("etkf").initial
+    expected = linear(6, initial=initial).sequence(frames.copy())
     spread = torch.randn(3, 7, 6, 2)
-    frames["observation"] = frames["observation"].unsqueeze(-2) + spread - spread.mean(-2, keepdim=True)
-    out = linear(6, initial=linear_denkf("etkf").initial).sequence(frames)
+    frames["samples"] = frames["observation"].nan_to_num().unsqueeze(-2) + spread - spread.mean(-2, keepdim=True)
+    sensor = Given(torch.nn.Identity(), ["samples"], [("sensor", "ensemble")])
+    noise = ConstantNoise(R.sqrt(), in_key="samples")
+    out = IEnKS(NoisyLinear(F), sensor, LinearObservation(H), noise, initial=initial).sequence(frames)
     for key in (("belief", "ensemble"), ("smoothed", "ensemble"), ("info", "innovation"), ("info", "nis")):
         assert_close(out[key], expected[key], rtol=0, atol=1e-10)
 
