@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch._dynamo.backends.common import aot_autograd
 
 from tests.filters.factories import has_compiler, toy_denkf, toy_frames
+from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
 from torch_denkf.filters import EKF, FusedFilter, FusedSensor, KalmanFilter, _compared
 from torch_denkf.filters._compared import refuse_other_numbers
@@ -157,8 +158,7 @@ def test_a_wrong_gradient_is_refused_where_a_sequence_is_trained():
         return make_boxed_func(run)
 
     wrong = aot_autograd(fw_compiler=lambda graph, example: make_boxed_func(graph.forward), bw_compiler=doubled)
-    filter, frames = toy_denkf(), toy_frames((2, 2))
-    filter.draw_noise(frames)
+    filter, frames = linear_filter("BackpropKF", trainable=True), linear_frames(2, 2)
     filter.compile(backend=wrong, chunk=1)
     with pytest.raises(RuntimeError, match="gradient by the parameter"):
         filter.sequence(frames.copy())
@@ -230,6 +230,22 @@ def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
     refuse_other_numbers(lambda x: 1 * x, lambda x: x, (nan,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to inf off"):
         refuse_other_numbers(lambda x: x.nan_to_num(), lambda x: x, (nan,), **names)
+    with pytest.raises(RuntimeError, match="'y' is up to 1 off"):  # of marks, too
+        refuse_other_numbers(lambda x: x > 2, lambda x: x > 0, (nan,), **names)
+
+
+def test_half_precision_inside_rounds_as_such():
+    """A compiler keeps more digits between two layers than the eager code, which writes them to memory in bfloat16."""
+    names = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
+    x, weight = torch.randn(20, 50), torch.randn(50, 3)
+
+    def half(x):
+        return (x.bfloat16() @ weight.bfloat16()).float()
+
+    assert (half(x) - x @ weight).abs().max() > 1e-3 * half(x).abs().max()
+    refuse_other_numbers(lambda x: x @ weight, half, (x,), **names)
+    with pytest.raises(RuntimeError, match="'y' is up to"):
+        refuse_other_numbers(half, lambda x: x @ weight, (x,), **names)
 
 
 def test_numbers_drawn_inside_by_another_generator_are_no_error():

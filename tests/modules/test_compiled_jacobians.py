@@ -112,18 +112,14 @@ def everything(kind, dtype):
     return modules, reads
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 @pytest.mark.parametrize(
-    ("kind", "gradients"),
-    [
-        ("EKF", False),
-        pytest.param("EKF", True, marks=pytest.mark.slow),
-        pytest.param("UKF", False, marks=pytest.mark.slow),
-        pytest.param("UKF", True, marks=pytest.mark.slow),
-    ],
+    ("kind", "gradients", "passes"),
+    [("EKF", False, True), ("EKF", True, True), ("UKF", False, True), ("UKF", True, True), ("EKF", False, False)],
 )
-@pytest.mark.parametrize("passes", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_inductor_gives_the_eager_numbers(kind, gradients, passes):
+    """With this package's passes, and without."""
     modules, reads = everything(kind, torch.float64)
     trained = [parameter for module in modules.values() for parameter in module.parameters()]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -60,18 +59,16 @@ def refuse_other_numbers(
     given = list(tensors(inputs))
     free = [name in frames for name in names]
     telling = [_telling(value) if may else value for value, may in zip(given, free, strict=True)]
-    labels, by, trained = [repr(name) for name in outputs], [], []
+    labels, by, trained = [repr(name) for name in outputs], [], {}
     if parameters is not None and torch.is_grad_enabled():
         # Not by beliefs: of a covariance one triangle may be read, or the other.
         by = [index for index, value in enumerate(given) if value.requires_grad and free[index]]
-        trained = [name for name, value in parameters.items() if value.requires_grad]
+        trained = {name: value for name, value in parameters.items() if value.requires_grad}
         labels += [f"gradient by {name!r}" for name in [names[index] for index in by]]
         labels += [f"gradient by the parameter {name}" for name in trained]
 
-    learned = [] if parameters is None else [parameters[name] for name in trained]
-
     def run(function: Callable, values: Sequence[Tensor], seed: int = 0) -> list[Tensor]:
-        return _results(function, inputs, values, by, learned, seed)
+        return _results(function, inputs, values, by, list(trained.values()), seed)
 
     same = all(one is other for one, other in zip(given, telling, strict=True))
     for values in [given] if same else [given, telling]:
@@ -81,18 +78,17 @@ def refuse_other_numbers(
         for nudge in range(1, _NUDGES + 1):
             if _fits(off, allowed):
                 break
-            step = step or _NUDGE * _coarsest_rounding(partial(run, eager, values))
+            step = step or _NUDGE * _coarsest_rounding(run, eager, values)
             near = run(eager, [_nudged(value, step, nudge) for value in values], nudge)
             spread = map(_distance, near, theirs)
             allowed = [torch.maximum(most, 2 * far) for most, far in zip(allowed, spread, strict=True)]
         if not _fits(off, allowed):
-            times = [
-                (far / most.clamp(min=1e-300)).nan_to_num(nan=0.0).max() for far, most in zip(off, allowed, strict=True)
-            ]
-            worst = int(torch.stack(times).argmax())
+            pairs = zip(off, allowed, strict=True)
+            times = [float((far / most.clamp(min=1e-300)).nan_to_num(nan=0.0).max()) for far, most in pairs]
+            worst = times.index(max(times))
             raise RuntimeError(
                 f"The compiled {what} is wrong: {labels[worst]} is up to {float(off[worst].max()):.3g} off what the "
-                f"same code gives eagerly, up to {float(theirs[worst].abs().max()):.3g}; rounding explains "
+                f"same code gives eagerly, up to {float(theirs[worst].double().abs().max()):.3g}; rounding explains "
                 f"{float(allowed[worst].max()):.1g}. That is an error of torch's compiler (torch {torch.__version__}), "
                 f"and nothing is returned. {cure}"
             )
@@ -216,9 +212,9 @@ class _Precision(TorchDispatchMode):
         return out
 
 
-def _coarsest_rounding(run: Callable[[], Any]) -> float:
+def _coarsest_rounding(run: Callable, *args: Any) -> float:
     """The rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
     with _Precision() as mode:
-        run()
+        run(*args)
     products = 0.0 if torch.get_float32_matmul_precision() == "highest" else torch.finfo(torch.bfloat16).eps
     return max(mode.coarsest, products)
