@@ -123,7 +123,9 @@ def test_in_turn_and_joint_are_one_kalman_filter(float64, kind, joint):
 def test_in_turn_and_joint_are_the_same_ensemble_in_mean_and_covariance(float64):
     frames, (F, _, H, R) = readings(), linear_system()
     members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
-    outs = [fused("ensemble", joint=joint, members=members, noisy=False).sequence(frames.copy()) for joint in (0, 1)]
+    outs = [
+        fused("ensemble", joint=joint, members=members, noisy=False).sequence(frames.copy()) for joint in (False, True)
+    ]
     assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
     assert_close(outs[0]["belief", "var"], outs[1]["belief", "var"], rtol=0, atol=1e-10)
     whole = DEnKF(
