@@ -31,8 +31,9 @@ setup(
     packages=find_packages(include=["torch_denkf", "torch_denkf.*"]),
     package_data={
         "torch_denkf": ["py.typed", "**/*.pyi"],
-        "torch_denkf.simulation.ur5": ["assets/*.xml"],
-        "torch_denkf.pretrained": ["weights/*/*"],
+        "torch_denkf.applications.ur5": ["simulation/assets/*.xml", "weights/*/*"],
+        "torch_denkf.applications.car": ["weights/*/*"],
+        "torch_denkf.applications.reacher": ["weights/*/*"],
     },
     entry_points={"console_scripts": ["denkf = torch_denkf.cli.main:main"]},
     install_requires=[
@@ -53,8 +54,6 @@ setup(
         "lerobot": ["pyarrow>=15", "av>=14"],
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],
-        # torch_denkf.plots.log_rollout alone: 500 MB.
-        "viewer": ["rerun-sdk>=0.23"],
         "examples": ["matplotlib", "tensorboard"],
         # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
         "hub": ["huggingface_hub>=1.0"],

@@ -20,10 +20,10 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform
+from torch_denkf.applications.reacher.encoders import ENCODER_STD, reacher_env
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
 from torch_denkf.plots import plot_bands
-from torch_denkf.pretrained.encoders import ENCODER_STD, reacher_env
 
 NOISE, DT = ENCODER_STD, 0.02  # encoder noise, 0.05 rad; control step in s
 
@@ -38,8 +38,10 @@ def make_filter(states: torch.Tensor) -> DEnKF:
         sensor=None,  # the encoders are read as they are
         observation=Select([0, 1]),
         noise=ConstantNoise([NOISE, NOISE], in_key="encoder"),
-        analysis=EnsembleAnalysis("etkf", sensor_key="encoder"),  # draws no noise for a reading that is used as it is
-        initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], sensor_key="encoder"),
+        analysis=EnsembleAnalysis(
+            "etkf", observation_key="encoder"
+        ),  # draws no noise for a reading that is used as it is
+        initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], observation_key="encoder"),
     )
 
 

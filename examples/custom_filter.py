@@ -93,7 +93,7 @@ def make_filter(use_beacons: bool) -> Filter:
             "etkf",
             forecast_key=before_gps,
             predicted_key=("gps_reading", "predicted"),
-            sensor_key="gps",
+            observation_key="gps",
             noise_variance_key=("gps_reading", "noise"),
             observed_key="gps_observed",
         ),

@@ -49,7 +49,7 @@ def export(path: Path, compiled: bool) -> float:
         None,
         Select([0, 1]),
         ConstantNoise([math.hypot(NOISE, COUNT / math.sqrt(12))] * 2, in_key="encoder"),
-        EnsembleAnalysis("sakov", sensor_key="encoder"),
+        EnsembleAnalysis("sakov", observation_key="encoder"),
         initial=AroundState([0.01, 0.01, 5.0, 5.0, 50.0, 50.0], ensemble_size=MEMBERS),
     )
     example = filter.initialise(TensorDict({"encoder": torch.zeros(2), "state": torch.zeros(6)}))

@@ -18,14 +18,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf import FusedFilter, FusedSensor, GaussianLoss
-from torch_denkf.modules import (
-    ContinuousMotion,
-    ContinuousNoise,
-    LinearTransition,
-    MomentPrior,
-    Select,
-    SensorAttention,
-)
+from torch_denkf.fusion import SensorAttention
+from torch_denkf.modules import ContinuousMotion, ContinuousNoise, LinearTransition, MomentPrior, Select
 
 DT, LATE = 0.02, 15  # s; steps by which the GPS is late
 PUSH = 1.0  # m/s for each root of a second: how much the speed wanders

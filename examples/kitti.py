@@ -19,11 +19,18 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import TransformedEnv
 
 from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, FilterTrainer, MissingFrames, SensorLoss, Stage
-from torch_denkf.data import KITTIOdometryExperienceReplay, with_motion, write_drives
+from torch_denkf.applications.car import (
+    FlowSensor,
+    KITTIOdometryExperienceReplay,
+    dead_reckoning,
+    kitti_endpoint_error,
+    with_motion,
+    write_drives,
+)
+from torch_denkf.applications.car.modules.unicycle import UnicycleMotion, UnicycleTransition
 from torch_denkf.envs import ReplayEnv
-from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_endpoint_error
-from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, FlowSensor, Select, StochasticMLP
-from torch_denkf.modules.unicycle import UnicycleMotion, UnicycleTransition
+from torch_denkf.metrics import interval_coverage
+from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, Select, StochasticMLP
 from torch_denkf.plots import plot_bands, plot_path
 
 VELOCITIES = [3, 4]  # v in m/s and theta_dot in rad/s, of the state [x, y, theta, v, theta_dot]
@@ -39,7 +46,7 @@ def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
         observation=Select(VELOCITIES),
         noise=DiagonalNoise(2, r=0.2 * scale, loc=loc, scale=scale),
         # Innovations correct the velocities, and each member's pose moves with them.
-        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(dt)),
+        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_prefix="analysis"), UnicycleMotion(dt)),
         initial=AroundState([0.0, 0.0, 0.0, *(0.2 * scale).tolist()], ensemble_size=32),  # around the true start
         process_noise=[0.0, 0.0, 0.0, *(0.1 * scale).tolist()],  # how much the velocities may change in a step
     )

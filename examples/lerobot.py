@@ -36,7 +36,6 @@ from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay, lag_errors
 from torch_denkf.envs import ReplayEnv
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (
-    BlackIsMissing,
     ConstantNoise,
     DiagonalNoise,
     EnsembleAnalysis,
@@ -48,6 +47,7 @@ from torch_denkf.modules import (
     Select,
     StochasticMLP,
 )
+from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.objectives import DEnKFLoss, SensorLoss, TransitionLoss
 from torch_denkf.plots import belief_video, plot_bands
 from torch_denkf.training import FilterTrainer, Stage, choose_for_coverage, hold_last

@@ -49,8 +49,8 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss
+from torch_denkf.applications.reacher.encoders import NoisyEncoders
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
-from torch_denkf.pretrained.encoders import NoisyEncoders
 from torch_denkf.training import Processes
 
 WINDOW, EPISODE, REPEAT = 25, 100, 4  # steps: of a window that is learned from, of an episode, of the simulator in one
@@ -77,8 +77,8 @@ def make_filter() -> DEnKF:
         None,
         Select([0, 1, 2]),
         ConstantNoise([0.05] * 3, in_key="encoder"),
-        EnsembleAnalysis("etkf", sensor_key="encoder"),
-        initial=FromSensor([0, 1, 2], mean=[0.0] * 5, std=[1.0, 1.0, 1.0, 0.1, 0.1], sensor_key="encoder"),
+        EnsembleAnalysis("etkf", observation_key="encoder"),
+        initial=FromSensor([0, 1, 2], mean=[0.0] * 5, std=[1.0, 1.0, 1.0, 0.1, 0.1], observation_key="encoder"),
     )
 
 

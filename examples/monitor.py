@@ -19,15 +19,8 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from torch_denkf import DEnKF, DEnKFTransform, Gated, LinearGaussianEnv, Monitored
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    GaussianPrior,
-    InnovationMonitor,
-    LearnedTransition,
-    MonitoredSensor,
-    Select,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
+from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
 
 DT, PUSH, NOISE = 0.1, 0.05, 0.3  # s, m/s a step, m
 OFF, BACK, BIAS = 120, 160, 4.0  # steps at which the GPS goes off and comes back, m
@@ -42,7 +35,7 @@ def make_cart() -> DEnKF:
         sensor=None,
         observation=Select([0]),
         noise=ConstantNoise([NOISE], in_key="observation"),
-        analysis=EnsembleAnalysis("etkf", sensor_key="observation"),
+        analysis=EnsembleAnalysis("etkf", observation_key="observation"),
         process_noise=[0.0, PUSH],
         initial=GaussianPrior([0.0, 0.0], [0.3, 0.3], ensemble_size=64),
     )
@@ -132,7 +125,7 @@ def main() -> None:
     # In an environment the alarm stands beside the belief.
     motion = torch.tensor([[1.0, DT], [0.0, 0.99]])
     plant = LinearGaussianEnv(motion, torch.eye(1, 2), [0.0, PUSH], [NOISE], initial_std=[0.3, 0.3], seed=0)
-    rollout = TransformedEnv(plant, DEnKFTransform(make_cart(), monitor=monitor)).rollout(20)
+    rollout = TransformedEnv(plant, DEnKFTransform(Monitored(make_cart(), monitor))).rollout(20)
     print("Alarms in an environment:", int(rollout["next", "monitor", "alarm"].sum()))
 
 

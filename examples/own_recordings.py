@@ -106,7 +106,7 @@ def make_filter(data: RecordingReplay) -> Filter:
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
     pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
     initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
-    encoder = {"sensor_key": "encoder", "observed_key": "encoder_observed"}
+    encoder = {"observation_key": "encoder", "observed_key": "encoder_observed"}
     encoder |= {"predicted_key": "encoder_predicted", "noise_variance_key": "encoder_noise"}
     return Filter(
         {
@@ -124,7 +124,7 @@ def make_filter(data: RecordingReplay) -> Filter:
             "encoder_noise": ConstantNoise([0.05], trainable=True, in_key="encoder", out_key="encoder_noise"),
             "transition": NoisyTransition(transition, as_process_noise(pushes, initial)),
             "h_camera": Select([0]),
-            "by_camera": EnsembleAnalysis("etkf", belief_key="middle"),
+            "by_camera": EnsembleAnalysis("etkf", belief_prefix="middle"),
             "h_encoder": Select([1], in_key=("middle", "ensemble"), out_key="encoder_predicted"),
             "by_encoder": EnsembleAnalysis("etkf", forecast_key=("middle", "ensemble"), **encoder),
         },

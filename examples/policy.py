@@ -64,7 +64,7 @@ class LearningFilter:
             "sensor": None,  # the encoder is read as it is
             "observation": Select([0, 1]),
             "noise": ConstantNoise([0.5, 0.5], trainable=True, in_key="observation"),
-            "analysis": EnsembleAnalysis("etkf", sensor_key="observation"),
+            "analysis": EnsembleAnalysis("etkf", observation_key="observation"),
         }
         first, later = (GaussianPrior([0.0] * 3, [0.7, 0.7, speed], ensemble_size=32) for speed in (0.6, 3.0))
         self.filter = DEnKF(**parts, initial=first, update_at_reset=True)

@@ -27,9 +27,17 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, KITTIReplayEnv
-from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
+from torch_denkf.applications.car import (
+    UnicycleMotion,
+    UnicycleTransition,
+    dead_reckoning,
+    drive_frames,
+    kitti_endpoint_error,
+    read_kitti_drive,
+    write_drives,
+)
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.metrics import dead_reckoning, interval_coverage, kitti_endpoint_error
+from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import (
     AroundState,
     DiagonalNoise,
@@ -37,8 +45,6 @@ from torch_denkf.modules import (
     ImageSensor,
     LearnedObservation,
     StochasticMLP,
-    UnicycleMotion,
-    UnicycleTransition,
     convolutional_trunk,
 )
 from torch_denkf.plots import plot_bands, plot_path
@@ -89,7 +95,7 @@ def make_filter(frames: TensorDict, dt: float) -> DEnKF:
         observation=LearnedObservation(SensorCurve(loc, scale)),
         noise=DiagonalNoise(2, r=0.3 * scale, loc=loc, scale=scale),
         # Innovations correct the velocities, and each member's pose moves with them.
-        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_key="analysis"), UnicycleMotion(dt)),
+        analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_prefix="analysis"), UnicycleMotion(dt)),
         initial=AroundState(INITIAL_STD, ensemble_size=ENSEMBLE),
     )
 

@@ -25,6 +25,7 @@ from torch_denkf import (
     DEnKFTransform,
     EnKS,
     EnRTS,
+    FixedLag,
     KalmanFilter,
     LinearGaussianEnv,
     RTSSmoother,
@@ -67,7 +68,7 @@ def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
         sensor=None,
         observation=Select([0]),
         noise=ConstantNoise([NOISE], in_key="encoder"),
-        analysis=EnsembleAnalysis("etkf", sensor_key="encoder"),
+        analysis=EnsembleAnalysis("etkf", observation_key="encoder"),
         process_noise=[0.0, PUSH],
         initial=GaussianPrior(*START, ensemble_size=members),
     )
@@ -77,10 +78,10 @@ def make_ukf() -> UKF:
     """An unscented Kalman filter of the pendulum."""
     return UKF(
         LearnedTransition(Swing(), residual=False),
-        [0.0, PUSH],
         None,
         Select([0]),
         ConstantNoise([NOISE], in_key="encoder"),
+        process_noise=[0.0, PUSH],
         initial=MomentPrior(START[0], START[1].square().diag()),
         observation_key="encoder",
     )
@@ -120,9 +121,9 @@ def main() -> None:
     # While it runs: the belief of now, and a better one of 10 steps ago. Small swings: a linear system.
     swing, angle = torch.tensor([[1.0, DT], [-9.81 * DT, 1.0 - 0.1 * DT]]), torch.tensor([[1.0, 0.0]])
     plain = LinearGaussianEnv(swing, angle, [0.0, PUSH], [NOISE], missing=0.5, batch_size=[runs], seed=0)
-    q, r = torch.diag(torch.tensor([0.0, PUSH**2])), torch.tensor([NOISE**2])
-    kalman = KalmanFilter(swing, q, angle, r, mean=torch.zeros(2), cov=torch.eye(2))
-    later = TransformedEnv(plain, DEnKFTransform(kalman, lag=10)).rollout(steps)["next"]
+    noises = {"process_noise": [0.0, PUSH], "noise": [NOISE]}
+    kalman = KalmanFilter(swing, angle, **noises, mean=torch.zeros(2), cov=torch.eye(2))
+    later = TransformedEnv(plain, DEnKFTransform(FixedLag(kalman, 10))).rollout(steps)["next"]
     now = later["belief", "mean"][:, 10:] - later["state"][:, 10:]
     then = later["smoothed", "mean"][:, 10:] - later["state"][:, :-10]
     print("\nIn an environment:")

@@ -9,26 +9,21 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.data.lerobot.lerobot_folder import write_version_2
-from tests.data.ur5.ur5_demos import make_demo, write_folder
-from torch_denkf.data import (
-    Images,
-    LeRobotReplay,
-    UR5ExperienceReplay,
-    read_kitti_drive,
-    recording_from_rows,
-    with_motion,
-    write_drives,
-    write_trajectory,
-)
-from torch_denkf.data.ur5.files import append_to_manifest, read_manifest, what_is_wrong, write_demo
+from torch_denkf.applications.car import read_kitti_drive, with_motion, write_drives, write_trajectory
+from torch_denkf.applications.car.odometry.paths import read_path, write_path
+from torch_denkf.applications.car.odometry.tracking import TrackedBelief
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.data.files import append_to_manifest, read_manifest, what_is_wrong, write_demo
+from torch_denkf.data import Images, LeRobotReplay
+from torch_denkf.data.lerobot.rows import recording_from_rows
 from torch_denkf.deployment import export_step
 from torch_denkf.deployment.folder import load_folder, save_folder
 from torch_denkf.filters import KalmanFilter
-from torch_denkf.odometry import read_path, write_path
-from torch_denkf.odometry.tracking import TrackedBelief
 from torch_denkf.plots import write_video
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
+from torch_denkf.training import FilterTrainer, Stage
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 FULL = r"cannot write .*{}.*: No space left on device, \d+(\.\d)? [kM]B free in .*disk0"
 
@@ -152,7 +147,7 @@ def test_logs_of_a_training(small_disk):
 def test_an_exported_step(small_disk):
     """torch itself ends the process here (SIGABRT)."""
     disk, one = small_disk("16k"), torch.eye(1)
-    kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
     with pytest.raises(OSError, match=FULL.format("kf.pt2")):
         export_step(kf, TensorDict({"observation": torch.ones(1)}), disk / "kf.pt2", compiled=False)
     assert list(disk.iterdir()) == []

@@ -15,32 +15,22 @@ from torch import nn
 
 import torch_denkf
 from tests.filters.factories import FixedEnsemble, NoisyLinear
-from torch_denkf.filters import (
-    EKF,
-    UKF,
-    BackpropKF,
-    DEnKF,
-    FusedFilter,
-    FusedSensor,
-    Gated,
-    KalmanFilter,
-    ParticleFilter,
-)
-from torch_denkf.functional import Neighbours
+from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, KalmanFilter, ParticleFilter
+from torch_denkf.functional.localisation import Neighbours
+from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
 from torch_denkf.modules import (
     ConstantNoise,
     EKFTransition,
     EnsembleAnalysis,
-    GatedAnalysis,
     LearnedLikelihood,
     LinearTransition,
     LocalEnsembleAnalysis,
     MomentPrior,
     Select,
-    SensorAttention,
     SubModel,
     UKFTransition,
 )
+from torch_denkf.monitoring import Gated, GatedAnalysis
 from torch_denkf.objectives import (
     DEnKFLoss,
     GaussianLoss,
@@ -141,14 +131,16 @@ def local(**options):
 def kalman(turn):
     both = torch.eye(2)
     prior = {"mean": ahead(turn), "cov": 0.2 * both}
-    return KalmanFilter(MOVE, Q.square().diag(), both, R.square(), **prior, angles=[0])
+    return KalmanFilter(MOVE, both, process_noise=Q, noise=R, **prior, angles=[0])
 
 
 def gaussian(kind):
     def make(turn):
         options = {"initial": moments(turn), "angles": [0]}
         if kind is BackpropKF:
-            return BackpropKF(MOVE, Q.square().diag(), Sensor("samples"), torch.eye(2), noise(), **options)
+            return BackpropKF(
+                MOVE, Sensor("samples"), torch.eye(2), noise(), process_noise_cov=Q.square().diag(), **options
+            )
         walk = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
         return kind(NoisyLinear(MOVE), walk, Sensor("samples"), Heading(), noise(), **options)
 
@@ -166,7 +158,7 @@ def particles(likelihood=None):
 
 def learned_likelihood():
     torch.manual_seed(3)
-    keys = {"encoding_key": "encoding", "reading_key": ("sensor", "ensemble")}
+    keys = {"encoding_key": "encoding", "observation_key": ("sensor", "ensemble")}
     return LearnedLikelihood(3, 2, num_cells=(8,), angles=[0], scale=[0.3, 0.4], **keys)
 
 

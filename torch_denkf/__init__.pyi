@@ -1,34 +1,34 @@
 from . import (
+    applications,
     data,
     deployment,
     envs,
     filters,
     functional,
+    fusion,
     metrics,
     modules,
+    monitoring,
     objectives,
-    odometry,
     plots,
     pretrained,
-    simulation,
     smoothers,
     training,
     transforms,
-    vision,
 )
-from .data.kitti.replay import KITTIOdometryExperienceReplay
+from .applications.car.kitti.env import KITTIReplayEnv
+from .applications.car.kitti.replay import KITTIOdometryExperienceReplay
+from .applications.car.optical_flow import OpticalFlow
+from .applications.ur5.data.replay import UR5ExperienceReplay
+from .applications.ur5.envs.table import UR5TableEnv
 from .data.lerobot.replay import LeRobotReplay
 from .data.recordings.frames import Images, Video
 from .data.recordings.replay import Recording, RecordingReplay
 from .data.recordings.tables import Table
-from .data.ur5.replay import UR5ExperienceReplay
-from .deployment import PackagedStep, export_step, load_step
-from .envs.kitti import KITTIReplayEnv
+from .deployment import export_step, load_step
 from .envs.linear import LinearGaussianEnv
 from .envs.pendulum import NoisyPendulumEnv
 from .envs.replay import ReplayEnv
-from .envs.ur5.expert import UR5Expert
-from .envs.ur5.table import UR5TableEnv
 from .filters import (
     DPF,
     EKF,
@@ -37,16 +37,13 @@ from .filters import (
     BackpropKF,
     DEnKF,
     Filter,
-    FusedFilter,
-    FusedSensor,
-    Gated,
     KalmanFilter,
     LSTMFilter,
     MixtureParticleFilter,
-    Monitored,
     ParticleFilter,
-    Refiltering,
 )
+from .fusion import FusedFilter, FusedSensor, Refiltering
+from .monitoring import Gated, Monitored
 from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from .pretrained.folders import available, from_pretrained, save_pretrained
 from .smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
@@ -60,29 +57,28 @@ from .transforms import (
     LastAction,
     MissingFrames,
     OccludingBox,
-    OpticalFlow,
     SaltAndPepper,
 )
 
 __version__: str
 
 __all__ = [
+    "applications",
     "data",
     "deployment",
     "envs",
     "filters",
     "functional",
+    "fusion",
     "metrics",
     "modules",
+    "monitoring",
     "objectives",
-    "odometry",
     "plots",
     "pretrained",
-    "simulation",
     "smoothers",
     "training",
     "transforms",
-    "vision",
     "BackpropKF",
     "BlackFrames",
     "Blur",
@@ -120,7 +116,6 @@ __all__ = [
     "OccludingBox",
     "OpticalFlow",
     "PFM",
-    "PackagedStep",
     "ParticleFilter",
     "ParticleSmoother",
     "RTSSmoother",
@@ -135,7 +130,6 @@ __all__ = [
     "TransitionLoss",
     "UKF",
     "UR5ExperienceReplay",
-    "UR5Expert",
     "UR5TableEnv",
     "Video",
     "available",

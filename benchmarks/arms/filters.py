@@ -12,7 +12,8 @@ from benchmarks.arms.arms import NOISE, Arm, wrap
 from benchmarks.arms.sensor import FromPlaces, JointPlaces, JointSensor
 from torch_denkf import modules as m
 from torch_denkf.filters import DEnKF
-from torch_denkf.training import Stage, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 
 # What follows was chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
@@ -102,11 +103,11 @@ def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error:
     if sensor is None:
         observation: m.SubModel = m.Select(range(size))
         noise = m.ConstantNoise([NOISE] * size, in_key=key)
-        initial = m.FromSensor(range(size), sensor_key=key, **start)
+        initial = m.FromSensor(range(size), observation_key=key, **start)
     else:
         observation, noise = JointPlaces(arm), m.ConstantNoise(error, in_key=key)
         initial = FromPlaces(arm, bias=error, **start)
-    analysis = m.EnsembleAnalysis("etkf", sensor_key=key)
+    analysis = m.EnsembleAnalysis("etkf", observation_key=key)
     return DEnKF(
         transition=transition, sensor=sensor, observation=observation, noise=noise, analysis=analysis, initial=initial
     )

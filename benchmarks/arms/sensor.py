@@ -102,7 +102,7 @@ class FromPlaces(m.FromSensor):
 
     def __init__(self, arm: Arm, *, mean: Tensor, std: Tensor, bias: Tensor, ensemble_size: int):
         mean, std = torch.cat([mean, torch.zeros_like(bias)]), torch.cat([std, bias])
-        settings = {"sensor_key": ("sensor", "reading"), "ensemble_size": ensemble_size}
+        settings = {"observation_key": ("sensor", "reading"), "ensemble_size": ensemble_size}
         super().__init__(range(2 * arm.joints), mean=mean, std=std, **settings)
         self.arm = arm
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import platform
 import shlex
 import sys
@@ -14,6 +15,7 @@ import torch
 import tyro
 
 T = TypeVar("T")
+ROOT = Path(__file__).parents[2]
 CONFIG = (tyro.conf.FlagCreatePairsOff,)  # --smoke, and no --no-smoke
 
 
@@ -52,8 +54,16 @@ def some_of(names: Iterable[str]) -> Any:
 
 
 def command(study: str) -> str:
-    """The command line that is running, for the record: ``python -m benchmarks.<study> ...``."""
-    return shlex.join(["python", "-m", f"benchmarks.{study}", *sys.argv[1:]])
+    """The command line that is running, for the record: ``python -m benchmarks.<study> ...``.
+
+    Absolute paths are written as seen from the repository's root, so that no folder of this machine is in the record.
+    """
+    return shlex.join(["python", "-m", f"benchmarks.{study}", *(_from_root(word) for word in sys.argv[1:])])
+
+
+def _from_root(word: str) -> str:
+    option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    return option + equals + (os.path.relpath(value, ROOT) if os.path.isabs(value) else value)
 
 
 def processor() -> str:

@@ -38,7 +38,7 @@ class Extended(ArmRecipe):
             noise=self.noise(),
             transition=self.forecast(MappedNoise(self.process_noise(), matrix)),
             **self.readings(),
-            analysis=self.Analysis(self.observation(), observation_key=self.reading_key),
+            analysis=self.Analysis(self.observation(), observation_key=self.observation_key),
         )
 
 

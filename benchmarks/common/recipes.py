@@ -13,14 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf.filters import Filter
-from torch_denkf.modules import (
-    GaussianLikelihood,
-    LearnedLikelihood,
-    ParticleAnalysis,
-    ResampledTransition,
-    ScaledNoise,
-    SubModel,
-)
+from torch_denkf.modules import GaussianLikelihood, LearnedLikelihood, ScaledNoise, SubModel
+from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
 
 R = TypeVar("R", bound=type)
@@ -48,10 +42,10 @@ class Recipe:
         dims: the dimensions of the state that count, in scores and losses.
         unit: what counts as an error of one in each of them, ``[len(dims)]``.
         encoding: how many features the noise of a reading is learned from.
-        reading_key: what is compared with the predicted reading.
+        observation_key: what is compared with the predicted reading.
     """
 
-    reading_key: NestedKey = ("sensor", "ensemble")
+    observation_key: NestedKey = ("sensor", "ensemble")
     needs_training = False  # True where the state follows from the readings only by learned weights
     scaled: ClassVar[tuple[type[nn.Module], ...]] = (ScaledNoise,)  # modules that set_inflation sets
     dims: Sequence[int]
@@ -115,9 +109,9 @@ class Particles(Recipe):
         if not self.learned:
             modules["noise"] = self.noise()
         modules |= {"transition": ResampledTransition(motion, self.resampling), **self.readings()}
-        likelihood = GaussianLikelihood(sensor_key=self.reading_key, **self.likelihood_keys)
+        likelihood = GaussianLikelihood(observation_key=self.observation_key, **self.likelihood_keys)
         if self.learned:
-            keys = {"reading_key": self.reading_key, **self.likelihood_keys}
+            keys = {"observation_key": self.observation_key, **self.likelihood_keys}
             likelihood = LearnedLikelihood(self.encoding, len(self.unit), bound=self.learned, scale=self.unit, **keys)
         observation = self.observation()
         return modules | {"observation": observation, "likelihood": likelihood, "analysis": ParticleAnalysis()}

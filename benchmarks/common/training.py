@@ -9,7 +9,8 @@ from torch import Tensor
 
 from benchmarks.common.recipes import Recipe
 from torch_denkf.filters import Filter
-from torch_denkf.training import FilterTrainer, Stage, choose, choose_for_coverage, read_checkpoint, write_checkpoint
+from torch_denkf.training import FilterTrainer, Stage, choose, choose_for_coverage
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 
 def fit_filter(

@@ -170,7 +170,7 @@ def _filter(transition: m.SubModel, noise: m.ConstantNoise, members: int) -> DEn
         sensor=None,
         observation=m.Select(range(noise.log_variance.numel())),
         noise=noise,
-        analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
+        analysis=m.EnsembleAnalysis("etkf", observation_key="observation"),
         initial=m.GaussianPrior(START, [0.02] * 5, ensemble_size=members),
         update_at_reset=True,
     )

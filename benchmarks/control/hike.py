@@ -61,9 +61,9 @@ def exact_filter(noise: float) -> KalmanFilter:
     one = torch.eye(2)
     return KalmanFilter(
         one,
-        PROCESS**2 * one,
         one,
-        max(noise, 1e-3) ** 2 * one[0].new_ones(2),
+        process_noise=[PROCESS] * len(one),
+        noise=[max(noise, 1e-3)] * 2,
         mean=torch.zeros(2),
         cov=START_STD**2 * one,
         control=STRIDE * one,
@@ -82,7 +82,7 @@ def unlearned_filter(members: int) -> DEnKF:
         sensor=None,
         observation=m.Select([0, 1]),
         noise=m.ConstantNoise([0.2] * 2, trainable=True, in_key="observation"),
-        analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
+        analysis=m.EnsembleAnalysis("etkf", observation_key="observation"),
         initial=m.GaussianPrior([0.0] * 2, [START_STD] * 2, ensemble_size=members),
         process_noise=q,
         update_at_reset=True,

@@ -44,7 +44,7 @@ def unlearned_filter(members: int) -> DEnKF:
         sensor=None,
         observation=m.Select([0, 1]),
         noise=m.ConstantNoise([0.2] * 2, trainable=True, in_key="observation"),
-        analysis=m.EnsembleAnalysis("etkf", sensor_key="observation"),
+        analysis=m.EnsembleAnalysis("etkf", observation_key="observation"),
         initial=m.GaussianPrior([0.0] * 3, [0.7, 0.7, 0.6], ensemble_size=members),
         update_at_reset=True,
     )

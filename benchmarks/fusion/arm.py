@@ -9,9 +9,10 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.fusion.task import Task, add_features
-from torch_denkf.envs import UR5Expert, UR5TableEnv
-from torch_denkf.filters import FusedFilter, FusedSensor
+from torch_denkf.applications.ur5 import UR5TableEnv
+from torch_denkf.applications.ur5.envs.expert import UR5Expert
 from torch_denkf.functional import crps_gaussian
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, LinearObservation, LinearTransition, MappedNoise, MomentPrior
 from torch_denkf.pretrained import from_pretrained
 

@@ -10,15 +10,17 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.fusion.task import Task, add_features, delayed
-from torch_denkf.data import list_kitti_drives
-from torch_denkf.data.kitti.files import read_poses
-from torch_denkf.filters import FusedFilter, FusedSensor
-from torch_denkf.functional import crps_gaussian, unicycle_move
-from torch_denkf.modules import ConstantNoise, GaussianAround, Select, UnicycleNoise, UnicycleTransition
-from torch_denkf.odometry.car import VELOCITIES
-from torch_denkf.odometry.streams import Drive, read_sensor
+from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.applications.car.odometry.filter import VELOCITIES
+from torch_denkf.applications.car.odometry.streams import Drive, read_sensor
+from torch_denkf.applications.car.unicycle import unicycle_move
+from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
+from torch_denkf.functional import crps_gaussian
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import ConstantNoise, GaussianAround, Select
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.vision import KITTI_DT, poses_to_state
 
 __all__ = ["car_task"]
 

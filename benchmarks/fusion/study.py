@@ -20,7 +20,7 @@ from benchmarks.fusion.arm import arm_task
 from benchmarks.fusion.car import car_task
 from benchmarks.fusion.task import FAULTS, Task, delayed, faulty, without
 from benchmarks.fusion.training import make_weights, train
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 COLUMNS = Columns(
     names=("task", "method", "sensors", "condition", "seed", "error", "error_without", "error_ratio"),

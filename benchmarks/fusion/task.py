@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torch_denkf.filters import FusedFilter
+from torch_denkf.fusion import FusedFilter
 
 __all__ = ["FAULTS", "FEATURE_STEPS", "Task", "add_features", "delayed", "faulty", "without"]
 
@@ -29,7 +29,7 @@ class Task:
         offsets: by sensor, what a fault adds, in the reading's units.
         noises: by sensor, standard deviations of the readings.
         failing: the sensors of which one fails in a training window; those that matter most stand there twice.
-        slope: of the weights before training, see :class:`~torch_denkf.modules.SensorAttention`.
+        slope: of the weights before training, see :class:`~torch_denkf.fusion.SensorAttention`.
         updates: of the noise and of the weights.
         late: by sensor, by how many more steps its readings come late where it is delayed.
         train: windows ``[N, T]`` on which noise and weights are trained.

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.fusion.task import FAULTS, Task, faulty, without
-from torch_denkf.modules import SensorAttention
+from torch_denkf.fusion import SensorAttention
 
 __all__ = ["make_weights", "train"]
 

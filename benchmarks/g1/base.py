@@ -13,7 +13,7 @@ from benchmarks.g1.aim import HandPlace
 from benchmarks.g1.recordings import ARM, Recordings, Roles, bytes_of, rows_of, targets
 from benchmarks.g1.sensors import SENSORS, FramePool, Statistics, train_sensor
 from torch_denkf.modules import ImageSensor
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 CHECKED = 1200  # frames that a sensor is validated on
 

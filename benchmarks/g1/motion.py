@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from benchmarks.g1.sensors import Statistics
 from benchmarks.g1.targets import Target
-from torch_denkf.training import Stage, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 
 FADING = 0.98  # of a bias in a row, before training
 DELAYS = (0, 2)  # rows: the robot follows a command after some

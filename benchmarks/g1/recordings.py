@@ -11,10 +11,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data import LeRobotReplay, lag_errors, recording_from_rows
+from torch_denkf.data import LeRobotReplay, lag_errors
 from torch_denkf.data.episodes import hashed_share
 from torch_denkf.data.lerobot.recording import DecodedRecording
 from torch_denkf.data.lerobot.replay import is_for_tests
+from torch_denkf.data.lerobot.rows import recording_from_rows
 
 ARM, HAND = range(7, 14), range(20, 26)  # numbers of the robot's 26: the right arm, rad, and the right hand, 0 to 1
 JOINTS, FINGERS = len(ARM), len(HAND)

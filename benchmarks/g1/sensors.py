@@ -15,7 +15,8 @@ from benchmarks.g1.recordings import FINGERS, JOINTS, READ
 from benchmarks.g1.trunk import SecondLookTrunk, Shrink
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, convolutional_trunk
-from torch_denkf.training import Stage, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 
 SAMPLES = 16  # of a sensor while it is trained
 ELSEWHERE = 0.4  # of the training frames are put before the table of another episode

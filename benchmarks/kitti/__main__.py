@@ -17,7 +17,7 @@ from benchmarks.kitti.study import Study, evaluate_and_draw, make_jobs, prepare_
 from benchmarks.kitti.tables import COLUMNS, markdown
 from benchmarks.kitti.training import Budget, load_filter
 from torch_denkf._files import write_text
-from torch_denkf.data import write_drives
+from torch_denkf.applications.car import write_drives
 
 
 def smoke(study: Study) -> Study:

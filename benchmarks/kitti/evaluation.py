@@ -17,20 +17,17 @@ from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import REACH, KITTIRecipe
 from benchmarks.kitti.streams import CONDITIONS, DISTURBANCES, Stream
 from benchmarks.kitti.training import FLOOR, run_filter
-from torch_denkf.filters import Filter
-from torch_denkf.functional import crps_gaussian
-from torch_denkf.metrics import (
+from torch_denkf.applications.car import (
     dead_reckoning,
-    gaussian_nll,
-    interval_coverage,
     kitti_devkit_error,
     kitti_endpoint_error,
     kitti_pathlength_error,
-    nees,
-    spread_skill_ratio,
-    state_errors,
 )
-from torch_denkf.odometry.streams import all_frames, lose_frames, shortest_spans
+from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, shortest_spans
+from torch_denkf.filters import Filter
+from torch_denkf.functional import crps_gaussian
+from torch_denkf.metrics import interval_coverage, nees, spread_skill_ratio, state_errors
+from torch_denkf.metrics.consistency import gaussian_nll
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged

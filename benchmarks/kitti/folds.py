@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.kitti.streams import DISTURBANCES, Stream, mirror, rows
-from torch_denkf.odometry.batches import with_start
+from torch_denkf.applications.car.odometry.batches import with_start
 
 VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 # Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.

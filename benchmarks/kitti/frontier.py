@@ -24,9 +24,9 @@ from benchmarks.kitti.recipes import KITTIRecipe
 from benchmarks.kitti.study import Job, Study, make_jobs
 from benchmarks.kitti.tables import by_drive
 from benchmarks.kitti.training import FLOOR, calibration_error, load_filter, run_filter
+from torch_denkf.applications.car.odometry.batches import mark_start
+from torch_denkf.applications.car.odometry.streams import all_frames
 from torch_denkf.filters import Filter
-from torch_denkf.odometry.batches import mark_start
-from torch_denkf.odometry.streams import all_frames
 
 SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" takes no localisation
 WINDOW = 100  # steps

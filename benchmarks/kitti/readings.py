@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from benchmarks.kitti.folds import Part
 from benchmarks.kitti.streams import LONGEST, mirror, rows, spans
-from torch_denkf.data.kitti.frames import MOTION_KEYS
+from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
 from torch_denkf.modules import SubModel
 
 

@@ -14,9 +14,11 @@ from torch import Tensor
 from benchmarks.common.scores import SensorLoss
 from benchmarks.kitti.folds import Fold, FrameSampler, Part, Statistics, statistics
 from benchmarks.kitti.readings import read_sensor, read_spans
+from torch_denkf.applications.car import FlowSensor
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import FlowSensor, ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.training import Stage, train_part
+from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 
 SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
 

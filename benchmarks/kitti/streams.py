@@ -13,18 +13,14 @@ from tensordict import TensorDict
 from torchrl.envs.transforms import Transform
 
 from benchmarks.common.jobs import side_by_side
-from torch_denkf.data import (
-    frames_at,
-    list_kitti_drives,
-    mirror_drive,
-    read_kitti_drive,
-    steps_between,
-    with_motion,
-)
+from torch_denkf.applications.car import read_kitti_drive, with_motion
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.frames import MOTION_KEYS, frames_at
+from torch_denkf.applications.car.kitti.gaps import steps_between
+from torch_denkf.applications.car.kitti.mirror import mirror_drive
+from torch_denkf.applications.car.vision import static_region
 from torch_denkf.data.cache import cached
-from torch_denkf.data.kitti.frames import MOTION_KEYS
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
-from torch_denkf.vision import static_region
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
 LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing

@@ -21,7 +21,7 @@ from benchmarks.kitti.sensors import SENSORS, SensorOfFold, SensorTraining, sens
 from benchmarks.kitti.streams import Stream, find_streams, prepare, spans
 from benchmarks.kitti.tables import IDENTITY
 from benchmarks.kitti.training import Budget, load_filter, train_filter
-from torch_denkf.data import render_drives
+from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.modules import SubModel
 
 RENDERED_FRAMES = 160

@@ -21,11 +21,13 @@ from benchmarks.kitti.folds import VELOCITIES, Fold, FrameSampler, Statistics
 from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
+from torch_denkf.applications.car.odometry.batches import ReadingSampler
+from torch_denkf.applications.car.odometry.scores import EndToEndLoss
+from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames
 from torch_denkf.filters import Filter
-from torch_denkf.odometry.batches import ReadingSampler
-from torch_denkf.odometry.scores import EndToEndLoss
-from torch_denkf.odometry.streams import all_frames, lose_frames
-from torch_denkf.training import Stage, parameters_without, read_checkpoint
+from torch_denkf.training import Stage
+from torch_denkf.training.checkpoint import read_checkpoint
+from torch_denkf.training.parts import parameters_without
 
 INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.6, 2.0)
 FLOOR = 1e-8  # of the variances of v and theta_dot

@@ -66,7 +66,7 @@ def _models() -> dict:
 
 def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> Filter:
     """The DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
-    keys = {"inflation": inflation, "rotate": scheme == "etkf", "sensor_key": "observation"}
+    keys = {"inflation": inflation, "rotate": scheme == "etkf", "observation_key": "observation"}
     if scheme == "etkf" and radius is not None:
         places = torch.arange(float(VARIABLES)).unsqueeze(-1)
         analysis = LocalEnsembleAnalysis.around(places, places, radius, period=[float(VARIABLES)], **keys)
@@ -85,7 +85,7 @@ def gaussian(kind: type[EKF | UKF], inflation: float) -> Filter:
 def particles(size: int, kernel: float) -> Filter:
     """A bootstrap filter, regularised."""
     initial = AroundState([1.0] * VARIABLES, ensemble_size=size)
-    likelihood = GaussianLikelihood(sensor_key="observation")
+    likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(**_models(), likelihood=likelihood, jitter=kernel, initial=initial)
 
 

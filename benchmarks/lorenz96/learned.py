@@ -8,11 +8,11 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from benchmarks.common.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
-from torch_denkf.functional import gaspari_cohn
+from torch_denkf.functional.localisation import gaspari_cohn
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select
 from torch_denkf.objectives import DEnKFLoss
-from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 FORCING, NOISE, R = 8.0, 0.2, 1.0  # of the true system: F; model noise and observation noise, standard deviations
 START, NOISE_START = 5.0, 1.0  # where learning begins
@@ -101,9 +101,9 @@ def make_filter(
         observation=Select(dims),
         noise=ConstantNoise([R] * len(dims), in_key="observation"),
         process_noise=noise,
-        analysis=EnsembleAnalysis("perturbed", taper=taper, sensor_key="observation"),
+        analysis=EnsembleAnalysis("perturbed", taper=taper, observation_key="observation"),
         initial=FromSensor(
-            dims, [mean] * variables, [std] * variables, ensemble_size=ensemble_size, sensor_key="observation"
+            dims, [mean] * variables, [std] * variables, ensemble_size=ensemble_size, observation_key="observation"
         ),
     )
 

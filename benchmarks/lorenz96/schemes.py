@@ -19,10 +19,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.arguments import command, processor
+from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.common.tables import head, line, write_page
-from torch_denkf.functional import analyse, inflate, random_rotation
+from torch_denkf.functional import analyse
+from torch_denkf.functional.inflation import inflate, random_rotation
 from torch_denkf.modules import LocalEnsembleAnalysis
-from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 VARIABLES = 40
 SPIN_UP = 1000  # cycles from a random state to the attractor

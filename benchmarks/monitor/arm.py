@@ -12,12 +12,12 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from benchmarks.monitor.scores import Run, afterwards, detection, false_alarms
-from torch_denkf.data import UR5ExperienceReplay
-from torch_denkf.envs import collect_ur5_demos
-from torch_denkf.filters import Filter, Gated
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, InnovationMonitor, MonitoredSensor, Select
+from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
+from torch_denkf.applications.ur5.train import UNIT
+from torch_denkf.filters import Filter
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, Select
+from torch_denkf.monitoring import Gated, InnovationMonitor, MonitoredSensor
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.pretrained.train.ur5_table import UNIT
 
 __all__ = [
     "CHOSEN",
@@ -83,14 +83,14 @@ def arm_filter() -> Filter:
     """The trained filter behind its camera, with a second update by the encoders of all joints."""
     model = from_pretrained("ur5-table")
     parts = {name: model[name] for name in model.module if name != "sensor"}
-    parts["analysis"] = EnsembleAnalysis("sensor", inflation=model.inflation, belief_key="seen")
+    parts["analysis"] = EnsembleAnalysis("sensor", inflation=model.inflation, belief_prefix="seen")
     parts["encoder_noise"] = ConstantNoise([ENCODER] * JOINTS, in_key="encoder", out_key=("encoders", "noise"))
     parts["read"] = Select(range(JOINTS), in_key=("seen", "ensemble"), out_key=("seen", "joints"))
     parts["encoders"] = EnsembleAnalysis(
         "etkf",
         forecast_key=("seen", "ensemble"),
         predicted_key=("seen", "joints"),
-        sensor_key="encoder",
+        observation_key="encoder",
         noise_variance_key=("encoders", "noise"),
     )
     return Filter(parts, initial=model.initial, update_at_reset=True)

@@ -12,16 +12,18 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.data import read_kitti_drive, with_motion
+from torch_denkf.applications.car import read_kitti_drive, with_motion
+from torch_denkf.applications.car.odometry.batches import mark_start
+from torch_denkf.applications.car.odometry.filter import CarFilter
+from torch_denkf.applications.car.odometry.scores import first_state
+from torch_denkf.applications.car.odometry.streams import read_sensor, shortest_spans
+from torch_denkf.applications.car.vision import PICTURE_SIGNS, flow_signs, picture_signs, plane_distance
+from torch_denkf.applications.car.vision.poses import KITTI_DT
+from torch_denkf.applications.car.vision.signs import FLOW_SIGNS
 from torch_denkf.data.cache import cached
 from torch_denkf.filters import Filter
-from torch_denkf.odometry import CarFilter
-from torch_denkf.odometry.batches import mark_start
-from torch_denkf.odometry.scores import first_state
-from torch_denkf.odometry.streams import read_sensor, shortest_spans
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.transforms import BlackFrames, Brightness, OccludingBox
-from torch_denkf.vision import FLOW_SIGNS, KITTI_DT, PICTURE_SIGNS, flow_signs, picture_signs, plane_distance
 
 __all__ = [
     "ALWAYS",

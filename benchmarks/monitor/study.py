@@ -16,8 +16,9 @@ from benchmarks.common.jobs import once, read_rows, side_by_side
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.monitor import car
 from benchmarks.monitor.drives import FAULTS, failing
-from torch_denkf.data import list_kitti_drives, write_drives
-from torch_denkf.data.kitti.render import render_drives
+from torch_denkf.applications.car import write_drives
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.render import render_drives
 
 TASKS = ("ur5", "kitti-real", "kitti-rendered")
 PATHS = ("m_per_m", "held_v", "held_theta_dot", "m_per_m_gated", "held_v_gated", "held_theta_dot_gated")
@@ -74,7 +75,7 @@ def rows_of(study: Study, task: str) -> list[dict]:
     cache = study.out / "readings"
     if task == "ur5":
         from benchmarks.monitor.arm import arm_rows, own_demos  # needs mujoco
-        from torch_denkf.pretrained.train.ur5_table import whole_demos
+        from torch_denkf.applications.ur5.train import whole_demos
 
         own = own_demos(study.out, 3) if study.smoke else own_demos(study.out)
         folder = whole_demos(study.out, 10 if study.smoke else 60, progress=False)

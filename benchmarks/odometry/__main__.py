@@ -13,14 +13,14 @@ import torch
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import Columns, head, line, report
+from torch_denkf.applications.car import kitti_devkit_error, kitti_endpoint_error, write_drives
+from torch_denkf.applications.car.kitti.clock import read_times
+from torch_denkf.applications.car.kitti.drive import choose_camera, list_kitti_drives
+from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.applications.car.odometry.paths import read_path
+from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
+from torch_denkf.applications.car.vision.poses import poses_to_state
 from torch_denkf.cli.main import main as denkf
-from torch_denkf.data import list_kitti_drives, write_drives
-from torch_denkf.data.kitti.clock import read_times
-from torch_denkf.data.kitti.drive import choose_camera
-from torch_denkf.data.kitti.files import read_poses
-from torch_denkf.metrics import kitti_devkit_error, kitti_endpoint_error
-from torch_denkf.odometry import read_path
-from torch_denkf.vision import KITTI_HEIGHT, poses_to_state
 
 WINDOW = 100  # steps of an end point error; half of a shorter drive
 COLUMNS = Columns(

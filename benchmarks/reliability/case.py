@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch_denkf
+from benchmarks.reliability.hostile import MARK
 
 __all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge", "workshop"]
 
@@ -45,8 +46,6 @@ class Case:
         right: whether a result is right, as the sound part of the input tells; ``None`` where the input must be
             refused.
         within: s in which it must be over.
-        needs: makes what several cases start from, in a process of its own; called once, before the first of them.
-        slow: whether ``needs`` takes so long that small samples leave the case out.
     """
 
     border: str
@@ -55,8 +54,6 @@ class Case:
     act: Callable[[Path], Any]
     right: Callable[[Any], bool] | None = None
     within: float = SECONDS
-    needs: Callable[[], Any] | None = None
-    slow: bool = False
 
 
 class Refused(Exception):
@@ -104,8 +101,6 @@ def workshop() -> Path:
 
 def judge(case: Case) -> Verdict:
     """Runs a case in a forked process, so that neither a crash nor a hang nor what it changes reaches another one."""
-    if case.needs is not None:
-        case.needs()
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     read, write = os.pipe()
     sys.stdout.flush()
@@ -154,6 +149,8 @@ def _run(case: Case, folder: Path, write: int) -> None:
     os.chdir(folder)
     try:
         verdict = _verdict(case, folder)
+        if (folder / MARK).exists():
+            verdict = Verdict("silent", "a hostile file got to run")
         os.write(write, json.dumps(vars(verdict)).encode())
     finally:
         os._exit(0)

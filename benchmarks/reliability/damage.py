@@ -1,109 +1,160 @@
-"""Small grammars of damage: of values, of files, and comparisons with what comes out of a sound input."""
+"""A small vocabulary of damage: wrong values, changed files and entries, each with a name or drawn by hypothesis."""
 
 from __future__ import annotations
 
 import math
+import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from hypothesis import strategies as st
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = [
-    "BYTES",
-    "copied",
-    "finite",
-    "gone",
-    "same",
-    "same_but",
-    "written",
-]
+__all__ = ["Wrong", "copied", "drawn", "fields", "finite", "gone", "same", "same_but", "written"]
 
 NAN, INF = math.nan, math.inf
+Named = st.SearchStrategy[tuple[str, Any]]
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """Wrong values of one thing.
+
+    Args:
+        named: those that are always tried, by what is wrong with them.
+        others: draws more of them, each with its name.
+    """
+
+    named: Mapping[str, Any]
+    others: Named = st.nothing()  # noqa: RUF009 - it cannot be changed
+
+    def __or__(self, more: Wrong | Mapping[str, Any]) -> Wrong:
+        """With further ones."""
+        if isinstance(more, Wrong):
+            return Wrong({**self.named, **more.named}, self.others | more.others)
+        return Wrong({**self.named, **more}, self.others)
+
+    def but(self, *names: str) -> Wrong:
+        """Without those that are not wrong here; none is drawn, as it might be one of them."""
+        return Wrong({name: value for name, value in self.named.items() if name not in names})
+
+    def each(self, change: Callable[[Any], Any]) -> Wrong:
+        """With something made of every value."""
+        return Wrong(
+            {name: change(value) for name, value in self.named.items()},
+            self.others.map(lambda other: (other[0], change(other[1]))),
+        )
+
+    def some(self) -> Named:
+        """Any of them, with its name."""
+        return st.sampled_from(sorted(self.named.items(), key=lambda one: one[0])) | self.others
+
+
+def drawn(values: st.SearchStrategy[Any]) -> Named:
+    """Values under their own names."""
+    return values.map(lambda value: (" ".join(repr(value).split())[:80], value))
 
 
 # ------------------------------------------------------------------------------------------------------- numbers
 
-Values = dict[str, Any]
+TEXT = {"text": "much"}
+BELOW = st.floats(max_value=-1e-30)
+NO_COUNT = st.integers(max_value=-1) | st.floats(0.01, 0.99).map(lambda part: 3 + part)
 
-_NO_NUMBER: Values = {"text": "much"}
-POSITIVE: Values = {"zero": 0.0, "negative": -1.0, "nan": NAN, "inf": INF, **_NO_NUMBER}
-NOT_NEGATIVE: Values = {"negative": -1.0, "nan": NAN, "inf": INF, **_NO_NUMBER}
-FINITE: Values = {"nan": NAN, "inf": INF, **_NO_NUMBER}
-SHARE: Values = {"negative": -0.1, "beyond one": 1.5, "nan": NAN, "inf": INF, **_NO_NUMBER}
-COUNT: Values = {"zero": 0, "negative": -3, "fraction": 2.5, **_NO_NUMBER}
-LARGE_COUNT: Values = {**COUNT, "one": 1}
-COUNT_OR_NONE: Values = {"negative": -3, "fraction": 2.5, **_NO_NUMBER}
-CHOICE: Values = {"unknown": "sideways", "a number": 3, "empty": ""}
-MODULE: Values = {"nothing": None, "text": "network"}
-
-
-def dims(size: int) -> Values:
-    """Indices of components, none of which fits ``size`` of them."""
-    return {
-        "beyond the end": [size],
-        "far before the start": [-size - 1],
-        "twice the same": [0, 0],
-        "fraction": [0.5],
-        "text": ["x"],
-    }
-
-
-def angles(size: int) -> Values:
-    """Indices of angles, likewise; one that is there twice is wrapped twice, and right."""
-    return {what: value for what, value in dims(size).items() if what != "twice the same"}
+POSITIVE = Wrong({"zero": 0.0, "negative": -1.0, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW | st.just(-0.0)))
+NOT_NEGATIVE = Wrong({"negative": -1.0, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW))
+FINITE = Wrong({"nan": NAN, "inf": INF, **TEXT}, drawn(st.just(-INF)))
+SHARE = Wrong(
+    {"negative": -0.1, "beyond one": 1.5, "nan": NAN, "inf": INF, **TEXT}, drawn(BELOW | st.floats(min_value=1.001))
+)
+RATE = SHARE | {"one": 1.0, "too small for eight bits": 0.001}
+COUNT = Wrong({"zero": 0, "negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
+LARGE_COUNT = COUNT | {"one": 1}
+COUNT_OR_NONE = Wrong({"negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
+FROM_ZERO = COUNT_OR_NONE
+CHOICE = Wrong({"unknown": "sideways", "a number": 3, "empty": ""}, drawn(st.text("xyz?", min_size=1)))
+MODULE = Wrong({"nothing": None, "text": "network"}, drawn(st.integers() | st.binary(max_size=4)))
+SIZE = Wrong(
+    {"zero": (0, 10), "negative": (-4, 10), "one number": (10,), "text": "ab"},
+    drawn(st.tuples(st.integers(max_value=0), st.integers(1, 20))),
+)
+CELLS = Wrong(
+    {"zero": (0,), "negative": (-4,), "fraction": (2.5,), "text": "wide"}, drawn(st.tuples(st.just(4), NO_COUNT))
+)
 
 
-def vector(size: int, *, positive: bool = False, negative: bool = True, length: bool = True) -> Values:
+def angles(size: int) -> Wrong:
+    """Indices of components, none of which fits ``size`` of them; an angle that is there twice is wrapped twice."""
+    beyond = st.integers(min_value=size, max_value=99) | st.integers(-99, -size - 1)
+    named = {"beyond the end": [size], "far before the start": [-size - 1], "fraction": [0.5], "text": ["x"]}
+    return Wrong(named, drawn(beyond.map(lambda index: [0, index])))
+
+
+def dims(size: int) -> Wrong:
+    """Likewise, of components that are read: each at most once."""
+    return angles(size) | {"twice the same": [0, 0]}
+
+
+def vector(size: int, *, positive: bool = False, negative: bool = True, length: bool = True) -> Wrong:
     """Vectors that are none of ``size`` finite numbers; ``positive`` where zero is wrong, too."""
 
-    def of(last: float) -> list[float]:
-        return [1.0] * (size - 1) + [last]
+    def of(last: float, place: int = -1) -> list[float]:
+        out = [1.0] * size
+        out[place] = last
+        return out
 
-    out: Values = {"nan": of(NAN), "inf": of(INF), "text": "much"}
+    bad, named = st.sampled_from([NAN, -INF]), {"nan": of(NAN), "inf": of(INF), "text": "much"}
     if length:
-        out |= {"too long": [1.0] * (size + 1), "a matrix": torch.ones(size, size + 1)}
+        named |= {"too long": [1.0] * (size + 1), "a matrix": torch.ones(size, size + 1)}
     if not negative or positive:
-        out["negative"] = of(-0.5)
+        named["negative"], bad = of(-0.5), bad | BELOW
     if positive:
-        out["zero"] = of(0.0)
+        named["zero"] = of(0.0)
+    return Wrong(named, drawn(st.builds(of, bad, st.integers(0, size - 1))))
+
+
+def _with(made: Tensor, place: tuple[int, int], value: float) -> Tensor:
+    out = made.clone()
+    out[place] = value
     return out
 
 
-def matrix(rows: int, columns: int) -> Values:
+def matrix(rows: int, columns: int) -> Wrong:
     """Matrices that are none of ``rows`` by ``columns`` finite numbers."""
-    bad = torch.eye(rows, columns)
-    nan, inf = bad.clone(), bad.clone()
-    nan[0, -1], inf[-1, 0] = NAN, INF
-    return {
-        "nan": nan,
-        "inf": inf,
-        "a row more": torch.eye(rows + 1, columns),
-        "a column more": torch.eye(rows, columns + 1),
-        "a vector": torch.ones(columns + 1),
-        "three dimensions": torch.ones(2, rows, columns),
-        "text": "much",
-    }
+    eye = torch.eye(rows, columns)
+    places = st.tuples(st.integers(0, rows - 1), st.integers(0, columns - 1))
+    return Wrong(
+        {
+            "nan": _with(eye, (0, -1), NAN),
+            "inf": _with(eye, (-1, 0), INF),
+            "a row more": torch.eye(rows + 1, columns),
+            "a column more": torch.eye(rows, columns + 1),
+            "a vector": torch.ones(columns + 1),
+            "three dimensions": torch.ones(2, rows, columns),
+            "text": "much",
+        },
+        drawn(st.builds(_with, st.just(eye), places, st.sampled_from([NAN, INF, -INF]))),
+    )
 
 
-def covariance(size: int) -> Values:
+def covariance(size: int) -> Wrong:
     """Matrices that are no covariance of ``size`` components."""
-    skew, minus = torch.eye(size), torch.eye(size)
-    skew[0, -1] = 0.5
-    minus[-1, -1] = -1.0
-    indefinite = torch.ones(size, size) + 0.5 * torch.ones(size, size) - torch.eye(size)
-    return {
-        **matrix(size, size),
-        "not symmetric": skew,
-        "negative variance": minus,
-        "indefinite": indefinite,
+    eye = torch.eye(size)
+    return matrix(size, size) | {
+        "not symmetric": _with(eye, (0, -1), 0.5),
+        "negative variance": _with(eye, (-1, -1), -1.0),
+        "indefinite": 1.5 * torch.ones(size, size) - eye,
     }
 
 
 # --------------------------------------------------------------------------------------------------------- files
+
+Change = Callable[[Any], Any]
 
 
 def copied(sound: Path, folder: Path) -> Path:
@@ -121,33 +172,126 @@ def gone(file: Path) -> None:
         file.unlink()
 
 
-def _flipped(at: float) -> Callable[[bytes], bytes]:
+def written(change: Callable[[bytes], bytes]) -> Change:
+    """Damages a file's bytes."""
+    return lambda file: file.write_bytes(change(file.read_bytes()))
+
+
+def instead(make: Change) -> Change:
+    """Puts something else in a file's place."""
+    return lambda file: (gone(file), make(file))
+
+
+def flipped(at: float, mask: int = 0xFF) -> Callable[[bytes], bytes]:
     def flip(data: bytes) -> bytes:
         place = min(int(at * len(data)), len(data) - 1)
-        return data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
+        return data[:place] + bytes([data[place] ^ mask]) + data[place + 1 :]
 
     return flip
 
 
-#: By name: what happens to a file's bytes.
-BYTES: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda data: b"",
-    "cut in half": lambda data: data[: len(data) // 2],
-    "cut by a byte": lambda data: data[:-1],
-    "zeros": lambda data: bytes(len(data)),
-    "zeros behind": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
-    "not UTF-8": lambda data: b"\xff\xfe\x80" + data,
-    "another format": lambda data: b"GIF89a" + data[6:],
-    "a byte flipped at the start": _flipped(0.0),
-    "a byte flipped in the middle": _flipped(0.5),
-    "a byte flipped near the end": _flipped(0.95),
-}
+def _cut(at: float) -> Callable[[bytes], bytes]:
+    return lambda data: data[: int(at * len(data))]
 
 
-def written(file: Path, change: Callable[[bytes], bytes]) -> Path:
-    """Damages a file's bytes."""
-    file.write_bytes(change(file.read_bytes()))
-    return file
+#: What happens to a file's bytes.
+BYTES = Wrong(
+    {
+        "empty": lambda data: b"",
+        "cut in half": lambda data: data[: len(data) // 2],
+        "cut by a byte": lambda data: data[:-1],
+        "zeros": lambda data: bytes(len(data)),
+        "zeros behind": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
+        "not UTF-8": lambda data: b"\xff\xfe\x80" + data,
+        "another format": lambda data: b"GIF89a" + data[6:],
+        "a byte flipped at the start": flipped(0.0),
+        "a byte flipped in the middle": flipped(0.5),
+        "a byte flipped near the end": flipped(0.95),
+    },
+    st.floats(0.0, 0.99).map(lambda at: (f"a high bit flipped at {at}", flipped(at, 0x80))),
+)
+#: Damage of files whose format or checksum tells every cut and every bit.
+SEALED = Wrong(
+    BYTES.named,
+    st.floats(0.0, 0.99).map(lambda at: (f"cut at {at}", _cut(at)))
+    | st.tuples(st.floats(0.0, 0.99), st.integers(0, 7)).map(
+        lambda place: (f"bit {place[1]} flipped at {place[0]}", flipped(place[0], 1 << place[1]))
+    ),
+)
+#: What stands in a file's place.
+PLACES = Wrong(
+    {
+        "taken away": gone,
+        "a folder": instead(Path.mkdir),
+        "a link to nowhere": instead(lambda file: file.symlink_to("nowhere")),
+        "a link to itself": instead(lambda file: file.symlink_to(file.name)),
+        "a link to a device": instead(lambda file: file.symlink_to("/dev/zero")),
+        "a pipe": instead(os.mkfifo),
+    }
+)
+#: All that happens to a file.
+FILE = BYTES.each(written) | PLACES
+
+
+# ----------------------------------------------------------------------------------------------- what has entries
+
+MISSING = object()
+OF_TYPES = {"text": "x", "nothing": None, "a list": [], "a fraction": 1.5, "negative": -3}
+
+
+def types(*names: str, **more: Any) -> Wrong:
+    """Values of the wrong type, for a field that has another one."""
+    return Wrong({name: OF_TYPES[name] for name in names} | more)
+
+
+def put(path: tuple[Any, ...], value: Any) -> Change:
+    """Puts a value into nested dictionaries, or takes it away; of a function, what it makes of the value."""
+
+    def change(content: Any) -> None:
+        for name in path[:-1]:
+            content = content[name]
+        changed = value(content[path[-1]]) if callable(value) else value
+        if changed is MISSING:
+            del content[path[-1]]
+        else:
+            content[path[-1]] = changed
+
+    return change
+
+
+def fields(wrong: Mapping[Any, Wrong], *, missing: bool = True) -> Wrong:
+    """Changes of what has entries: wrong values of some, and without them.
+
+    Args:
+        wrong: by key, or by path of keys.
+        missing: whether each is also taken away.
+    """
+    out = Wrong({})
+    for key, values in wrong.items():
+        path = key if isinstance(key, tuple) else (key,)
+        name = "/".join(path)
+        values |= {"missing": MISSING} if missing else {}
+        changes = values.each(lambda value, path=path: put(path, value))
+        out |= Wrong(
+            {f"{name} {what}": change for what, change in changes.named.items()},
+            changes.others.map(lambda one, name=name: (f"{name} {one[0]}", one[1])),
+        )
+    return out
+
+
+def on_row(row: int, change: Callable[[Any], Any]) -> Callable[[list], list]:
+    """Changes one of several values; it goes where there is nothing left of it."""
+
+    def act(values: list) -> list:
+        changed = change(values[row])
+        return [*values[:row], *([] if changed is MISSING else [changed]), *values[row + 1 :]]
+
+    return act
+
+
+def in_lines(change: Callable[[list[str]], list[str]]) -> Change:
+    """Changes the lines of a text file."""
+    return lambda file: file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
 
 
 # --------------------------------------------------------------------------------------------------- comparisons
@@ -159,10 +303,10 @@ def leaves(result: Any) -> dict[str, Tensor]:
         return {"": result}
     if isinstance(result, TensorDictBase):
         return {str(key): result[key] for key in result.keys(True, True) if isinstance(result[key], Tensor)}
+    if isinstance(result, list | tuple):
+        result = dict(enumerate(result))
     if isinstance(result, dict):
         return {f"{key}{name}": value for key, part in result.items() for name, value in leaves(part).items()}
-    if isinstance(result, list | tuple):
-        return {f"{key}{name}": value for key, part in enumerate(result) for name, value in leaves(part).items()}
     raise TypeError(f"{type(result).__name__} holds no tensors")
 
 
@@ -181,9 +325,7 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
     )
 
 
-def same_but(
-    result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str], derived: Iterable[str] = ()
-) -> bool:
+def same_but(result: Any, expected: Any, rows: Iterable[int], masks: Iterable[str]) -> bool:
     """Whether ``rows`` are marked as missing in one of ``masks``, and all other rows are as expected.
 
     Args:
@@ -191,18 +333,14 @@ def same_but(
         expected: likewise.
         rows: numbers of the damaged ones.
         masks: names of boolean entries; where one is False the row's reading does not count.
-        derived: entries that follow from several rows and may differ near the damage; they must be finite.
     """
     one, other = leaves(result), leaves(expected)
-    rows, derived = list(rows), set(derived)
+    rows = list(rows)
     if not other.keys() <= one.keys() or not finite(one):
         return False
-    shapes = [key for key in other if one[key].shape != other[key].shape]
-    marked = any(
-        bool((~one[name].reshape(len(one[name]), -1)[row]).any()) for name in masks if name in one for row in rows
-    )
-    if shapes or not marked:
+    if any(one[key].shape != other[key].shape for key in other):
         return False
     keep = torch.ones(len(next(iter(other.values()))), dtype=torch.bool)
     keep[rows] = False
-    return all(torch.equal(one[key][keep], other[key][keep]) for key in other if key not in derived)
+    marked = any(bool((~one[name][rows]).any()) for name in masks if name in one)
+    return marked and all(torch.equal(one[key][keep], other[key][keep]) for key in other)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
-import random
+import multiprocessing
+import re
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import hypothesis
+from hypothesis import strategies as st
+
 from benchmarks.common.arguments import some_of
 from benchmarks.common.tables import head, line
-from benchmarks.reliability.case import Case, Verdict, judge, workshop
+from benchmarks.reliability.case import Case, Verdict, judge
+from benchmarks.reliability.target import Target
 
-__all__ = ["BORDERS", "Fuzz", "all_cases", "run"]
+__all__ = ["BORDERS", "Fuzz", "all_targets", "search", "summary"]
 
 #: Modules of benchmarks/reliability/borders.
 BORDERS = (
@@ -37,121 +41,187 @@ BORDERS = (
     "around",
 )
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
+GOOD = KINDS[:2]
 RESULTS = Path(__file__).parent / "results"
+Row = dict[str, str]  # border, case, kind, what, and how to run it again
 
 
-def all_cases(borders: Sequence[str] = BORDERS) -> list[Case]:
-    """The damaged inputs, in an order of their own."""
-    return [case for name in borders for case in import_module(f"benchmarks.reliability.borders.{name}").cases()]
+def all_targets(borders: Sequence[str] = BORDERS) -> list[Target]:
+    """What may be damaged, in an order of its own."""
+    modules = [import_module(f"benchmarks.reliability.borders.{name}") for name in borders]
+    return [target for module in modules for target in module.targets()]
 
 
-def drawn(cases: Sequence[Case], count: int, seed: int) -> list[Case]:
-    """Some of the cases, of each border its share, at least one; none that takes long to prepare.
+def row(case: Case, verdict: Verdict, again: str) -> Row:
+    """What came of a case, for the record."""
+    return {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text, "again": again}
+
+
+class Found(AssertionError):
+    """An input that is neither refused clearly nor right."""
+
+
+def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str, again: str = "") -> list[Row]:
+    """Draws cases; the smallest that is neither clear nor right comes last, with the words that run it again.
 
     Args:
-        cases: all of them.
-        count: how many, about.
+        cases: what is drawn.
+        count: so many of them, if all are in order.
         seed: another one draws others.
+        words: of the command line, by which ``cases`` are found again.
+        again: runs only the case that these letters stand for.
     """
-    chance = random.Random(seed)
-    borders: dict[str, list[Case]] = {}
-    for case in cases:
-        if not case.slow:
-            borders.setdefault(case.border, []).append(case)
-    total = sum(map(len, borders.values()))
-    return [
-        case
-        for some in borders.values()
-        for case in chance.sample(some, min(len(some), max(1, round(count * len(some) / total))))
-    ]
+    rows: list[Row] = []
 
-
-def run(cases: Sequence[Case], progress: bool = True) -> list[tuple[Case, Verdict]]:
-    """Each case with its verdict."""
-    out, told = [], time.monotonic()
-    for number, case in enumerate(cases, start=1):
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=count,
+        database=None,
+        deadline=None,
+        derandomize=False,
+        print_blob=True,
+        report_multiple_bugs=False,
+        phases=(hypothesis.Phase.generate, hypothesis.Phase.shrink),
+        suppress_health_check=list(hypothesis.HealthCheck),
+        verbosity=hypothesis.Verbosity.quiet,
+    )
+    @hypothesis.given(cases)
+    def attack(case: Case) -> None:
         verdict = judge(case)
-        out.append((case, verdict))
-        if verdict.kind not in ("clear", "right"):
-            print(f"{verdict.kind}: {case.border}: {case.name}: {verdict.text}", flush=True)
-        if progress and (time.monotonic() - told > 10 or number == len(cases)):
-            counts = Counter(verdict.kind for _, verdict in out)
-            print(f"{number} of {len(cases)}: {dict(counts)}", flush=True)
-            told = time.monotonic()
-    return out
+        rows.append(row(case, verdict, words))
+        if verdict.kind not in GOOD:
+            raise Found(verdict.kind)
+
+    if again:
+        attack = hypothesis.reproduce_failure(hypothesis.__version__, again.encode())(attack)
+    try:
+        attack()
+    except Found as found:
+        smallest = rows[-1]
+        letters = re.search(r"reproduce_failure\([^,]+, b'([^']+)'\)", "".join(getattr(found, "__notes__", ())))
+        smallest["again"] += f" --again '{letters[1]}'" if letters else ""
+        rows = [*(one for one in rows if one["kind"] in GOOD), smallest]
+    except hypothesis.errors.DidNotReproduce:
+        pass
+    return rows
 
 
-def run_side_by_side(cases: Sequence[Case], processes: int) -> list[tuple[Case, Verdict]]:
-    """As :func:`run`, in several processes, each of which takes its share of the cases."""
-    if processes == 1:
-        return run(cases)
-    for needs in {case.needs for case in cases if case.needs is not None}:
-        needs()  # once for all
-    files = [workshop() / f"verdicts-{number}.json" for number in range(processes)]
-    children = []
-    for number, file in enumerate(files):
-        child = os.fork()
-        if child == 0:
-            try:
-                verdicts = [vars(verdict) for _, verdict in run(cases[number::processes])]
-                file.write_text(json.dumps(verdicts))
-            finally:
-                os._exit(0)
-        children.append(child)
-    for child in children:
-        os.waitpid(child, 0)
-    shares = [[Verdict(**found) for found in json.loads(file.read_text())] for file in files]
-    return [(case, shares[number % processes][number // processes]) for number, case in enumerate(cases)]
+def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
+    """All named cases of a target, and some that are drawn."""
+    words = f"--match {f'{target.border} {target.name}:'!r}"
+    rows = [row(case, judge(case), f"--match {f'{case.border} {case.name}'!r} --drawn 0") for case in target.named()]
+    if drawn and not target.wrong.others.is_empty:
+        rows += search(target.others(), drawn, seed, words)
+    return rows
 
 
-def summary(judged: Sequence[tuple[Case, Verdict]]) -> dict[str, Any]:
+def told(rows: Sequence[Row]) -> None:
+    """Prints what is neither clear nor right, and how to run it again."""
+    for one in rows:
+        if one["kind"] not in GOOD:
+            print(f"{one['kind']}: {one['border']}: {one['case']}: {one['what']}", flush=True)
+            print(f"  again: python -m benchmarks.reliability fuzz {one['again']}", flush=True)
+
+
+def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
+    """The rows of all works, each of which goes to the first process that is free."""
+    rows: list[Row] = []
+    context, at = multiprocessing.get_context("fork"), time.monotonic()
+    with context.Pool(processes, _take, (works,)) as pool:
+        for number, some in enumerate(pool.imap(_work, range(len(works))), start=1):
+            rows += some
+            told(some)
+            if time.monotonic() - at > 10:
+                counts = dict(Counter(one["kind"] for one in rows))
+                print(f"{number} of {len(works)}: {counts}", flush=True)
+                at = time.monotonic()
+    return rows
+
+
+_WORKS: list[Callable[[], list[Row]]] = []  # of this process, which has them from its parent
+
+
+def _take(works: Sequence[Callable[[], list[Row]]]) -> None:
+    _WORKS[:] = works
+
+
+def _work(number: int) -> list[Row]:
+    return _WORKS[number]()
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Counts of all, by border, and the cases that are neither clear nor right."""
 
     def counts(kinds: Sequence[str]) -> dict[str, int]:
         return {"records": len(kinds), **{kind: kinds.count(kind) for kind in KINDS}}
 
     borders: dict[str, list[str]] = {}
-    for case, verdict in judged:
-        borders.setdefault(case.border, []).append(verdict.kind)
-    wrong = [
-        {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text}
-        for case, verdict in judged
-        if verdict.kind not in ("clear", "right")
-    ]
-    everything = counts([verdict.kind for _, verdict in judged])
+    for one in rows:
+        borders.setdefault(one["border"], []).append(one["kind"])
+    wrong = [one for one in rows if one["kind"] not in GOOD]
+    everything = counts([one["kind"] for one in rows])
     return {**everything, "borders": {name: counts(kinds) for name, kinds in borders.items()}, "wrong": wrong}
 
 
 def table(found: dict[str, Any]) -> str:
     """A summary as Markdown."""
     rows = [*found["borders"].items(), ("all", found)]
-    lines = [line(name, row["records"], *(row[kind] for kind in KINDS)) for name, row in rows]
+    lines = [line(name, one["records"], *(one[kind] for kind in KINDS)) for name, one in rows]
     return "\n".join([*head("border", "inputs", *KINDS), *lines, ""])
+
+
+def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[], list[Row]]]:
+    """Works that draw so many cases, of each border its share, at least one; none that takes long to prepare."""
+    borders: dict[str, list[Target]] = {}
+    for target in targets:
+        if not target.slow:
+            borders.setdefault(target.border, []).append(target)
+    sizes = {border: sum(len(target.wrong.named) for target in some) for border, some in borders.items()}
+    return [
+        lambda some=some, border=border: search(
+            st.sampled_from(some).flatmap(Target.some),
+            max(1, round(count * sizes[border] / sum(sizes.values()))),
+            seed,
+            f"--sample {count} --seed {seed} --match {border!r}",
+        )
+        for border, some in borders.items()
+    ]
 
 
 @dataclass(frozen=True)
 class Fuzz:
     """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
 
-    sample: int = 0  # so many of the cases, drawn evenly; 0 for all
-    seed: int = 0  # of the sample
+    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and those that are drawn beside
+    drawn: int = 3  # so many cases beside those with names, of each thing that may be damaged
+    seed: int = 0  # of what is drawn
     borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]  # where the inputs come in
-    processes: int = 1  # that take cases side by side
+    processes: int = 2  # that take cases side by side
     match: str = ""  # only cases that have this in their names
+    again: str = ""  # only the case of these letters, which a failure printed beside its ``--match``
     out: Path = RESULTS / "fuzz.json"
     smoke: bool = False  # a tiny run
 
     def __call__(self) -> None:
         """Runs the suite."""
         began = time.time()
-        cases = [case for case in all_cases(self.borders) if self.match in f"{case.border} {case.name}"]
+        targets = [target.matching(self.match) for target in all_targets(self.borders)]
+        targets = [target for target in targets if target.wrong.named]
         sample = self.sample or (20 if self.smoke else 0)
-        if sample:
-            cases = drawn(cases, sample, self.seed)
-        found = summary(run_side_by_side(cases, self.processes))
+        slow = {target.needs for target in targets if target.needs and not (sample and target.slow)}
+        for needs in slow:
+            needs()  # once for all
+        if self.again:
+            (target,) = targets
+            works = [lambda: search(target.others(), 1, self.seed, "", self.again)]
+        elif sample:
+            works = sampled(targets, sample, self.seed)
+        else:
+            works = [lambda target=target: attacked(target, self.drawn, self.seed) for target in targets]
+        found = summary(side_by_side(works, self.processes))
         found["seconds"] = round(time.time() - began)
-        print({kind: found[kind] for kind in ("records", *KINDS)})
-        if not self.smoke:
+        print(table(found))
+        if not (self.smoke or self.match):
             self.out.parent.mkdir(parents=True, exist_ok=True)
             self.out.write_text(json.dumps(found, indent=1) + "\n")
             self.out.with_suffix(".md").write_text(table(found))

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torch_denkf.filters import KalmanFilter
-from torch_denkf.functional import kalman_predict, kalman_update, rts_smooth
+from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.functional.smoothing import rts_smooth
 
 Parameters = dict[str, Tensor]  # of each quantity, [D]: logarithms of standard deviations, logits of shares
 
@@ -142,9 +143,9 @@ def kalman_filter(model: Model) -> KalmanFilter:
 
     return KalmanFilter(
         joined(model.transition),
-        joined(model.noise),
         joined(OBSERVATION.expand(len(model.mean), 1, 3)),
-        model.reading_noise.flatten(),
+        process_noise_cov=joined(model.noise),
+        noise=model.reading_noise.flatten().sqrt(),
         mean=model.mean.flatten(),
         cov=joined(model.cov),
         control=joined(model.control),

@@ -30,9 +30,9 @@ def make_filter(case: Case) -> Filter:
     if case.method == "IEnKS":
         return IEnKS(**parts, inflation=case.inflation, rotate=True, observation_key="reading")
     if case.method == "particles":
-        likelihood = GaussianLikelihood(sensor_key="reading")
+        likelihood = GaussianLikelihood(observation_key="reading")
         return ParticleFilter(**parts, likelihood=likelihood, jitter=case.jitter, ess_threshold=case.ess_threshold)
-    return DEnKF(**parts, analysis=EnsembleAnalysis(case.scheme, inflation=case.inflation, sensor_key="reading"))
+    return DEnKF(**parts, analysis=EnsembleAnalysis(case.scheme, inflation=case.inflation, observation_key="reading"))
 
 
 def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:

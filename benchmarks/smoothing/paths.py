@@ -11,11 +11,12 @@ from torch import Tensor
 
 from benchmarks.common.tables import Columns
 from benchmarks.smoothing.recordings import Task
+from torch_denkf.applications.car import UnicycleMotion
+from torch_denkf.applications.car.odometry.evaluation import path_errors
+from torch_denkf.applications.car.odometry.filter import CarFilter
+from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.filters import Filter
-from torch_denkf.functional import unicycle_move
-from torch_denkf.modules import EnsembleAnalysis, UnicycleMotion
-from torch_denkf.odometry import CarFilter
-from torch_denkf.odometry.evaluation import path_errors
+from torch_denkf.modules import EnsembleAnalysis
 from torch_denkf.smoothers import EnKS
 
 WINDOW = 100  # steps

@@ -10,16 +10,18 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.data import UR5ExperienceReplay, list_kitti_drives, render_drives
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.render import render_drives
+from torch_denkf.applications.car.odometry.batches import mark_start
+from torch_denkf.applications.car.odometry.filter import CarFilter, car_filter
+from torch_denkf.applications.car.odometry.scores import first_state
+from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.filter import JOINTS, UR5TableFilter
+from torch_denkf.applications.ur5.train import behind_sensor, read_demos, whole_demos
 from torch_denkf.filters import Filter
-from torch_denkf.odometry import CarFilter, car_filter
-from torch_denkf.odometry.batches import mark_start
-from torch_denkf.odometry.scores import first_state
-from torch_denkf.odometry.streams import Drive, all_frames, read_spans
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.pretrained.train.ur5_table import behind_sensor, read_demos, whole_demos
-from torch_denkf.pretrained.ur5_table import JOINTS, UR5TableFilter
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 Group = dict[str, TensorDict]  # recordings of one length side by side, [N, T], by their names with blanks between
 

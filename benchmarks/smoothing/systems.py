@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from benchmarks.common.lorenz96 import lorenz96_step
 from torch_denkf.modules import SubModel
-from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from functools import partial
 
 import torch
 
+from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.speed.pairs import Row, interleave
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var, inflate
-from torch_denkf.simulation.lorenz96 import lorenz96_step
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional.inflation import inflate
 
 CYCLES, SETTLED = 400, 100  # the error is averaged over the cycles after these
 SCHEMES = {"perturbed": ("PertObs", 40, 1.06), "sakov": ("DEnKF", 40, 1.01)}

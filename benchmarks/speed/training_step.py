@@ -21,16 +21,9 @@ from tensordict import TensorDict
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import write_page
 from benchmarks.speed.machine import in_child
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    AroundState,
-    DiagonalNoise,
-    EnsembleAnalysis,
-    ImageSensor,
-    Select,
-    StochasticMLP,
-    UnicycleTransition,
-)
+from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, ImageSensor, Select, StochasticMLP
 from torch_denkf.objectives import DEnKFLoss
 
 BATCH, STEPS, IMAGE = 64, 20, (6, 50, 150)

@@ -28,20 +28,12 @@ from torchrl.envs.transforms import Transform
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import write_page
 from examples.append_to_env import NOISE, make_filter
-from torch_denkf.data import render_drives
+from torch_denkf.applications.car import KITTIReplayEnv, UnicycleTransition
+from torch_denkf.applications.car.kitti.render import render_drives
+from torch_denkf.applications.reacher import NoisyEncoders
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.envs import KITTIReplayEnv
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import (
-    AroundState,
-    DiagonalNoise,
-    EnsembleAnalysis,
-    Select,
-    StochasticMLP,
-    UnicycleTransition,
-    VectorSensor,
-)
-from torch_denkf.pretrained import NoisyEncoders
+from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, Select, StochasticMLP, VectorSensor
 from torch_denkf.transforms import DEnKFTransform
 
 TARGET_MS = 0.4

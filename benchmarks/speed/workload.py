@@ -62,14 +62,18 @@ def make_gaussian_filter(kind: str) -> EKF | UKF:
         kind: ``"EKF"`` or ``"UKF"``.
     """
     torch.manual_seed(0)
+    noise = ConstantNoise([PROCESS_STD] * STATE, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     models = (
         LearnedTransition(StochasticMLP(STATE, STATE, HIDDEN, layer="none", output_gain=0.3)),
-        ConstantNoise([PROCESS_STD] * STATE, in_key=("belief", "mean"), out_key=("forecast", "noise")),
         None,
         LearnedObservation(StochasticMLP(STATE, OBSERVATION, HIDDEN, layer="none")),
         ConstantNoise([STD] * OBSERVATION),
     )
-    start = {"initial": MomentPrior(torch.zeros(STATE), torch.eye(STATE)), "update_at_reset": True}
+    start = {
+        "process_noise": noise,
+        "initial": MomentPrior(torch.zeros(STATE), torch.eye(STATE)),
+        "update_at_reset": True,
+    }
     return EKF(*models, **start) if kind == "EKF" else UKF(*models, **POINTS, **start)
 
 

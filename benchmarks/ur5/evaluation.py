@@ -20,7 +20,7 @@ from benchmarks.ur5.sensors import WRIST, Preset
 from benchmarks.ur5.tables import BLACKOUT
 from benchmarks.ur5.training import filter_error, joint_coverage, run_filter
 from torch_denkf._files import write_bytes
-from torch_denkf.data import UR5ExperienceReplay
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage, state_errors
 from torch_denkf.modules import ImageSensor

@@ -22,7 +22,8 @@ from benchmarks.ur5.sensors import MEMBERS
 from benchmarks.ur5.study import Base, Study, members_of
 from benchmarks.ur5.training import INFLATIONS, joint_coverage, run_filter
 from torch_denkf.modules import ImageSensor
-from torch_denkf.training import choose_for_coverage, read_checkpoint
+from torch_denkf.training import choose_for_coverage
+from torch_denkf.training.checkpoint import read_checkpoint
 
 SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" takes no localisation
 SHOWN = 3.0  # degrees: the particle filters err by more

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
+from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.modules import KeypointTrunk
-from torch_denkf.simulation.ur5.domains import SIM, Domain
 
 REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half pictures: hand and wrist
 COARSE = 112  # pixels: the side of the picture that the first look gets

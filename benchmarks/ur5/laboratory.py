@@ -16,10 +16,10 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torch_denkf.simulation.ur5.camera import Camera
-from torch_denkf.simulation.ur5.domains import SIM, Domain, apply_domain
-from torch_denkf.simulation.ur5.render import GHOSTS, SCENERY, Renderer
-from torch_denkf.simulation.ur5.scene import UR5Scene
+from torch_denkf.applications.ur5.simulation.camera import Camera
+from torch_denkf.applications.ur5.simulation.domains import SIM, Domain, apply_domain
+from torch_denkf.applications.ur5.simulation.render import GHOSTS, SCENERY, Renderer
+from torch_denkf.applications.ur5.simulation.scene import UR5Scene
 
 SIDE = 112  # pixels, of the silhouettes
 DIFFERENT = 18  # grey levels by which the arm differs from what is behind it

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.sensors import JOINT_UNIT, PLACE_UNIT, Statistics
-from torch_denkf.training import Stage, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 
 SIZE = STATE + 2 * JOINTS  # of the filters' state
 AHEAD = 4  # steps that the motion is trained on: what errs little in one step may err much in ten

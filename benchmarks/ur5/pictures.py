@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from benchmarks.common.plots import BAND, draw_band, plt, save
 from torch_denkf._files import replacing
-from torch_denkf.envs import UR5TableEnv
+from torch_denkf.applications.ur5 import UR5TableEnv
 from torch_denkf.plots._frames import write_mp4
 
 STEP = 0.08  # s

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
+from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
-from torch_denkf.simulation.ur5.domains import SIM, Domain
-from torch_denkf.training import Stage, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.parts import train_part
 from torch_denkf.transforms import Brightness, SaltAndPepper
 
 SAMPLES = 32  # of a sensor while it is trained

@@ -25,10 +25,10 @@ from benchmarks.ur5.readings import read_all, read_codes
 from benchmarks.ur5.recipes import FILTERS, UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS, SAMPLES, SENSORS, WRIST, Statistics, adopt, train_sensor
 from benchmarks.ur5.training import Budget, train_filter
+from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.filters import Filter
 from torch_denkf.modules import ImageSensor
-from torch_denkf.simulation.ur5.domains import SIM, Domain
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 TRAININGS = ("sim", "real_like", "fine_tuned")
 SALTED = 3  # every third tuning demo is read with salt and pepper, too

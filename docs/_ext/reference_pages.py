@@ -37,10 +37,10 @@ OWN_METHODS = {
 def packages():
     """The packages with public names."""
     found = {}
-    for _, name, is_package in pkgutil.iter_modules(torch_denkf.__path__):
-        package = importlib.import_module(f"torch_denkf.{name}") if is_package and name[0] != "_" else None
+    for _, name, is_package in pkgutil.walk_packages(torch_denkf.__path__, "torch_denkf."):
+        package = importlib.import_module(name) if is_package and "._" not in name else None
         if getattr(package, "__all__", None):
-            found[name] = package
+            found[name.removeprefix("torch_denkf.")] = package
     return found
 
 

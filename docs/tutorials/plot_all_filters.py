@@ -86,19 +86,27 @@ def ensemble(analysis) -> DEnKF:
     return DEnKF(motion, None, side, noise, analysis, initial=members, process_noise=wind)
 
 
-likelihood = LearnedLikelihood(1, 1, num_cells=(32, 32), encoding_key="reading", reading_key="reading", scale=[NOISE])
+likelihood = LearnedLikelihood(
+    1, 1, num_cells=(32, 32), encoding_key="reading", observation_key="reading", scale=[NOISE]
+)
 windy = NoisyTransition(motion, as_process_noise(wind, particles))
 filters = {
     "KalmanFilter, at rest": KalmanFilter(
-        at_rest, push, look, torch.tensor([NOISE**2]), mean=moments.mean, cov=moments.cov, observation_key="reading"
+        at_rest,
+        look,
+        process_noise_cov=push,
+        noise=[NOISE],
+        mean=moments.mean,
+        cov=moments.cov,
+        observation_key="reading",
     ),
-    "BackpropKF, at rest": BackpropKF(at_rest, push, None, look, noise, **gaussian),
-    "EKF": EKF(motion, wind, None, side, noise, **gaussian),
-    "UKF": UKF(motion, wind, None, side, noise, **gaussian),
-    "DEnKF, etkf": ensemble(EnsembleAnalysis("etkf", sensor_key="reading")),
-    "DEnKF, perturbed": ensemble(EnsembleAnalysis("perturbed", sensor_key="reading")),
-    "DEnKF, sakov": ensemble(EnsembleAnalysis("sakov", sensor_key="reading")),
-    "DEnKF, local": ensemble(LocalEnsembleAnalysis(torch.ones(2, 1), sensor_key="reading")),
+    "BackpropKF, at rest": BackpropKF(at_rest, None, look, noise, process_noise_cov=push, **gaussian),
+    "EKF": EKF(motion, None, side, noise, process_noise=wind, **gaussian),
+    "UKF": UKF(motion, None, side, noise, process_noise=wind, **gaussian),
+    "DEnKF, etkf": ensemble(EnsembleAnalysis("etkf", observation_key="reading")),
+    "DEnKF, perturbed": ensemble(EnsembleAnalysis("perturbed", observation_key="reading")),
+    "DEnKF, sakov": ensemble(EnsembleAnalysis("sakov", observation_key="reading")),
+    "DEnKF, local": ensemble(LocalEnsembleAnalysis(torch.ones(2, 1), observation_key="reading")),
     "ParticleFilter": ParticleFilter(
         motion, None, side, noise=noise, initial=particles, process_noise=wind, observation_key="reading"
     ),

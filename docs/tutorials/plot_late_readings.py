@@ -6,7 +6,7 @@ A delivery robot drives along a street. Its wheels tell its speed ten times a se
 post every other second. Its GPS works out two positions a second, and takes half a second for each, so that a fix is
 old when it comes. And now and then the GPS is wrong by metres, because a house reflects the signals.
 
-:class:`~torch_denkf.filters.FusedFilter` puts all of them into one filter. Each sensor has its own rate, its own mask,
+:class:`~torch_denkf.fusion.FusedFilter` puts all of them into one filter. Each sensor has its own rate, its own mask,
 its own delay. This page shows what a delay means, what each sensor brings, and how weights between the sensors are
 learned that see which one is wrong.
 """
@@ -22,7 +22,8 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf import FusedFilter, FusedSensor, GaussianLoss
-from torch_denkf.modules import LinearTransition, MomentPrior, Select, SensorAttention
+from torch_denkf.fusion import SensorAttention
+from torch_denkf.modules import LinearTransition, MomentPrior, Select
 
 torch.manual_seed(0)
 DT, LATE = 0.1, 5  # s between two steps; steps by which a fix is old
@@ -132,7 +133,7 @@ for hidden in (("laser", "gps"), ("laser",), ("gps",), ()):
 # A house reflects the GPS' signals: for three seconds each fix is 8 m off, and no mask says so. The filter believes it
 # as much as ever.
 #
-# :class:`~torch_denkf.modules.SensorAttention` gives each reading a weight between 0 and 1, by which its variance is
+# :class:`~torch_denkf.fusion.SensorAttention` gives each reading a weight between 0 and 1, by which its variance is
 # divided. The weight follows from the innovations of all sensors (a reading minus what the forecast predicted, in
 # standard deviations), so it is learned what "the GPS disagrees while the laser agrees" means. It learns from drives in
 # which the GPS fails; nobody tells it when. ``GaussianLoss`` scores the belief against the true state.

@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDict
 
 from torch_denkf import Gated, KalmanFilter, Monitored
-from torch_denkf.modules import InnovationMonitor, MonitoredSensor
+from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
 
 torch.manual_seed(0)
 STEPS, FROM, TO, NOISE, PUSH = 200, 100, 130, 0.5, 0.02
@@ -42,24 +42,21 @@ def swing(runs: int, slip: float = 0.0) -> TensorDict:
 
 def joint() -> KalmanFilter:
     """A Kalman filter: motion and reading are linear, and their noise is known."""
-    noises = torch.diag(torch.tensor([0.0, PUSH**2])), torch.tensor([[NOISE**2]])
+    noises = {"process_noise": [0.0, PUSH], "noise": [NOISE]}
     start = {"mean": torch.zeros(2), "cov": 0.01 * torch.eye(2)}
-    return KalmanFilter(MOVE, noises[0], torch.eye(1, 2), noises[1], observation_key="encoder", **start)
+    return KalmanFilter(MOVE, torch.eye(1, 2), **noises, observation_key="encoder", **start)
 
 
 # %%
 # What to watch
 # -------------
 # While the filter's model is right, the innovation's square in standard deviations of what the filter expects (the
-# *normalised innovation squared*, NIS) is a chi-square variable. :class:`~torch_denkf.modules.InnovationMonitor` tests
-# three things at each step, and its false alarms are as rare as you ask for:
-#
-# * the sum of the NIS over a *window*: finds what is large;
-# * a cumulative sum, *CUSUM*, of by how much the NIS exceed what is usual: finds what stays;
-# * with ``whiteness=True`` the correlation of one innovation with the next.
-#
-# ``calibrate`` takes the distributions from clean recordings. Here they are those of theory; a filter with few members
-# or learned parts has wider ones.
+# *normalised innovation squared*, NIS) is a chi-square variable. :class:`~torch_denkf.monitoring.InnovationMonitor`
+# tests three things at each step, and its false alarms are as rare as you ask for:  * the sum of the NIS over a
+# *window*: finds what is large; * a cumulative sum, *CUSUM*, of by how much the NIS exceed what is usual: finds what
+# stays; * with ``whiteness=True`` the correlation of one innovation with the next.  ``calibrate`` takes the
+# distributions from clean recordings. Here they are those of theory; a filter with few members or learned parts has
+# wider ones.
 
 monitor = InnovationMonitor({"encoder": MonitoredSensor("info", 1)}, window=10, false_alarm_rate=1e-3)
 with torch.no_grad():
@@ -76,8 +73,8 @@ assert delay.median() <= 3
 # What is too small
 # -----------------
 # A filter follows its sensor, so that a bias shows in the innovations for a short time only.
-# :meth:`~torch_denkf.modules.InnovationMonitor.detectable_bias` says which bias *of the innovations* the window finds
-# in nine of ten cases. The figure shows what this means for the slip: one of one degree, which is two standard
+# :meth:`~torch_denkf.monitoring.InnovationMonitor.detectable_bias` says which bias *of the innovations* the window
+# finds in nine of ten cases. The figure shows what this means for the slip: one of one degree, which is two standard
 # deviations of a reading, is hardly ever found. Read such a curve before you take silence for a good sign.
 
 smallest = monitor.detectable_bias()["encoder"]
@@ -97,14 +94,12 @@ assert found[-1] > 0.95
 # %%
 # The gate
 # --------
-# :class:`~torch_denkf.filters.Gated` sums up the NIS of the last three readings before it lets the latest one correct
-# the belief. With ``response="reject"`` a reading above the limit is left out. ``"student"`` and ``"huber"`` enlarge
-# its variance instead. That is right for single outliers. But a sensor that stays wrong draws the belief over, a little
-# in each step.
-#
-# A gate that rejects goes on from the motion alone, and its uncertainty grows. ``patience`` says for how many readings.
-# Here the encoder slips by 10 degrees. A slip of 4 would get in: after 25 steps without a reading the forecast is so
-# uncertain that a reading 4 degrees off fits it.
+# :class:`~torch_denkf.monitoring.Gated` sums up the NIS of the last three readings before it lets the latest one
+# correct the belief. With ``response="reject"`` a reading above the limit is left out. ``"student"`` and ``"huber"``
+# enlarge its variance instead. That is right for single outliers. But a sensor that stays wrong draws the belief over,
+# a little in each step.  A gate that rejects goes on from the motion alone, and its uncertainty grows. ``patience``
+# says for how many readings. Here the encoder slips by 10 degrees. A slip of 4 would get in: after 25 steps without a
+# reading the forecast is so uncertain that a reading 4 degrees off fits it.
 
 data = swing(100, slip=10.0)
 filters = {"no gate": joint()}

@@ -96,7 +96,7 @@ robot = DEnKF(
     sensor=None,
     observation=Select([0, 1]),
     noise=ConstantNoise([MARKER, MARKER], in_key="marker"),
-    analysis=EnsembleAnalysis("etkf", sensor_key="marker"),
+    analysis=EnsembleAnalysis("etkf", observation_key="marker"),
     initial=GaussianPrior([0.0, 0.0, 0.0], [0.01, 0.01, 0.01], ensemble_size=MEMBERS),
     control_keys=["wheels"],
 )

@@ -82,7 +82,7 @@ print("steps with a picture: {:.0%}; with a reading of the encoder: {:.0%}".form
 move = torch.nn.Linear(2, 2, bias=False)
 move.weight.data = torch.tensor([[1.0, 0.99 * DT], [0.0, 0.99]])  # the position moves with the new speed
 process_noise = ConstantNoise([0.0, PUSH], in_key=("belief", "ensemble"), out_key=("forecast", "noise"))
-wheel = {"predicted_key": "wheel_predicted", "sensor_key": "wheel", "observed_key": "wheel_seen"}
+wheel = {"predicted_key": "wheel_predicted", "observation_key": "wheel", "observed_key": "wheel_seen"}
 wheel["noise_variance_key"] = "wheel_noise"
 fused = Filter(
     {
@@ -103,10 +103,10 @@ fused = Filter(
         "by_camera": EnsembleAnalysis(
             "sensor",
             predicted_key=("camera", "predicted"),
-            sensor_key=("camera", "ensemble"),
+            observation_key=("camera", "ensemble"),
             noise_variance_key=("camera", "noise"),
             observed_key="camera_seen",
-            belief_key="middle",
+            belief_prefix="middle",
         ),
         "h_wheel": Select([1], in_key=("middle", "ensemble"), out_key="wheel_predicted"),
         "by_wheel": EnsembleAnalysis("etkf", forecast_key=("middle", "ensemble"), **wheel),

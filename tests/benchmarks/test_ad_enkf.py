@@ -17,7 +17,8 @@ from benchmarks.lorenz96.learned import (
     tapers,
 )
 from tests.filters.factories import linear_denkf, linear_system
-from torch_denkf.functional import gaspari_cohn, kalman_predict, kalman_update
+from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.functional.localisation import gaspari_cohn
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior
 from torch_denkf.objectives import DEnKFLoss
 

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.arms.study import Study as Arms
 from benchmarks.arms.study import run_study
-from benchmarks.common.arguments import parse, run_one
+from benchmarks.common.arguments import ROOT, command, parse, run_one
 from benchmarks.common.jobs import once, read_rows, same_settings, side_by_side
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.kitti.study import Study as KITTI
@@ -50,6 +50,14 @@ def test_a_study_is_called_as_it_was_run(file, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         parse(Options, ["--help"])
     assert "usage: python -m benchmarks.study.search [" in capsys.readouterr().out
+
+
+def test_the_command_for_the_record_names_no_folder_of_the_machine(monkeypatch):
+    data, out = ROOT.parent / "shared/data/kitti", ROOT / "runs/monitor"
+    monkeypatch.setattr(sys, "argv", ["monitor", "--root", str(data), f"--out={out}", "--tasks", "car", "--draws", "3"])
+    assert command("monitor") == (
+        "python -m benchmarks.monitor --root ../shared/data/kitti --out=runs/monitor --tasks car --draws 3"
+    )
 
 
 def test_smoke_alone_runs_all_commands():

@@ -19,7 +19,7 @@ from benchmarks.g1.tables import COLUMNS, markdown, named
 from benchmarks.g1.targets import ARM, HAND
 from benchmarks.g1.training import run_filter
 from torch_denkf.data import LeRobotReplay
-from torch_denkf.filters import FusedFilter, FusedSensor
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import LinearTransition, MomentPrior, Select
 
 COUNT, STEPS, MEMBERS, FEATURES = 4, 60, 8, 5

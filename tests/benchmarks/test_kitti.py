@@ -17,10 +17,9 @@ from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, mirror, rows
 from benchmarks.kitti.study import rows_of
 from benchmarks.kitti.tables import COLUMNS, by_drive, markdown
 from benchmarks.kitti.training import calibration_error, certain_gain, log_gains, run_filter
-from torch_denkf.metrics import dead_reckoning
-from torch_denkf.modules import PairObservation
-from torch_denkf.odometry.batches import ReadingSampler
-from torch_denkf.odometry.streams import all_frames, lose_frames, take_spans
+from torch_denkf.applications.car import PairObservation, dead_reckoning
+from torch_denkf.applications.car.odometry.batches import ReadingSampler
+from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames, take_spans
 
 
 def streams(*drives, cameras=("image_0",)):

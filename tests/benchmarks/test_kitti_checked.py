@@ -12,9 +12,9 @@ from benchmarks.kitti.recipes import FILTERS
 from benchmarks.kitti.sensors import SENSORS
 from benchmarks.kitti.streams import LONGEST, Stream, spans
 from benchmarks.kitti.study import Job, Study
-from torch_denkf.data import write_drives
-from torch_denkf.data.kitti.frames import MOTION_KEYS
-from torch_denkf.odometry.streams import shortest_spans
+from torch_denkf.applications.car import write_drives
+from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
+from torch_denkf.applications.car.odometry.streams import shortest_spans
 
 FRAMES = 14
 

@@ -10,8 +10,8 @@ from benchmarks.kitti.sensors import SENSORS
 from benchmarks.kitti.study import Job, Study
 from benchmarks.kitti.training import load_filter, run_filter
 from tests.benchmarks.test_kitti import smooth_drive
-from torch_denkf.odometry.streams import all_frames
-from torch_denkf.training import write_checkpoint
+from torch_denkf.applications.car.odometry.streams import all_frames
+from torch_denkf.training.checkpoint import write_checkpoint
 
 
 @pytest.fixture

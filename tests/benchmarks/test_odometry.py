@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from benchmarks.odometry.__main__ import COLUMNS, page
-from torch_denkf.vision import KITTI_HEIGHT
+from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 
 RECORDED = Path(__file__).parents[2] / "benchmarks" / "odometry" / "results" / "odometry.csv"
 

@@ -17,7 +17,7 @@ from benchmarks.ur5.recipes.denkf import localisation
 from benchmarks.ur5.sensors import MEMBERS, NEAR, SENSORS, NearForecast, TurnedWrist, side_of, wrist_of
 from benchmarks.ur5.training import run_filter
 from tests.benchmarks.ur5_for_tests import FACTS, states
-from torch_denkf.simulation.ur5.domains import Domain
+from torch_denkf.applications.ur5.simulation.domains import Domain
 
 # ------------------------------------------------------------------------------------------------------ the wrist
 

@@ -12,7 +12,8 @@ from tests.envs.opengl import needs_opengl
 pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'torch_denkf[examples]'")
 
 from benchmarks.ur5 import pictures
-from torch_denkf.envs import UR5Expert, UR5TableEnv
+from torch_denkf.applications.ur5 import UR5TableEnv
+from torch_denkf.applications.ur5.envs.expert import UR5Expert
 
 STEPS, SIDE, MEMBERS = 24, 48, 6
 UNSEEN = slice(10, 16)

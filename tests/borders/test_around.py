@@ -10,17 +10,22 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
+from benchmarks.common.lorenz96 import lorenz96_step
 from tests.borders.test_constructors import NAN, refuses
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf.data import Episode, EpisodeReplay, bridge_gaps
+from torch_denkf.applications.car import bridge_gaps, track
+from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
+from torch_denkf.applications.car.odometry.filter import car_filter
+from torch_denkf.applications.car.odometry.training import train_car_filter
+from torch_denkf.applications.reacher import reacher
+from torch_denkf.data import Episode, EpisodeReplay
 from torch_denkf.deployment.folder import WEIGHTS, load_folder, save_folder
 from torch_denkf.envs import ReplayEnv
-from torch_denkf.modules import LearnedTransition, MemberGain, NoisyTransition
+from torch_denkf.modules import LearnedTransition, NoisyTransition
+from torch_denkf.modules.noise import MemberGain
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, TransitionLoss
-from torch_denkf.odometry import car_filter, evaluate_car_filter, track, train_car_filter
-from torch_denkf.pretrained import from_pretrained, reacher, save_pretrained
-from torch_denkf.simulation.lorenz96 import lorenz96_step
+from torch_denkf.pretrained import from_pretrained, save_pretrained
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 
 INF = math.inf

@@ -2,8 +2,8 @@
 
 import pytest
 
+from torch_denkf.applications.car.odometry.paths import PATH_COLUMNS
 from torch_denkf.cli.main import main
-from torch_denkf.odometry.paths import PATH_COLUMNS
 
 EMPTY = [
     ("odometry", "--checkpoint"),

@@ -10,6 +10,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.filters.gaussian_for_tests import linear_filter
+from torch_denkf.applications.car import FlowSensor, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
@@ -18,8 +20,6 @@ from torch_denkf.modules import (
     ConstantNoise,
     DiagonalNoise,
     EnsembleAnalysis,
-    FlipoutLinear,
-    FlowSensor,
     FromSensor,
     GaussianAround,
     GaussianPrior,
@@ -30,22 +30,18 @@ from torch_denkf.modules import (
     LearnedTransition,
     LinearObservation,
     LinearTransition,
-    LSTMUpdate,
     MappedNoise,
-    MemberGain,
     MomentPrior,
-    ParticleAnalysis,
-    ResampledTransition,
     ScaledNoise,
     Select,
     StochasticMLP,
     UKFTransition,
-    UnicycleMotion,
-    UnicycleNoise,
-    UnicyclePose,
-    UnicycleTransition,
     VectorSensor,
 )
+from torch_denkf.modules.noise import MemberGain
+from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition
+from torch_denkf.modules.recurrent import LSTMUpdate
+from torch_denkf.modules.stochastic import FlipoutLinear
 
 EYE, ZERO, ONE = torch.eye(2), torch.zeros(2), torch.ones(2)
 NAN, INF = float("nan"), float("inf")
@@ -54,9 +50,9 @@ INDEFINITE = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
 BESIDE_ZERO = torch.tensor([[1.0, 0.1], [0.1, 0.0]])
 PARTS = {
     "transition": EYE,
-    "transition_noise": EYE,
+    "process_noise_cov": EYE,
     "observation": EYE,
-    "observation_noise": ONE,
+    "noise_cov": EYE,
     "mean": ZERO,
     "cov": EYE,
 }
@@ -81,7 +77,7 @@ KALMAN = [
     ("mean", torch.tensor([0.0, NAN]), "nan at [1]"),
     *[
         (name, *case)
-        for name in ("transition_noise", "cov", "observation_noise")
+        for name in ("process_noise_cov", "cov", "noise_cov")
         for case in (
             (-EYE, "-1.0 at [0]"),
             (NAN * EYE, "nan"),
@@ -91,8 +87,6 @@ KALMAN = [
             (torch.eye(3), "[3, 3]"),
         )
     ],
-    ("observation_noise", torch.tensor([1.0, -2.0]), "-2.0 at [1]"),
-    ("observation_noise", torch.ones(3), "[3]"),
     ("control", torch.ones(3, 1), "[3, 1]"),
     ("control", NAN * torch.ones(2, 1), "nan"),
     ("angles", [2], "got 2"),
@@ -103,10 +97,25 @@ KALMAN = [
 def test_kalman_filter(case):
     name, value, *words = case
     if name == "observation" and value.shape == (1, 2):
-        parts, words = {**PARTS, "observation_noise": torch.ones(1)}, ["inf at [0, 1]"]
+        parts, words = {**PARTS, "noise_cov": torch.eye(1)}, ["inf at [0, 1]"]
     else:
         parts = PARTS
     refuses(lambda: KalmanFilter(**{**parts, name: value}), name, *words)
+
+
+@pytest.mark.parametrize(
+    ("noises", "words"),
+    [
+        ({"noise": [1.0, -2.0]}, "-2.0 at \\[1\\]"),
+        ({"noise": [1.0, 1.0, 1.0]}, "noise .*\\[3\\]"),
+        ({"process_noise": [1.0], "noise": [1.0, 1.0]}, "not both"),
+        ({}, "Give noise, standard deviations"),
+    ],
+)
+def test_noises_of_a_kalman_filter(noises, words):
+    parts = {name: value for name, value in PARTS.items() if name != "noise_cov"}
+    with pytest.raises(ValueError, match=words):
+        KalmanFilter(**parts, **noises)
 
 
 @pytest.mark.parametrize("name", [*PARTS, "control"])
@@ -215,7 +224,7 @@ def test_covariances_that_are_right_pass(scale, dtype):
     cov = scale * (root @ root.mT)
     assert MomentPrior(cov[0], cov).cov.equal(cov)
     one = torch.eye(6, dtype=dtype)
-    KalmanFilter(one, 0 * one, one, 0 * cov[0], mean=cov[0], cov=cov)
+    KalmanFilter(one, one, process_noise_cov=0 * one, noise_cov=0 * cov, mean=cov[0], cov=cov)
 
 
 def test_constants_without_values_pass():
@@ -223,7 +232,14 @@ def test_constants_without_values_pass():
     with torch.device("meta"):
         prior = GaussianPrior([0.0], [1.0], ensemble_size=4)
         DEnKF.paper(state_dim=3, observation_dim=2)
-        KalmanFilter(torch.eye(2), torch.eye(2), torch.eye(2), torch.ones(2), mean=torch.zeros(2), cov=torch.eye(2))
+        KalmanFilter(
+            torch.eye(2),
+            torch.eye(2),
+            process_noise_cov=torch.eye(2),
+            noise_cov=torch.eye(2),
+            mean=torch.zeros(2),
+            cov=torch.eye(2),
+        )
     assert prior.std.is_meta
     kf = KalmanFilter(**PARTS)
     for other in (copy.deepcopy(kf), pickle.loads(pickle.dumps(kf))):

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.data.kitti.test_drive import make
-from torch_denkf.data import bridge_gaps, frames_at, read_kitti_drive, render_drives, with_motion
+from tests.applications.car.kitti.test_drive import make
+from torch_denkf.applications.car import KITTIReplayEnv, bridge_gaps, read_kitti_drive, with_motion
+from torch_denkf.applications.car.kitti.frames import frames_at
+from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.data.times import increasing
-from torch_denkf.envs import KITTIReplayEnv
 
 ROWS = 20
 POSES, TIMES, CALIBRATION, IMAGES = "poses/00.txt", "sequences/00/times.txt", "sequences/00/calib.txt", "image_2"

@@ -13,7 +13,8 @@ from tensordict import TensorDict
 
 from tests.data.lerobot.lerobot_folder import FPS, SIZE, joints, write_info, write_version_2, write_version_3
 from tests.data.lerobot.test_errors import edit_table
-from torch_denkf.data import LeRobotReplay, recording_from_rows
+from torch_denkf.data import LeRobotReplay
+from torch_denkf.data.lerobot.rows import recording_from_rows
 
 open_all = partial(LeRobotReplay, size=SIZE, cache=None, split="all")
 INFO, EPISODES = "meta/info.json", "meta/episodes.jsonl"

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -26,11 +27,11 @@ from torch_denkf.modules import (
     LearnedTransition,
     LinearObservation,
     LocalEnsembleAnalysis,
-    ParticleAnalysis,
     Select,
     StochasticMLP,
     VectorSensor,
 )
+from torch_denkf.modules.particles import ParticleAnalysis
 from torch_denkf.transforms import DEnKFTransform
 
 REJECTED = ("info", "rejected")
@@ -38,7 +39,7 @@ BAD = [float("nan"), float("inf"), -float("inf"), 1e25, -2e18]
 
 
 def particles(scheme, **kwargs):
-    likelihood = GaussianLikelihood(sensor_key="observation")
+    likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(
         LearnedTransition(StochasticMLP(2, 2, (8,))),
         None,
@@ -69,7 +70,7 @@ def local(**kwargs):
         observation=LinearObservation(torch.eye(2)),
         noise=ConstantNoise([0.5, 0.3], in_key="observation"),
         analysis=LocalEnsembleAnalysis.around(
-            torch.tensor([[0.0], [1.0]]), torch.tensor([[0.0], [1.0]]), 1.0, sensor_key="observation"
+            torch.tensor([[0.0], [1.0]]), torch.tensor([[0.0], [1.0]]), 1.0, observation_key="observation"
         ),
         initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=16),
         **kwargs,
@@ -77,7 +78,7 @@ def local(**kwargs):
 
 
 def from_sensor(**kwargs):
-    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, sensor_key="observation")
+    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
     return linear_denkf("etkf", initial=start, **kwargs)
 
 
@@ -283,11 +284,12 @@ def test_the_transform_without_its_check(make_filter, update_at_reset):
     assert (said["next"][REJECTED] == 0).all()
 
 
+@pytest.mark.parametrize("make_filter", [partial(particles, "systematic"), linear_kalman])
 @pytest.mark.parametrize("value", BAD)
-def test_the_transform_with_its_check(value):
+def test_the_transform_with_its_check(value, make_filter):
     env = TransformedEnv(base_env(batch_size=[2]))
     env.append_transform(ExcludeTransform("observed"))
-    env.append_transform(DEnKFTransform(particles("systematic")))
+    env.append_transform(DEnKFTransform(make_filter()))
     td = env.rand_action(env.reset())
     emit = env.base_env._emit
     env.base_env._emit = lambda *args: emit(*args).update({"observation": torch.tensor([[0.0, 0.0], [value, 0.0]])})
@@ -327,7 +329,7 @@ def test_the_transform_of_a_package(tmp_path):
 def test_a_belief_beyond_all_units_is_refused(value):
     """Stored, or given to a reset; up to 1e18 the step is the exact one, K = 1/3 at P = 1 beside R = 2."""
     one = torch.eye(2)
-    kf = KalmanFilter(one, 0 * one, one, 2 * one, mean=torch.zeros(2), cov=one)
+    kf = KalmanFilter(one, one, process_noise_cov=0 * one, noise_cov=2 * one, mean=torch.zeros(2), cov=one)
     rows = TensorDict({"observation": torch.zeros(3, 2)}, [3])
     belief = kf.initialise(rows.clone())
     belief["belief", "mean"] = torch.full((3, 2), 9e17)
@@ -368,8 +370,8 @@ def test_two_sensors_with_masks_of_their_own():
 
     def two(**options):
         def analysis(key, start, end):
-            keys = {"observed_key": f"{key}_seen", "sensor_key": key, "noise_variance_key": (key + "_noise",)}
-            return EnsembleAnalysis("etkf", forecast_key=start, belief_key=end, **keys)
+            keys = {"observed_key": f"{key}_seen", "observation_key": key, "noise_variance_key": (key + "_noise",)}
+            return EnsembleAnalysis("etkf", forecast_key=start, belief_prefix=end, **keys)
 
         single = linear_denkf("etkf")
         return Filter(

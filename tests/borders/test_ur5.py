@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.data.ur5.ur5_demos import make_demo, write_folder
-from torch_denkf.data import UR5ExperienceReplay
-from torch_denkf.data.ur5.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
+from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.applications.ur5.data.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
 
 open_all = partial(UR5ExperienceReplay, cache=None, split="all", progress=False)
 

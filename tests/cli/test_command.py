@@ -9,23 +9,23 @@ import pytest
 
 import torch_denkf
 from torch_denkf.cli._command import Command
-from torch_denkf.cli.main import COMMANDS, main
+from torch_denkf.cli.main import commands, main
 
 
 def test_help_names_every_command(capsys):
     assert main([]) == main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(f"\n  {name} " in out for name in COMMANDS)
+    assert all(f"\n  {name} " in out for name in commands())
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", commands())
 def test_each_command_has_help_with_an_example(name, capsys):
     assert main([name, "--help"]) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"usage: denkf {name} ")
     assert f"\nexample:\n  denkf {name}" in out
     example = out.split("\nexample:\n  denkf ")[1].split()
-    command = import_module(f"torch_denkf.cli.{COMMANDS[name][0]}").main
+    command = import_module(commands()[name][0]).main
     command.parser.parse_args(example[1:])  # it is a command that works
 
 

@@ -1,7 +1,5 @@
 """What all data sets share: shapes of samples, splits, options; and what filters make of their samples."""
 
-import warnings
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,8 +8,10 @@ from torchrl.data import SliceSampler
 import torch_denkf
 import torch_denkf.data
 from tests.data.replay_for_tests import check_contract
-from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay, recording_from_rows, write_drives
+from torch_denkf.applications.car import write_drives
+from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
 from torch_denkf.data.episodes import hashed_share
+from torch_denkf.data.lerobot.rows import recording_from_rows
 from torch_denkf.filters import DEnKF
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.training import FilterTrainer, Stage
@@ -120,7 +120,7 @@ def test_statistics_are_of_the_training_episodes_whatever_the_split():
 
 def test_cameras_and_mirror_images_of_a_drive_stay_together(tmp_path):
     write_drives(tmp_path, ["hill", "lane", "town"], frames=6, size=(12, 36))
-    kitti = torch_denkf.data.KITTIOdometryExperienceReplay
+    kitti = torch_denkf.applications.car.KITTIOdometryExperienceReplay
     options = {"size": (12, 36), "cache": None, "mirrored": True}
     sides = {k: hashed_share(k, "test") for k in ("hill", "lane", "town")}
     share = sorted(sides.values())[0] + 1e-6  # one drive
@@ -150,7 +150,7 @@ def test_options_that_are_wrong():
     fails(ValueError, r"in \[0, 1\), got 1.5", validation_share=1.5)
     fails(ValueError, "pass validation_share=0.1", split="validation")
     with pytest.raises(ValueError, match="test_share is a share of all episodes"):
-        torch_denkf.data.KITTIOdometryExperienceReplay("nowhere", test_share=1.5)
+        torch_denkf.applications.car.KITTIOdometryExperienceReplay("nowhere", test_share=1.5)
     fails(
         ValueError,
         "num_slices=2 times slice_len=3 is 6 rows, but batch_size=7",
@@ -183,18 +183,6 @@ def test_episodes_that_do_not_fit_their_rows():
         Episode("b", 4, 2),
     )
     fails(ValueError, "each of at least a row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
-
-
-def test_the_old_name_of_lerobots_replay_warns():
-    vars(torch_denkf.data).pop("LeRobotExperienceReplay", None)  # once in a process is enough
-    with pytest.warns(DeprecationWarning, match="now called LeRobotReplay"):
-        assert torch_denkf.data.LeRobotExperienceReplay is LeRobotReplay
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert torch_denkf.LeRobotReplay is LeRobotReplay
-
-
-# Filters --------------------------------------------------------------------------------------------------------------
 
 
 def test_losses_and_trainers_take_a_sample_as_it_is(tmp_path):

@@ -66,7 +66,7 @@ def iterated():
 
 
 def of_a_user():
-    return DEnKF(**parts(Downhill()), analysis=EnsembleAnalysis("etkf", sensor_key="reading"), initial=members())
+    return DEnKF(**parts(Downhill()), analysis=EnsembleAnalysis("etkf", observation_key="reading"), initial=members())
 
 
 def lstm():

@@ -11,7 +11,7 @@ from torch import nn
 
 from torch_denkf.deployment import export, export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.filters.inductor import trace_below_autograd
+from torch_denkf.filters._inductor import trace_below_autograd
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")
@@ -24,7 +24,7 @@ def small_filter(action=False):
         None,
         Select([0, 2]),
         ConstantNoise([0.1, 0.2], in_key="reading"),
-        EnsembleAnalysis("perturbed", sensor_key="reading"),
+        EnsembleAnalysis("perturbed", observation_key="reading"),
         initial=AroundState([0.1, 0.1, 0.1], ensemble_size=8),
     )
 
@@ -116,7 +116,9 @@ def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_p
 
 def test_a_batch_and_a_kalman_filter(tmp_path):
     shift, noise = torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2)
-    kf = KalmanFilter(shift, noise, torch.eye(2)[:1], torch.eye(1), mean=torch.zeros(2), cov=torch.eye(2))
+    kf = KalmanFilter(
+        shift, torch.eye(2)[:1], process_noise_cov=noise, noise_cov=torch.eye(1), mean=torch.zeros(2), cov=torch.eye(2)
+    )
     example = TensorDict({"observation": torch.randn(5, 1)}, [5])
     step = load_step(export_step(kf, example, tmp_path / "kf.pt2", compiled=False))
     belief = kf.initialise(example.copy())

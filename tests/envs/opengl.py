@@ -11,7 +11,7 @@ mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed: pip inst
 
 @cache
 def why_not() -> str | None:
-    from torch_denkf.simulation.ur5.render import Renderer
+    from torch_denkf.applications.ur5.simulation.render import Renderer
 
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='front'/></worldbody></mujoco>")
     try:

@@ -9,17 +9,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.data.ur5.ur5_demos import ten_demos
-from torch_denkf.data import (
-    Episode,
-    EpisodeReplay,
-    KITTIOdometryExperienceReplay,
-    LeRobotReplay,
-    UR5ExperienceReplay,
-    recording_from_rows,
-    write_drives,
-)
-from torch_denkf.envs import RecordedPolicy, ReplayEnv
+from tests.applications.ur5.data.ur5_demos import ten_demos
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, write_drives
+from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.data import Episode, EpisodeReplay, LeRobotReplay
+from torch_denkf.data.lerobot.rows import recording_from_rows
+from torch_denkf.envs import ReplayEnv
+from torch_denkf.envs.replay import RecordedPolicy
 from torch_denkf.filters import DEnKF
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation
 from torch_denkf.modules._base import SubModel

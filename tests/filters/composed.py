@@ -67,7 +67,7 @@ def compose(features, *, frozen_start=True):
         modules = {name: modules[name] for name in order}
     names = ["belief"] + ["first"] * ("two sensors" in features) + ["second"] * ("two analyses" in features)
     observed = "seen" if "mask on one" in features else "observed"
-    modules["analysis"] = EnsembleAnalysis("perturbed", observed_key=observed, belief_key=names[-1])
+    modules["analysis"] = EnsembleAnalysis("perturbed", observed_key=observed, belief_prefix=names[-1])
     if "two sensors" in features:
         modules["sensor_b"] = VectorSensor(
             4, 3, ensemble_size=E, num_cells=(8,), layer=layer, rate=0.3, in_key="b", out_key=("other", "ensemble")
@@ -82,9 +82,9 @@ def compose(features, *, frozen_start=True):
             "perturbed",
             forecast_key=(before, "ensemble"),
             predicted_key=("other", "predicted"),
-            sensor_key=("other", "ensemble"),
+            observation_key=("other", "ensemble"),
             noise_variance_key=("other", "noise"),
-            belief_key=names[-1],
+            belief_prefix=names[-1],
         )
     if "two analyses" in features:
         before = names[-1]
@@ -97,9 +97,9 @@ def compose(features, *, frozen_start=True):
             "perturbed",
             forecast_key=(before, "ensemble"),
             predicted_key="c_predicted",
-            sensor_key="c",
+            observation_key="c",
             noise_variance_key="c_noise",
-            belief_key=names[-1],
+            belief_prefix=names[-1],
         )
     assert names == ["belief"]
     return Filter(modules, initial=FixedEnsemble(torch.randn(E, S)))

@@ -5,7 +5,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.filters.inductor import need_compiler
+from torch_denkf.filters._inductor import need_compiler
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, StochasticMLP, SubModel
 from torch_denkf.modules.noise import ConstantNoise, DiagonalNoise
@@ -101,7 +101,15 @@ def linear_system(dtype=None):
 
 def linear_kalman(**kwargs):
     F, Q, H, R = linear_system()
-    return KalmanFilter(F, Q, H, R, mean=torch.tensor([1.0, -1.0]), cov=torch.diag(torch.tensor([1.0, 2.0])), **kwargs)
+    return KalmanFilter(
+        F,
+        H,
+        process_noise_cov=Q,
+        noise=R.sqrt(),
+        mean=torch.tensor([1.0, -1.0]),
+        cov=torch.diag(torch.tensor([1.0, 2.0])),
+        **kwargs,
+    )
 
 
 def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, initial=None, r=None, **kwargs):
@@ -114,7 +122,7 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
         sensor=None,
         observation=LinearObservation(H),
         noise=ConstantNoise(R.sqrt() if r is None else r, in_key="observation"),
-        analysis=EnsembleAnalysis(scheme, sensor_key="observation"),
+        analysis=EnsembleAnalysis(scheme, observation_key="observation"),
         initial=FixedEnsemble(members) if initial is None else initial,
         **kwargs,
     )

@@ -43,8 +43,8 @@ def linear_filter(name, *, control=False, process_noise=None, noise=None, **kwar
     r = ConstantNoise(R.sqrt(), in_key="observation") if noise is None else noise
     keys = {"initial": prior(), "observation_key": "observation", **kwargs}
     if name == "BackpropKF":
-        return BackpropKF(F, q, None, H, r, control=control, **keys)
-    return FILTERS[name](NoisyLinear(F, control=control), q, None, LinearObservation(H), r, **keys)
+        return BackpropKF(F, None, H, r, process_noise_cov=q, control=control, **keys)
+    return FILTERS[name](NoisyLinear(F, control=control), None, LinearObservation(H), r, process_noise=q, **keys)
 
 
 def linear_frames(*batch, width=2, resets=True, missing=0.3):
@@ -70,11 +70,11 @@ def learned_filter(name, *, layer="none", **kwargs):
     if name == "BackpropKF":
         q = CholeskyNoise(3, r=0.3)
         A, B, C = 0.5 * torch.randn(3, 3), torch.randn(3, 2), torch.randn(2, 3)
-        filter = BackpropKF(A, q, sensor, C, r, control=B, trainable=True, **keys)
+        filter = BackpropKF(A, sensor, C, r, process_noise_cov=q, control=B, trainable=True, **keys)
     else:
         transition = LearnedTransition(StochasticMLP(5, 3, (8, 8), output_gain=0.5, **mlp), action_key="action")
         observation = LearnedObservation(StochasticMLP(3, 2, (8,), **mlp))
-        filter = FILTERS[name](transition, q, sensor, observation, r, **keys)
+        filter = FILTERS[name](transition, sensor, observation, r, process_noise=q, **keys)
     with torch.no_grad():  # the noise networks start at zero, where much of their gradient is zero, too
         for module in (r, q):
             for parameter in module.parameters():

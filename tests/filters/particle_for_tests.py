@@ -52,7 +52,7 @@ def bootstrap(size, *, noisy=True, initial=None, observed_key="observed", **kwar
         NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None),
         None,
         LinearObservation(H),
-        GaussianLikelihood(sensor_key="observation", observed_key=observed_key),
+        GaussianLikelihood(observation_key="observation", observed_key=observed_key),
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=prior if initial is None else initial,
         observed_key=observed_key,

@@ -27,9 +27,10 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
+from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.filters import DEnKF, Filter
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, UnicycleMotion, UnicycleTransition
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
 from torch_denkf.modules.belief import FromSensor, GaussianPrior
 from torch_denkf.modules.observation import LinearObservation, Select
 from torch_denkf.transforms import DEnKFTransform
@@ -99,7 +100,9 @@ def test_motion_behind_the_analysis(float64):
         None,
         Select([3, 4]),
         ConstantNoise([0.5, 0.5], in_key="y"),
-        TensorDictSequential(EnsembleAnalysis("etkf", sensor_key="y", belief_key="analysis"), UnicycleMotion(0.1)),
+        TensorDictSequential(
+            EnsembleAnalysis("etkf", observation_key="y", belief_prefix="analysis"), UnicycleMotion(0.1)
+        ),
         initial=FixedEnsemble(members),
     )
     frames = TensorDict({"y": torch.randn(3, 9, 2), "is_init": torch.zeros(3, 9, 1, dtype=torch.bool)}, [3, 9])
@@ -136,13 +139,18 @@ def test_a_filter_with_other_keys(float64):
             super().__init__(members)
             self.out_keys = [("two", name) for name in ("ensemble", "mean", "var")]
 
-    names = {"predicted_key": ("two_forecast", "y"), "noise_variance_key": "r", "belief_key": "two", "info_key": "i"}
+    names = {
+        "predicted_key": ("two_forecast", "y"),
+        "noise_variance_key": "r",
+        "belief_prefix": "two",
+        "info_prefix": "i",
+    }
     other = Filter(
         Renamed(),
         LinearObservation(H, in_key=("two_forecast", "ensemble"), out_key=("two_forecast", "y")),
         ConstantNoise(R.sqrt(), in_key="y", out_key="r"),
         EnsembleAnalysis(
-            "etkf", forecast_key=("two_forecast", "ensemble"), sensor_key="y", observed_key="seen", **names
+            "etkf", forecast_key=("two_forecast", "ensemble"), observation_key="y", observed_key="seen", **names
         ),
         initial=RenamedStart(plain.initial.members),
         init_key="first",
@@ -295,7 +303,7 @@ def test_select_observation(float64):
     # The paper's KITTI set-up: h selects known dimensions.
     filter = linear_denkf()
     filter = DEnKF(filter["transition"], None, Select([1]), ConstantNoise([0.5], in_key="y"),
-                   EnsembleAnalysis("etkf", sensor_key="y"), initial=filter.initial)  # fmt: skip
+                   EnsembleAnalysis("etkf", observation_key="y"), initial=filter.initial)  # fmt: skip
     out = filter.step(filter.initialise(TensorDict({"y": torch.zeros(1)})))
     forecast = out["forecast", "ensemble"][:, 1]
     gain = forecast.var() / (forecast.var() + 0.25)

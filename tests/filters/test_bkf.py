@@ -34,7 +34,7 @@ def make_filter(**kwargs):
     F, Q, H, _ = linear_system()
     sensor = TensorDictModule(nn.Linear(3, 2), ["features"], [("sensor", "ensemble")])
     r = DiagonalNoise(2, r=1.0, num_cells=(), in_features=1, in_key="flag", out_key=("sensor", "noise"), floor=1e-4)
-    return BackpropKF(F, Q, sensor, H, r, initial=prior(), **kwargs)
+    return BackpropKF(F, sensor, H, r, process_noise_cov=Q, initial=prior(), **kwargs)
 
 
 def test_the_sensor_and_its_noise_are_learned_through_the_filter():
@@ -72,7 +72,7 @@ def test_a_step_is_the_kalman_filter_of_what_the_networks_say(float64):
             parameter.add_(torch.randn_like(parameter))
     sensor = TensorDictModule(nn.Linear(3, 2), ["features"], [("sensor", "ensemble")])
     B = torch.randn(2, 1)
-    filter = BackpropKF(F, q, sensor, H, r, initial=prior(), control=B, trainable=True)
+    filter = BackpropKF(F, sensor, H, r, process_noise_cov=q, initial=prior(), control=B, trainable=True)
     td = TensorDict({"features": torch.randn(4, 3), "action": torch.randn(4, 1)}, [4])
     td = filter.initialise(td)
     out = filter.step(td.copy())

@@ -137,7 +137,7 @@ def test_keep_returns_what_is_asked_for(float64):
 
 def test_the_covariance_of_an_ensemble_on_request(float64):
     filter = linear_denkf()
-    filter.module["analysis"] = EnsembleAnalysis("etkf", sensor_key="observation", covariance=True)
+    filter.module["analysis"] = EnsembleAnalysis("etkf", observation_key="observation", covariance=True)
     frames = TensorDict({"observation": torch.randn(3, 5, 2)}, [3, 5])
     out = filter.sequence(frames)
     deviations = out[ENSEMBLE] - out[MEAN].unsqueeze(-2)
@@ -174,7 +174,7 @@ def test_freezing_a_network_called_keys_is_noticed():
 
 
 def test_guards_that_are_left_out_are_not_about_what_users_change():
-    from torch_denkf.filters.inductor import worth_checking
+    from torch_denkf.filters._inductor import worth_checking
 
     class Guard:
         def __init__(self, name, kind="TYPE_MATCH", is_global=False):

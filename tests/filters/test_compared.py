@@ -6,14 +6,18 @@ import pytest
 import torch
 from functorch.compile import make_boxed_func
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torch._dynamo.backends.common import aot_autograd
 
-from tests.filters.factories import has_compiler, toy_denkf, toy_frames
+from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
-from torch_denkf.filters import EKF, FusedFilter, FusedSensor, KalmanFilter, _compared
+from torch_denkf.filters import EKF, Filter, KalmanFilter, _compared
 from torch_denkf.filters._compared import refuse_other_numbers
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
+from torch_denkf.modules._running import named_modules_of
 
 needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 
@@ -21,7 +25,7 @@ needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a
 def kalman(prior=1.0, r=1.0):
     """Five numbers that walk at random, of which three are read."""
     eye = torch.eye(5)
-    return KalmanFilter(eye, eye, eye[:3], r * torch.ones(3), mean=torch.ones(5), cov=prior * eye)
+    return KalmanFilter(eye, eye[:3], process_noise_cov=eye, noise=[r**0.5] * 3, mean=torch.ones(5), cov=prior * eye)
 
 
 def compiler(run):
@@ -81,10 +85,10 @@ def ekf():
     """Four numbers that stand still, of which two are read."""
     return EKF(
         LearnedTransition(torch.nn.Identity(), residual=False),
-        [0.1] * 4,
         None,
         Select([0, 1]),
         ConstantNoise([0.5, 0.5], in_key="observation"),
+        process_noise=[0.1] * 4,
         initial=MomentPrior(torch.zeros(4), torch.eye(4)),
         observation_key="observation",
     )
@@ -174,7 +178,14 @@ def precise():
     """A reading 1e4 times as precise as the belief, of sums that the belief knows well."""
     sums = torch.tensor([[1.0, 1.0, 1.0]])
     cov = 1e4 * torch.ones(3, 3) + torch.diag(torch.tensor([1.0, 2.0, 3.0]))
-    filter = KalmanFilter(torch.eye(3), 0 * torch.eye(3), sums, torch.tensor([1e-4]), mean=torch.zeros(3), cov=cov)
+    filter = KalmanFilter(
+        torch.eye(3),
+        sums,
+        process_noise_cov=0 * torch.eye(3),
+        noise=[1e-2],
+        mean=torch.zeros(3),
+        cov=cov,
+    )
     return filter, filter.initialise(TensorDict({"observation": 100 * torch.randn(2, 1)}, [2]))
 
 
@@ -255,3 +266,23 @@ def test_numbers_drawn_inside_by_another_generator_are_no_error():
     refuse_other_numbers(lambda x: x + torch.randn(100, generator=own), lambda x: x + torch.randn(100), (x,), **names)
     with pytest.raises(RuntimeError, match="'y' is up to"):
         refuse_other_numbers(lambda x: x + 50, lambda x: x + torch.randn(100), (x,), **names)
+
+
+def test_running_means_are_those_of_the_step_alone():
+    """The first compiled step also runs eagerly, and on numbers in place of black pictures: that is no training."""
+    filter = linear_denkf().float()
+    norm = nn.BatchNorm1d(2)
+    modules = {"norm": TensorDictModule(norm, ["raw"], ["observation"]), **dict(named_modules_of(filter))}
+    filter = Filter(modules, initial=filter.initial).train()
+    raw = 3 + torch.randn(6, 2)
+    raw[0] = 0.0
+    start = filter.initialise(TensorDict({"raw": raw}, [6]))
+    found = []
+    for backend in (None, "eager"):
+        norm.reset_running_stats()
+        if backend:
+            filter.compile(backend=backend)
+        filter.step(start.copy())
+        found.append({name: value.clone() for name, value in norm.named_buffers()})
+    assert found[0]["num_batches_tracked"] == 1
+    torch.testing.assert_close(found[1], found[0])

@@ -199,16 +199,16 @@ def two_readings(scheme, size=20_000):
             "analysis1": EnsembleAnalysis(
                 scheme,
                 predicted_key="first_predicted",
-                sensor_key="first",
+                observation_key="first",
                 noise_variance_key="first_noise",
-                belief_key="mid",
+                belief_prefix="mid",
             ),
             "h2": LinearObservation(one, in_key=("mid", "ensemble"), out_key="second_predicted"),
             "analysis2": EnsembleAnalysis(
                 scheme,
                 forecast_key=("mid", "ensemble"),
                 predicted_key="second_predicted",
-                sensor_key="second",
+                observation_key="second",
                 noise_variance_key="second_noise",
             ),
         },
@@ -226,7 +226,9 @@ def test_the_pairs_that_are_traced_hold_each_feature():
 def test_two_analyses_are_the_kalman_filter_of_both_readings(float64, scheme, way):
     torch.manual_seed(0)
     filter, one = two_readings(scheme), torch.eye(1)
-    kalman = KalmanFilter(one, one, torch.ones(2, 1), torch.ones(2), mean=torch.zeros(1), cov=one)
+    kalman = KalmanFilter(
+        one, torch.ones(2, 1), process_noise_cov=one, noise_cov=torch.eye(2), mean=torch.zeros(1), cov=one
+    )
     frames = TensorDict({"first": torch.randn(4, 1), "second": torch.randn(4, 1)}, [4])
     exact = kalman.sequence(frames.copy().set("observation", torch.cat([frames["first"], frames["second"]], -1)))
     if way == "compiled":
@@ -264,7 +266,7 @@ def test_two_sensors_draw_their_own_noise(way):
             "transition": NoisyLinear(one),
             "observation": LinearObservation(one),
             "analysis": EnsembleAnalysis(
-                "sensor", sensor_key=("first", "ensemble"), noise_variance_key=("first", "noise")
+                "sensor", observation_key=("first", "ensemble"), noise_variance_key=("first", "noise")
             ),
         },
         initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=500),
@@ -282,7 +284,7 @@ def test_large_ensemble_with_everything_is_the_kalman_filter(float64):
     kalman = linear_kalman()
     half = lambda index: {  # noqa: E731
         "predicted_key": f"p{index}",
-        "sensor_key": f"y{index}",
+        "observation_key": f"y{index}",
         "noise_variance_key": f"r{index}",
         "observed_key": f"seen{index}",
     }
@@ -292,7 +294,7 @@ def test_large_ensemble_with_everything_is_the_kalman_filter(float64):
             "r0": ConstantNoise(R[:1].sqrt(), in_key="y0", out_key="r0"),
             "r1": ConstantNoise(R[1:].sqrt(), in_key="y1", out_key="r1"),
             "h0": LinearObservation(H[:1], out_key="p0"),
-            "a0": EnsembleAnalysis("perturbed", belief_key="mid", **half(0)),
+            "a0": EnsembleAnalysis("perturbed", belief_prefix="mid", **half(0)),
             "h1": LinearObservation(H[1:], in_key=("mid", "ensemble"), out_key="p1"),
             "a1": EnsembleAnalysis("perturbed", forecast_key=("mid", "ensemble"), **half(1)),
         },

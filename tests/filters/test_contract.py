@@ -18,18 +18,18 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import FusedFilter, FusedSensor, Gated, LSTMFilter, Monitored, ParticleFilter
+from torch_denkf.filters import LSTMFilter, ParticleFilter
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianLikelihood,
     GaussianPrior,
-    InnovationMonitor,
     LinearObservation,
     LinearTransition,
     MomentPrior,
-    MonitoredSensor,
     Select,
 )
+from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms import DEnKFTransform
 
@@ -40,7 +40,7 @@ def particles(scheme, **kwargs):
         NoisyLinear(F, torch.linalg.cholesky(Q)),
         None,
         LinearObservation(H),
-        GaussianLikelihood(sensor_key="observation"),
+        GaussianLikelihood(observation_key="observation"),
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=16),
         resampling=scheme,

@@ -10,12 +10,12 @@ from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
-    FlipoutLinear,
     LearnedTransition,
     NoisyTransition,
     Select,
     StochasticMLP,
 )
+from torch_denkf.modules.stochastic import FlipoutLinear
 
 
 def widths(network):
@@ -118,7 +118,7 @@ def test_process_noise_of_another_width_leaves_the_analysis_its_own():
         None,
         Select([0, 2]),
         ConstantNoise([0.1, 0.2], in_key="y"),
-        EnsembleAnalysis("perturbed", sensor_key="y"),
+        EnsembleAnalysis("perturbed", observation_key="y"),
         initial=AroundState([0.1] * 3, ensemble_size=8),
     )
     noise = denkf.draw_noise(TensorDict({"y": torch.zeros(5, 2)}, [5]))

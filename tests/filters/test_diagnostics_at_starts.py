@@ -85,7 +85,7 @@ def test_a_start_from_the_sensors_reading_runs_the_sensor():
     """Also where it is not updated with that frame: the initial belief reads what the frame modules write."""
     plain, (_, _, _, R) = linear_denkf(), linear_system()
     sensor = TensorDictModule(lambda raw: 2.0 * raw, ["raw"], ["observation"])
-    initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, sensor_key="observation")
+    initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, observation_key="observation")
     names = ("noise", "transition", "observation", "analysis")
     filter = Filter({"sensor": sensor, **{name: plain[name] for name in names}}, initial=initial)
     out = filter.initialise(TensorDict({"raw": torch.tensor([[1.0, -3.0]])}, [1]))

@@ -71,7 +71,7 @@ def test_a_module_that_undoes_another_is_refused():
     with pytest.raises(ValueError, match=r"over what 'analysis' .* before any module has read it"):
         Filter(
             {name: plain[name] for name in ("noise", "transition", "observation", "analysis")}
-            | {"again": EnsembleAnalysis("etkf", sensor_key="observation")},
+            | {"again": EnsembleAnalysis("etkf", observation_key="observation")},
             initial=plain.initial,
         )
     with pytest.raises(ValueError, match="'observation' is a tensor"):
@@ -81,7 +81,7 @@ def test_a_module_that_undoes_another_is_refused():
                 "transition": plain["transition"],
                 "observation": plain["observation"],
                 "analysis": EnsembleAnalysis(
-                    "etkf", sensor_key="observation", noise_variance_key=("observation", "noise")
+                    "etkf", observation_key="observation", noise_variance_key=("observation", "noise")
                 ),
             },
             initial=plain.initial,

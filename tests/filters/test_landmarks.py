@@ -6,9 +6,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import EKF, UKF
 from torch_denkf.functional import wrap_angles
-from torch_denkf.modules import ConstantNoise, GaussianAround, LearnedObservation, UnicycleTransition
+from torch_denkf.modules import ConstantNoise, GaussianAround, LearnedObservation
 
 LANDMARKS = [[-12.0, 0.0], [5.0, 15.0]]  # m; the first is behind the vehicle, so that its direction passes pi
 DT = 0.1  # s

@@ -16,7 +16,7 @@ import torch
 from tests.conftest import COMPILED
 from tests.filters.factories import has_compiler
 from torch_denkf._lock import locked
-from torch_denkf.filters.inductor.libraries import clear_damaged_libraries, is_whole
+from torch_denkf.filters._inductor.libraries import clear_damaged_libraries, is_whole
 
 ROOT = Path(__file__).parents[2]
 
@@ -64,7 +64,7 @@ def loaded():
 logging.basicConfig()
 before = loaded()
 one = torch.eye(1)
-kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one).compile()
+kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one).compile()
 out = kf.step(kf.initialise(TensorDict({"observation": torch.ones(5, 1)}, [5])))
 print(out["belief", "mean"].flatten().tolist())
 print(*sorted(loaded() - before))

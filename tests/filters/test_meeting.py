@@ -22,7 +22,7 @@ MEAN = ("belief", "mean")
 
 def walk(**kwargs):
     one = torch.eye(1)
-    return KalmanFilter(one, 0.25 * one, one, one, mean=torch.zeros(1), cov=one, **kwargs)
+    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
 
 
 # ------------------------------------------------------------------------------------------- noise that actions drive
@@ -43,7 +43,7 @@ def driven(place):
         "noise": DrivenNoise(),
         "transition": NoisyLinear(torch.eye(1)),
         "observation": LinearObservation(torch.eye(1)),
-        "analysis": EnsembleAnalysis("etkf", sensor_key="y"),
+        "analysis": EnsembleAnalysis("etkf", observation_key="y"),
     }
     order = ["noise", "transition", "observation", "analysis"]
     order.insert(place, order.pop(0))

@@ -17,14 +17,8 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
-from torch_denkf.modules import (
-    ConstantNoise,
-    EnsembleAnalysis,
-    FromSensor,
-    GaussianPrior,
-    LinearObservation,
-    WithWeights,
-)
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, GaussianPrior, LinearObservation
+from torch_denkf.modules.particles import with_weights
 
 LOG_WEIGHT = ("belief", "log_weight")
 
@@ -130,11 +124,15 @@ def test_one_of_two_sensors_may_be_missing(float64):
             "r1": ConstantNoise(R[1:].sqrt(), in_key="y1", out_key="r1"),
             "h0": LinearObservation(H[:1], out_key="p0"),
             "a0": EnsembleAnalysis(
-                "etkf", predicted_key="p0", sensor_key="y0", noise_variance_key="r0", belief_key="mid"
+                "etkf", predicted_key="p0", observation_key="y0", noise_variance_key="r0", belief_prefix="mid"
             ),
             "h1": LinearObservation(H[1:], in_key=("mid", "ensemble"), out_key="p1"),
             "a1": EnsembleAnalysis(
-                "etkf", forecast_key=("mid", "ensemble"), predicted_key="p1", sensor_key="y1", noise_variance_key="r1"
+                "etkf",
+                forecast_key=("mid", "ensemble"),
+                predicted_key="p1",
+                observation_key="y1",
+                noise_variance_key="r1",
             ),
         },
         initial=plain.initial,
@@ -147,7 +145,7 @@ def test_one_of_two_sensors_may_be_missing(float64):
                 "transition": plain["transition"],
                 "noise": ConstantNoise(R[[kept]].sqrt(), in_key="y"),
                 "observation": LinearObservation(H[[kept]]),
-                "analysis": EnsembleAnalysis("etkf", sensor_key="y"),
+                "analysis": EnsembleAnalysis("etkf", observation_key="y"),
             },
             initial=plain.initial,
         )
@@ -160,12 +158,12 @@ def test_a_start_without_the_reading_is_the_prior(float64, case):
     """The belief starts from reading 0 where it is there, from N(mean, std) where it is not; reading 1 is another's."""
     plain = linear_denkf()
     mean, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0])
-    start = FromSensor([0], mean, std, ensemble_size=7, sensor_key="y0", noise_variance_key="r0")
+    start = FromSensor([0], mean, std, ensemble_size=7, observation_key="y0", noise_variance_key="r0")
     modules = {"transition": plain["transition"]}
-    modules |= parts_of_reading(0, "forecast", "mid", info_key="i0")
-    modules |= parts_of_reading(1, "mid", "belief", info_key="i1")
+    modules |= parts_of_reading(0, "forecast", "mid", info_prefix="i0")
+    modules |= parts_of_reading(1, "mid", "belief", info_prefix="i1")
     if case == "weights":
-        filter = bootstrap(7, initial=WithWeights(start))
+        filter = bootstrap(7, initial=with_weights(start))
         filter.module.update(torch.nn.ModuleDict({"r0": modules["r0"]}))
         noise_key = ("noise", "initial.initial")
     else:
@@ -196,7 +194,7 @@ def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kin
     """Unheld it overflows at step 872 in float32: the standard deviation grows by a tenth a step."""
     F, one = 1.1 * torch.eye(1), torch.eye(1)
     if kind == "kalman":
-        filter = KalmanFilter(F, one, one, one, mean=torch.ones(1), cov=one)
+        filter = KalmanFilter(F, one, process_noise_cov=one, noise_cov=one, mean=torch.ones(1), cov=one)
     else:
         parts = {"observation": LinearObservation(one), "noise": ConstantNoise([1.0], in_key="observation")}
         prior = GaussianPrior([1.0], [1.0], ensemble_size=64)
@@ -220,7 +218,9 @@ def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kin
         td = filter.step(td.set("observation", torch.tensor([reading])))
     assert (td[MEAN] - 4.8).abs() < 3.0
     assert td[VAR] < 3.0
-    loose = KalmanFilter(F, one, one, one, mean=torch.ones(1), cov=one, variance_ceiling=None)
+    loose = KalmanFilter(
+        F, one, process_noise_cov=one, noise_cov=one, mean=torch.ones(1), cov=one, variance_ceiling=None
+    )
     frames = TensorDict(
         {"observation": torch.zeros(1000, 1), "observed": torch.zeros(1000, 1, dtype=torch.bool)}, [1000]
     )

@@ -87,7 +87,7 @@ def test_a_transform_writes_memory_of_its_own(float64):
 
 def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
     one = torch.eye(1)
-    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
     belief = filter.initialise(TensorDict({}, [3]))
     belief["belief", "mean"][0] = 7.0
     belief["belief", "cov"].mul_(100.0)
@@ -103,7 +103,9 @@ def test_a_belief_that_is_written_to_leaves_the_next_episode_alone():
 def test_a_belief_around_a_state_is_not_that_state():
     state = torch.tensor([1.0, 2.0])
     belief = GaussianAround([0.5, 0.5])
-    filter = KalmanFilter(torch.eye(2), torch.eye(2), torch.eye(2), torch.eye(2), mean=state, cov=torch.eye(2))
+    filter = KalmanFilter(
+        torch.eye(2), torch.eye(2), process_noise_cov=torch.eye(2), noise_cov=torch.eye(2), mean=state, cov=torch.eye(2)
+    )
     filter.initial = belief
     row = filter.initialise(TensorDict({"state": state}))
     row["belief", "mean"].add_(1.0)
@@ -116,12 +118,12 @@ MATRIX, VECTOR = (2, 2), (2,)
 #: Constructors, and the shapes of the constants that they take.
 TAKES = {
     "KalmanFilter": (
-        lambda a, b, c, d, e, f: KalmanFilter(a, b, c, d, mean=e, cov=f),
+        lambda a, b, c, d, e, f: KalmanFilter(a, c, process_noise_cov=b, noise_cov=d, mean=e, cov=f),
         [MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
     "BackpropKF": (
         lambda a, b, c, d, e: BackpropKF(
-            a, b, None, c, ConstantNoise([0.5, 0.5], in_key="observation"), initial=MomentPrior(d, e)
+            a, None, c, ConstantNoise([0.5, 0.5], in_key="observation"), process_noise_cov=b, initial=MomentPrior(d, e)
         ),
         [MATRIX, MATRIX, MATRIX, VECTOR, MATRIX],
     ),
@@ -155,7 +157,7 @@ def test_constructors_copy_what_they_are_given(name, kind):
 
 def test_one_matrix_for_all_is_four_matrices():
     one = torch.eye(1)
-    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
     buffers = dict(filter.named_buffers())
     assert len(memories(*buffers.values())) == len(buffers) == 6
 

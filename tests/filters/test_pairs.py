@@ -15,17 +15,9 @@ from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import FusedFilter, FusedSensor, Gated, Monitored
-from torch_denkf.modules import (
-    BlackIsMissing,
-    EKFAnalysis,
-    InnovationMonitor,
-    LinearTransition,
-    MomentPrior,
-    MonitoredSensor,
-    Select,
-    SubModel,
-)
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import EKFAnalysis, LinearTransition, MomentPrior, Select, SubModel
+from torch_denkf.monitoring import BlackIsMissing, Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.transforms import DEnKFTransform
 
 FEATURES = (

@@ -91,7 +91,7 @@ def test_partial_mask_is_the_filter_of_the_remaining_dimension(float64, kept):
         NoisyLinear(F, torch.linalg.cholesky(Q)),
         None,
         LinearObservation(H[[kept]]),
-        GaussianLikelihood(sensor_key="observation"),
+        GaussianLikelihood(observation_key="observation"),
         noise=ConstantNoise(R[[kept]].sqrt(), in_key="observation"),
         initial=both.initial,
     )

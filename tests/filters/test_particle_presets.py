@@ -6,22 +6,19 @@ from tensordict import TensorDict
 
 from tests.filters.factories import OBS, M, NoisyLinear, assert_equal, linear_system, toy_frames
 from tests.filters.particle_for_tests import BELIEF, E, bootstrap, toy_parts
+from torch_denkf.applications.car import PairObservation, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
 from torch_denkf.filters import DPF, MixtureParticleFilter, ParticleFilter
 from torch_denkf.modules import (
     AroundState,
-    ClonedPrior,
-    ClonedTransition,
     ConstantNoise,
     DiagonalNoise,
     GaussianLikelihood,
     LearnedLikelihood,
     LinearObservation,
     NoisyTransition,
-    PairObservation,
-    ResampledTransition,
-    UnicycleTransition,
-    WithWeights,
 )
+from torch_denkf.modules.particles import ResampledTransition, with_weights
 
 
 def test_dpf():
@@ -87,7 +84,7 @@ def test_a_likelihood_of_ones_own_has_the_key_itself():
 def test_what_is_there_already_is_kept():
     parts = toy_parts()
     transition = ResampledTransition(parts.pop("transition"), "transport")
-    initial = WithWeights(parts.pop("initial"))
+    initial = with_weights(parts.pop("initial"))
     filter = ParticleFilter(transition, initial=initial, noise=DiagonalNoise(OBS), **parts)
     assert filter["transition"] is transition
     assert filter.initial is initial
@@ -105,7 +102,7 @@ def test_clones_of_past_velocities_are_resampled_along():
         ClonedTransition(vehicle),
         None,
         PairObservation(history_key=None),
-        GaussianLikelihood(sensor_key="y", observed_key=("forecast", "observed")),
+        GaussianLikelihood(observation_key="y", observed_key=("forecast", "observed")),
         noise=ConstantNoise([0.5, 0.1], in_key="y"),
         initial=ClonedPrior(AroundState([0.0, 0.0, 0.0, 1.0, 0.1], ensemble_size=200), lags=2),
         resampling="soft",

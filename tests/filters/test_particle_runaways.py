@@ -36,7 +36,7 @@ def cubic_filter(size=1000, resampling="systematic", **kwargs):
         Cubic(),
         None,
         Select([0]),
-        GaussianLikelihood(sensor_key="reading"),
+        GaussianLikelihood(observation_key="reading"),
         noise=ConstantNoise([R], in_key="reading"),
         initial=GaussianPrior([0.0], [PRIOR], ensemble_size=size),
         process_noise=[Q],

@@ -13,7 +13,7 @@ from torchrl.modules.utils import get_env_transforms_from_module
 from tests.filters.factories import FixedEnsemble, S, assert_equal, linear_system, toy_frames
 from tests.filters.particle_for_tests import BELIEF, E, bootstrap, toy_filter
 from torch_denkf.envs.linear import LinearGaussianEnv
-from torch_denkf.functional import weighted_mean, weighted_var
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.transforms import DEnKFTransform
 
 

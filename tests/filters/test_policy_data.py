@@ -113,3 +113,34 @@ def test_a_policy_carries_actions_that_need_not_be_there():
     coasting = filter.predict(td.copy())["belief", "mean"]
     driven = filter.predict(td.copy().set("action", torch.tensor([2.0])))["belief", "mean"]
     torch.testing.assert_close(driven - coasting, torch.tensor([1.0, -2.0]))
+
+
+@every_filter
+@pytest.mark.parametrize("update_at_reset", [False, True])
+def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_reset):
+    """As in a transform. In the other row, and where the first frame is used, it is refused."""
+    filter = FILTERS[name]()
+    filter.update_at_reset = update_at_reset
+    row = policy_data(filter, anew=(0,))[0][:, 0]
+    row["previous", "known"][1] = True
+    first, second = row.copy(), row.copy()
+    first["observation"], second["observation"] = row["observation"].clone(), row["observation"].clone()
+    first["observation"][0], second["observation"][1] = torch.nan, torch.nan
+    with pytest.raises(ValueError, match="NaN or infinity in"):
+        filter(second)
+    if update_at_reset:
+        with pytest.raises(ValueError, match="NaN or infinity in"):
+            filter(first)
+    else:
+        torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
+
+
+def test_policy_steps_under_vmap():
+    filter = linear_kalman()
+    row = policy_data(filter)[0][:, 0].select("observation", ("previous", "belief"))
+
+    def step(*values):
+        return filter(TensorDict(dict(zip(keys, values, strict=True)), []))["belief", "mean"]
+
+    keys = list(row.keys(True, True))
+    torch.testing.assert_close(torch.vmap(step)(*(row[key] for key in keys)), filter(row)["belief", "mean"])

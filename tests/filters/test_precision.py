@@ -13,23 +13,18 @@ from tests.filters.factories import (
     toy_frames,
 )
 from tests.filters.gaussian_for_tests import linear_filter
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
-from torch_denkf.modules import (
-    ConstantNoise,
-    GaussianPrior,
-    LinearObservation,
-    MomentPrior,
-    Select,
-    StochasticMLP,
-    UnicycleTransition,
-)
+from torch_denkf.modules import ConstantNoise, GaussianPrior, LinearObservation, MomentPrior, Select, StochasticMLP
 
 
 def test_float64_matrices_beside_float32_are_refused():
     F, Q, H, R = linear_system(torch.float64)
     with pytest.raises(TypeError, match=r"mean is torch.float32 and transition is torch.float64; convert one"):
-        KalmanFilter(F, Q, H, R, mean=torch.zeros(2), cov=torch.eye(2))
-    kf = KalmanFilter(F, Q, H, R, mean=torch.zeros(2).double(), cov=torch.eye(2).double())
+        KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2))
+    kf = KalmanFilter(
+        F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2).double(), cov=torch.eye(2).double()
+    )
     frames = TensorDict({"observation": torch.randn(5, 2, dtype=torch.float64)}, [5])
     assert kf.sequence(frames)[MEAN].dtype == torch.float64
 
@@ -62,8 +57,10 @@ def test_no_process_noise_is_zero(float64, kind, q):
     F, _, H, R = linear_system()
     parts = (None, LinearObservation(H), ConstantNoise(R.sqrt(), in_key="observation"))
     prior = MomentPrior(torch.zeros(2), torch.eye(2))
-    filter = kind(NoisyLinear(F), q, *parts, initial=prior, observation_key="observation")
-    exact = KalmanFilter(F, torch.zeros(2, 2), H, R, mean=torch.zeros(2), cov=torch.eye(2))
+    filter = kind(NoisyLinear(F), *parts, process_noise=q, initial=prior, observation_key="observation")
+    exact = KalmanFilter(
+        F, H, process_noise_cov=torch.zeros(2, 2), noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2)
+    )
     frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
     # The sigma points' ridge is 10 eps of the correlations.
     close(filter.sequence(frames.copy()), exact.sequence(frames.copy()), [MEAN, COV], atol=1e-10)
@@ -73,7 +70,9 @@ def test_process_noise_is_a_part_of_an_ensemble_filter(float64):
     torch.manual_seed(0)
     F, Q, H, R = linear_system()
     parts = (None, LinearObservation(H), ConstantNoise(R.sqrt(), in_key="observation"))
-    kalman = KalmanFilter(F, torch.diag(Q.diagonal()), H, R, mean=torch.zeros(2), cov=torch.eye(2))
+    kalman = KalmanFilter(
+        F, H, process_noise_cov=torch.diag(Q.diagonal()), noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2)
+    )
     prior = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=20_000)
     filter = DEnKF(
         NoisyLinear(F), *parts, initial=prior, observation_key="observation", process_noise=Q.diagonal().sqrt()

@@ -12,8 +12,10 @@ from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.test_contract import FILTERS, every_filter, readings
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, FusedFilter, FusedSensor, Gated, KalmanFilter, Monitored
-from torch_denkf.modules import InnovationMonitor, LinearTransition, MomentPrior, MonitoredSensor, Select
+from torch_denkf.filters import EKF, KalmanFilter
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import LinearTransition, MomentPrior, Select
+from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
@@ -56,7 +58,7 @@ def test_a_prefix_changes_names_and_nothing_else(float64, name):
 def walk(**kwargs):
     """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
     one = torch.eye(1)
-    return KalmanFilter(one, 0.25 * one, one, one, mean=torch.zeros(1), cov=one, **kwargs)
+    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
 
 
 def by_hand(readings, q=0.25, r=1.0):

@@ -16,8 +16,8 @@ from torch_denkf.modules import (
     LinearObservation,
     MappedNoise,
     MomentPrior,
-    WithWeights,
 )
+from torch_denkf.modules.particles import with_weights
 
 S, OBS, E, T = 3, 2, 8, 4
 GAUSSIAN = st.sampled_from(["KalmanFilter", "EKF", "UKF", "BackpropKF"])
@@ -47,23 +47,30 @@ class System:
         prior = MomentPrior(self.mean, self.cov)
         if name == "KalmanFilter":
             return KalmanFilter(
-                self.F, self.root @ self.root.mT, self.H, self.r.square().diag(), mean=self.mean, cov=self.cov
+                self.F,
+                self.H,
+                process_noise_cov=self.root @ self.root.mT,
+                noise_cov=self.r.square().diag(),
+                mean=self.mean,
+                cov=self.cov,
             )
         unit = ConstantNoise(torch.ones_like(self.mean), in_key=("belief", "mean"), out_key=("forecast", "noise"))
         q, r = MappedNoise(unit, self.root), ConstantNoise(self.r, in_key="observation")
         keys = {"initial": prior, "observation_key": "observation"}
         if name == "BackpropKF":
-            return BackpropKF(self.F, q, None, self.H, r, **keys)
-        return {"EKF": EKF, "UKF": UKF}[name](NoisyLinear(self.F), q, None, LinearObservation(self.H), r, **keys)
+            return BackpropKF(self.F, None, self.H, r, process_noise_cov=q, **keys)
+        return {"EKF": EKF, "UKF": UKF}[name](
+            NoisyLinear(self.F), None, LinearObservation(self.H), r, process_noise=q, **keys
+        )
 
     def ensemble(self, scheme, order=None):
         initial = FixedEnsemble(self.members if order is None else self.members[order])
         parts = (NoisyLinear(self.F, self.root), None, LinearObservation(self.H))
         r = ConstantNoise(self.r, in_key="observation")
         if scheme == "particles":
-            likelihood = GaussianLikelihood(sensor_key="observation")
-            return ParticleFilter(*parts, likelihood, noise=r, initial=WithWeights(initial), resampling=None)
-        analysis = EnsembleAnalysis(scheme, sensor_key="observation")
+            likelihood = GaussianLikelihood(observation_key="observation")
+            return ParticleFilter(*parts, likelihood, noise=r, initial=with_weights(initial), resampling=None)
+        analysis = EnsembleAnalysis(scheme, observation_key="observation")
         return DEnKF(*parts, r, analysis, initial=initial)
 
     def frames(self, seed, batch, steps=T):

@@ -11,17 +11,11 @@ from torch import nn
 import torch_denkf.modules
 from tests.filters.factories import FixedEnsemble, NoisyLinear
 from tests.filters.test_contract import FILTERS, every_filter
-from torch_denkf.filters import DEnKF, Filter, FusedFilter, FusedSensor
-from torch_denkf.modules import (
-    BlackIsMissing,
-    ConstantNoise,
-    EnsembleAnalysis,
-    LinearObservation,
-    SignGate,
-    SubModel,
-    VectorSensor,
-)
+from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, LinearObservation, SubModel, VectorSensor
 from torch_denkf.modules._running import reads_of, writes
+from torch_denkf.monitoring import BlackIsMissing, SignGate
 
 
 @every_filter

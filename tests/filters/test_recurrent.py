@@ -12,8 +12,9 @@ from torchrl.modules import set_recurrent_mode
 
 from tests.filters.factories import stepwise
 from tests.transforms.envs_for_tests import base_env
+from torch_denkf.applications.car import dead_reckoning
+from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.metrics import dead_reckoning
 from torch_denkf.modules import GaussianAround, ImageSensor
 from torch_denkf.objectives import GaussianLoss
 from torch_denkf.transforms import DEnKFTransform
@@ -155,7 +156,7 @@ def test_compiled_step_equals_eager():
 def vehicle(sensor=None, **kwargs):
     initial = GaussianAround([0.0, 0.0, 0.0, 1.0, 0.1])
     units = {"loc": [10.0, 0.1], "scale": [3.0, 0.1], "hidden_size": 8, "floor": 1e-4}
-    return LSTMFilter(sensor, state_dim=5, dt=0.1, initial=initial, **{**units, **kwargs})
+    return LSTMFilter(sensor, state_dim=5, motion=UnicyclePose(0.1), initial=initial, **{**units, **kwargs})
 
 
 def test_pose_is_the_dead_reckoning_of_the_velocities(float64):
@@ -188,10 +189,11 @@ def test_the_sensor_of_other_filters_is_trained_through_the_memory():
     assert sensor.module["trunk"][0].weight.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("wrong", [{"state_dim": 3}, {"initial": None}, {"update_at_reset": True}])
-def test_a_vehicle_needs_its_pose_and_five_dimensions(wrong):
+@pytest.mark.parametrize("wrong", [{"initial": None}, {"update_at_reset": True}])
+def test_a_vehicle_needs_its_pose(wrong):
+    given = {"motion": UnicyclePose(0.1), "initial": GaussianAround([0.1] * 5), **wrong}
     with pytest.raises(ValueError, match="GaussianAround"):
-        LSTMFilter(None, **{"features": 4, "state_dim": 5, "dt": 0.1, "initial": GaussianAround([0.1] * 5), **wrong})
+        LSTMFilter(None, features=4, state_dim=5, **given)
 
 
 # ------------------------------------------------------------------------------------------------------- a memory

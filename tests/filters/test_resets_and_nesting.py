@@ -9,18 +9,10 @@ from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf
 from tests.filters.two_readings_for_tests import parts_of_reading
+from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import with_history
 from torch_denkf.filters import Filter, KalmanFilter
-from torch_denkf.modules import (
-    AroundState,
-    ConstantNoise,
-    EnsembleAnalysis,
-    KalmanAnalysis,
-    PairObservation,
-    Select,
-    UnicycleMotion,
-    UnicycleTransition,
-    WithHistory,
-)
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, KalmanAnalysis, Select
 from torch_denkf.transforms import DEnKFTransform
 
 # ------------------------------------------------------------------------------------------------ resets that update
@@ -31,7 +23,7 @@ def test_an_update_at_a_reset_sees_nothing_of_the_episode_before(float64, histor
     """An update that reads the belief of t-1 itself, as UnicycleMotion does."""
     keys = {"history_key": ("belief", "history")} if history else {}
     start = AroundState([0.1] * 5, ensemble_size=6)
-    analysis = {"sensor_key": "y", "belief_key": "analysis"}
+    analysis = {"observation_key": "y", "belief_prefix": "analysis"}
     if history:
         analysis |= {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed")}
     filter = Filter(
@@ -42,7 +34,7 @@ def test_an_update_at_a_reset_sees_nothing_of_the_episode_before(float64, histor
             "analysis": EnsembleAnalysis("etkf", **analysis),
             "motion": UnicycleMotion(0.1, **keys),
         },
-        initial=WithHistory(start, lags=2) if history else start,
+        initial=with_history(start, lags=2) if history else start,
         update_at_reset=True,
     )
     frames = TensorDict({"y": torch.randn(2, 8, 2), "state": 3 * torch.randn(2, 8, 5)}, [2, 8])
@@ -71,14 +63,14 @@ def blocks(**info):
     plain, prefixes = linear_denkf(), ["forecast", "mid", "belief"]
     noises, blocks = {}, {}
     for i, name in enumerate(["first", "second"]):
-        keys = {"info_key": f"info{i}"} if info else {}
+        keys = {"info_prefix": f"info{i}"} if info else {}
         parts = parts_of_reading(i, prefixes[i], prefixes[i + 1], **keys)
         noises[f"r{i}"], blocks[name] = parts[f"r{i}"], TensorDictSequential(parts[f"h{i}"], parts[f"a{i}"])
     return Filter({**noises, "transition": plain["transition"], **blocks}, initial=plain.initial)
 
 
 def test_analyses_inside_sequences_count_all_or_are_refused(float64):
-    with pytest.raises(ValueError, match="each its own info_key"):
+    with pytest.raises(ValueError, match="each its own info_prefix"):
         blocks()
     filter, both = blocks(named=True), linear_denkf()
     frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
@@ -92,7 +84,7 @@ def test_analyses_inside_sequences_count_all_or_are_refused(float64):
 def test_a_step_on_entries_sees_a_replaced_module():
     """Forecast variance 2, reading 1: the mean is 2 / (2 + R)."""
     one = torch.ones(1, 1)
-    filter = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+    filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
     entries = {MEAN: torch.zeros(1), ("belief", "cov"): one, "observation": torch.ones(1)}
     before = filter.take_step(dict(entries), torch.Size([]))[MEAN]
     filter.module["analysis"] = KalmanAnalysis(one, 2 * one)
@@ -107,7 +99,7 @@ def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
         "etkf",
         forecast_key=("mid", "ensemble"),
         predicted_key="p1",
-        sensor_key="y1",
+        observation_key="y1",
         noise_variance_key="r1",
         observed_key="seen",
     )

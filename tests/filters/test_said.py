@@ -31,7 +31,7 @@ class Perturbed(SubModel):
         reads = [("forecast", "ensemble"), ("forecast", "observation"), reading, ("sensor", "noise")]
         writes = [("belief", name) for name in ("ensemble", "mean", "var")] + [(info, name) for name in _DIAGNOSTICS]
         super().__init__(nn.Identity(), reads, writes, optional_keys=["observed"] if masked else [])
-        self.reading_keys, self.info_key = self.in_keys[2:], info
+        self.reading_keys, self.info_prefix = self.in_keys[2:], info
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, device=None, dtype=None, **_):
         if members is None or observation_dim is None:

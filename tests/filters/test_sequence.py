@@ -196,7 +196,7 @@ def adds_up_actions(**kwargs) -> DEnKF:
         None,
         LinearObservation(torch.eye(2)),
         ConstantNoise([1e6, 1e6], in_key="observation"),
-        EnsembleAnalysis("etkf", sensor_key="observation"),
+        EnsembleAnalysis("etkf", observation_key="observation"),
         initial=FixedEnsemble(torch.zeros(3, 2)),
         **kwargs,
     )

@@ -78,7 +78,7 @@ class Scaled(SubModel):
 
     def __init__(self):
         super().__init__(nn.Identity(), [ENSEMBLE, "factor"], [ENSEMBLE, MEAN, ("info", "nis")])
-        self.info_key = "info"
+        self.info_prefix = "info"
 
     def compute(self, ensemble, factor):
         scaled = ensemble * factor.unsqueeze(-1)

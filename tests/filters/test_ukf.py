@@ -7,19 +7,10 @@ from torch import nn
 
 from tests.filters.factories import assert_equal, linear_kalman
 from tests.filters.gaussian_for_tests import BELIEF, INFO, linear_filter, linear_frames
+from torch_denkf.applications.car import PairObservation, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
 from torch_denkf.filters import EKF, UKF
-from torch_denkf.modules import (
-    CholeskyNoise,
-    ClonedPrior,
-    ClonedTransition,
-    ConstantNoise,
-    GaussianAround,
-    PairObservation,
-    Select,
-    StochasticMLP,
-    UnicycleNoise,
-    UnicycleTransition,
-)
+from torch_denkf.modules import CholeskyNoise, ConstantNoise, GaussianAround, Select, StochasticMLP
 
 
 @pytest.mark.parametrize(("alpha", "beta", "kappa"), [(1.0, 0.0, 0.0), (1.0, 2.0, 1.0), (0.1, 2.0, 0.0)])
@@ -46,7 +37,7 @@ def vehicle(make, *, lags=0, std=(0.0, 0.0, 0.0, 0.5, 0.02)):
     inner = CholeskyNoise(2, r=[0.5, 0.02], in_features=5 + 2 * lags)
     r = ConstantNoise([0.3, 0.01], trainable=True, in_key="reading")
     q = UnicycleNoise(inner, 0.1)
-    return make(transition, q, None, observation, r, initial=initial, observation_key="reading", **keys)
+    return make(transition, None, observation, r, process_noise=q, initial=initial, observation_key="reading", **keys)
 
 
 def drive(batch, steps, lags):

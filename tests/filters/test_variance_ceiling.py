@@ -24,7 +24,9 @@ def unseen(*batch):
 
 def kalman(ceiling, cov, mean=(1.0, -2.0)):
     one = torch.eye(2)
-    return KalmanFilter(one, one, one, one, mean=torch.tensor(mean), cov=cov, variance_ceiling=ceiling)
+    return KalmanFilter(
+        one, one, process_noise_cov=one, noise_cov=one, mean=torch.tensor(mean), cov=cov, variance_ceiling=ceiling
+    )
 
 
 @pytest.mark.filterwarnings("ignore:The variance")

@@ -14,9 +14,9 @@ def parts_of_reading(index, before, after, **kwargs):
             "etkf",
             forecast_key=(before, "ensemble"),
             predicted_key=f"p{index}",
-            sensor_key=f"y{index}",
+            observation_key=f"y{index}",
             noise_variance_key=f"r{index}",
-            belief_key=after,
+            belief_prefix=after,
             **kwargs,
         ),
     }

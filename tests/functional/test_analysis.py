@@ -9,14 +9,9 @@ from torch.distributions import MultivariateNormal
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torch_denkf.functional import (
-    analyse,
-    ensemble_anomalies,
-    ensemble_cov,
-    ensemble_mean,
-    kalman_update,
-    random_rotation,
-)
+from torch_denkf.functional import analyse, ensemble_anomalies, ensemble_mean, kalman_update
+from torch_denkf.functional.inflation import random_rotation
+from torch_denkf.functional.moments import ensemble_cov
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 SPACES = ["observation", "ensemble"]

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from torch_denkf.functional import align_angles, mean_observation, wrap_angles
+from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.angles import align_angles, mean_observation
 
 
 @pytest.fixture(autouse=True)

@@ -6,15 +6,14 @@ from torch_denkf.functional import (
     crps_ensemble,
     energy_score,
     ensemble_anomalies,
-    ensemble_cov,
     ensemble_mean,
     ensemble_var,
-    gaussian_log_prob,
-    inflate,
     kalman_predict,
     kalman_update,
-    relax_to_prior_spread,
 )
+from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
+from torch_denkf.functional.moments import ensemble_cov
 
 
 def everything(ensemble, target, observed):

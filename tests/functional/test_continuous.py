@@ -3,7 +3,7 @@
 import torch
 from torch.testing import assert_close
 
-from torch_denkf.functional import discretise
+from torch_denkf.functional.continuous import discretise
 
 DRIFT = [[0.0, 1.0], [0.0, 0.0]]
 

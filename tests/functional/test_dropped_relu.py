@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from torch_denkf.functional import dropout_factor, dropped_relu, random_bytes
+from torch_denkf.functional.dropped_relu import dropped_relu
+from torch_denkf.functional.random_bits import dropout_factor, random_bytes
 
 RATE = 0.25
 

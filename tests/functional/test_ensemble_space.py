@@ -5,7 +5,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torch_denkf.functional import _ensemble_space, analyse, random_rotation
+from torch_denkf.functional import _ensemble_space, analyse
+from torch_denkf.functional.inflation import random_rotation
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 EXACT = {"rtol": 1e-9, "atol": 1e-9}

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from torch_denkf.functional import gaussian_log_prob, kalman_predict, kalman_update
+from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.functional.gaussian import gaussian_log_prob
 
 BATCHES = [(), (3,), (2, 3)]
 # Condition numbers below 1e4 in double precision leave about 1e-12.

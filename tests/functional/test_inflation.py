@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var
+from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.moments import ensemble_cov
 
 # Few operations on numbers of size 1 in double precision.
 EXACT = {"rtol": 1e-12, "atol": 1e-12}

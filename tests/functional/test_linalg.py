@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from torch_denkf.functional import cholesky, inverse_square_root, inverse_square_root_difference, semidefinite_root
+from torch_denkf.functional.linalg import (
+    cholesky,
+    inverse_square_root,
+    inverse_square_root_difference,
+    semidefinite_root,
+)
 
 # Eigenvalues with repetitions, zeros, and eight decades between them.
 SPECTRA = [[0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 0.0, 0.0], [1e6, 1.0, 1.0, 1e-2], [3.0, 2.0, 1.0, 0.5]]

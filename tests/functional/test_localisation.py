@@ -5,16 +5,9 @@ import math
 import pytest
 import torch
 
-from torch_denkf.functional import (
-    Neighbours,
-    analyse,
-    ensemble_cov,
-    gaspari_cohn,
-    kalman_update,
-    letkf,
-    neighbours,
-    neighbours_of_taper,
-)
+from torch_denkf.functional import analyse, kalman_update, letkf, neighbours
+from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
+from torch_denkf.functional.moments import ensemble_cov
 
 EXACT = {"rtol": 1e-8, "atol": 1e-8}
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_denkf.functional import ensemble_anomalies, ensemble_cov, ensemble_mean, ensemble_var
+from torch_denkf.functional import ensemble_anomalies, ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_cov
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])

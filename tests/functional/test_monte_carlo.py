@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from torch_denkf.functional import analyse, ensemble_cov, ensemble_mean, kalman_predict, kalman_update
+from torch_denkf.functional import analyse, ensemble_mean, kalman_predict, kalman_update
+from torch_denkf.functional.moments import ensemble_cov
 
 STEPS, REPEATS, DT = 50, 32, 0.5
 # Position and velocity on a line with a slowly turning third component; position and the third are seen.

@@ -7,31 +7,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.properties_for_tests import BATCHES, DIMS, DTYPES, FIXED, MEMBERS, SCALES, SCHEMES, SEEDS, Draw, close
+from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import (
     analyse,
     crps_ensemble,
     crps_gaussian,
-    effective_sample_size,
     energy_score,
-    ensemble_cov,
     ensemble_mean,
     ensemble_var,
-    gaussian_log_prob,
-    inflate,
     kalman_predict,
     kalman_update,
-    relax_to_prior_spread,
     sigma_points,
     soft_resample,
     systematic_resample,
     transport_resample,
-    unicycle_move,
-    unscented_moments,
-    unscented_weights,
-    weighted_mean,
-    weighted_var,
     wrap_angles,
 )
+from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.resampling import effective_sample_size
+from torch_denkf.functional.unscented import unscented_moments, unscented_weights
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
 SPACES = st.sampled_from(["observation", "ensemble"])
 

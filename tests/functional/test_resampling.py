@@ -10,17 +10,15 @@ from scipy.optimize import linprog
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
-    effective_sample_size,
     ensemble_mean,
     ensemble_var,
     jitter_copies,
     soft_resample,
     systematic_resample,
     transport_resample,
-    weighted_mean,
-    weighted_var,
 )
-from torch_denkf.functional.weighted import weighted_median
+from torch_denkf.functional.resampling import effective_sample_size
+from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
 
 E, S = 6, 2
 BATCHES = [(), (3,), (2, 2)]

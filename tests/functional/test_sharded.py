@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.functional.two_shards import SHARES, problem
-from torch_denkf.functional import analyse, analyse_sharded
+from torch_denkf.functional import analyse
+from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.modules import EnsembleAnalysis, ShardedEnsembleAnalysis
 
 # Sums in another order. The forecast's members reach 5, where single precision has steps of 5e-7: ten of them.

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_denkf.functional import cholesky, kalman_update
+from torch_denkf.functional import kalman_update
 from torch_denkf.functional._small_system import (
     LARGEST,
     LARGEST_FACTOR,
@@ -11,6 +11,7 @@ from torch_denkf.functional._small_system import (
     gain_written_out,
     solve_written_out,
 )
+from torch_denkf.functional.linalg import cholesky
 
 
 def systems(size, batch=(3,)):

@@ -5,14 +5,8 @@ import math
 import pytest
 import torch
 
-from torch_denkf.functional import (
-    kalman_update,
-    sigma_points,
-    unscented_moments,
-    unscented_update,
-    unscented_weights,
-    wrap_angles,
-)
+from torch_denkf.functional import kalman_update, sigma_points, wrap_angles
+from torch_denkf.functional.unscented import unscented_moments, unscented_update, unscented_weights
 
 F64 = torch.float64
 # Sums of a few dozen numbers of size 1 in double precision; the ridge of 10 S eps shrinks correlations by 1e-14.

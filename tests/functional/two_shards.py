@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from torch_denkf.functional import analyse_sharded
+from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.modules import ShardedEnsembleAnalysis
 
 SHARES = {"uneven": (70_000, 30_000), "blind": (100_000, 0)}  # of the observations

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy import stats
 
-from torch_denkf.metrics import gaussian_nll, nees
-from torch_denkf.metrics.consistency import _chi_square_quantile
+from torch_denkf.metrics import nees
+from torch_denkf.metrics.consistency import _chi_square_quantile, gaussian_nll
 
 
 def gaussians(count=5, dims=3, seed=0):

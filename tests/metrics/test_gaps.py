@@ -8,11 +8,10 @@ from torch_denkf.metrics import (
     interval_coverage,
     nees,
     pit,
-    rank_histogram,
-    spread_error,
     spread_skill_ratio,
     state_errors,
 )
+from torch_denkf.metrics.calibration import rank_histogram, spread_error
 
 
 def problem():

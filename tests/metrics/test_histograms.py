@@ -7,15 +7,8 @@ import pytest
 import torch
 from scipy import stats
 
-from torch_denkf.metrics import (
-    ensemble_interval,
-    histogram_band,
-    pareto_frontier,
-    pit,
-    rank_histogram,
-    spread_error,
-    spread_skill_ratio,
-)
+from torch_denkf.metrics import pit, spread_skill_ratio
+from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
 
 def rng(seed=0):
@@ -110,14 +103,6 @@ def test_interval_is_numpys_quantile():
     np.testing.assert_allclose([low.numpy(), high.numpy()], expected, atol=1e-12)
 
 
-def test_frontier_is_that_of_the_definition():
-    costs = torch.randint(0, 6, (40, 2), generator=rng())
-    points = costs.tolist()
-    expected = [not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points) for p in points]
-    assert pareto_frontier(costs).tolist() == expected
-    assert 0 < sum(expected) < 40
-
-
 def test_errors_say_what_to_do():
     ones = torch.ones(4, 2)
     with pytest.raises(ValueError, match="cannot be negative"):
@@ -130,7 +115,3 @@ def test_errors_say_what_to_do():
         histogram_band(0, 10)
     with pytest.raises(ValueError, match="5 bins need at least one state each; got 4"):
         spread_error(ones, ones, ones, bins=5)
-    with pytest.raises(ValueError, match="leave out its row"):
-        pareto_frontier(torch.tensor([[1.0, torch.nan]]))
-    with pytest.raises(ValueError, match="a row a filter"):
-        pareto_frontier(torch.ones(3))

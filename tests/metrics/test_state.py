@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_denkf.metrics import state_difference, state_errors
+from torch_denkf.metrics import state_errors
+from torch_denkf.metrics.state import state_difference
 
 
 def test_by_hand():

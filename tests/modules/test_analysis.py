@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.functional import analyse, inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional import analyse
+from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.modules import EnsembleAnalysis
 
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]

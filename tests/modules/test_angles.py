@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.functional import Neighbours
+from torch_denkf.functional.localisation import Neighbours
 from torch_denkf.modules import (
     EnsembleAnalysis,
     GaussianLikelihood,
@@ -110,8 +110,8 @@ def test_kalman_analysis(samples, batch):
 @pytest.mark.parametrize("samples", [True, False])
 def test_likelihoods(samples, batch):
     here, there = ensembles(batch, samples)
-    learned = LearnedLikelihood(4, OBS, num_cells=(8,), angles=[0], reading_key=("sensor", "ensemble"))
-    plain = LearnedLikelihood(4, OBS, num_cells=(8,), reading_key=("sensor", "ensemble"))
+    learned = LearnedLikelihood(4, OBS, num_cells=(8,), angles=[0], observation_key=("sensor", "ensemble"))
+    plain = LearnedLikelihood(4, OBS, num_cells=(8,), observation_key=("sensor", "ensemble"))
     plain.load_state_dict(learned.state_dict())
     here["sensor", "encoding"] = there["sensor", "encoding"] = torch.randn(*batch, 4)
     for model, oracle in ((GaussianLikelihood(angles=[0]), GaussianLikelihood()), (learned, plain)):

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
 from torch_denkf.filters._steps import _without_reading
 from torch_denkf.modules import (
     AroundState,
@@ -23,12 +24,9 @@ from torch_denkf.modules import (
     LinearObservation,
     LinearTransition,
     MomentPrior,
-    PairObservation,
     Select,
     StochasticMLP,
     SubModel,
-    UnicycleMotion,
-    UnicycleTransition,
     VectorSensor,
 )
 
@@ -54,7 +52,7 @@ CASES = {
     ),
     "unicycle motion": (
         lambda **k: UnicycleMotion(0.1, **k),
-        {"before_key": ("a", "x"), "analysis_key": "z", "belief_key": "b"},
+        {"before_key": ("a", "x"), "analysis_key": "z", "belief_prefix": "b"},
         {("a", "x"): (E, S), "z": (E, S)},
     ),
     "pair observation": (
@@ -110,7 +108,7 @@ CASES = {
     "from sensor": (
         lambda **k: FromSensor([3, 4], torch.zeros(S), torch.ones(S), ensemble_size=E, **k),
         {
-            "sensor_key": ("s", "y"),
+            "observation_key": ("s", "y"),
             "noise_variance_key": ("s", "r"),
             "observed_key": "ok",
             "out_keys": [("b", "e"), ("b", "m"), "v"],
@@ -120,20 +118,20 @@ CASES = {
     "analysis": (
         lambda **k: EnsembleAnalysis("perturbed", **k),
         {
-            "forecast_key": "f",
+            "forecast_prefix": "f",
             "predicted_key": ("p", "y"),
-            "sensor_key": ("s", "y"),
+            "observation_key": ("s", "y"),
             "noise_variance_key": ("s", "r"),
             "observed_key": "ok",
-            "belief_key": "b",
-            "info_key": "i",
+            "belief_prefix": "b",
+            "info_prefix": "i",
         },
         {"f": (E, S), ("p", "y"): (E, OBS), ("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
     ),
-    "moment prior": (lambda **k: MomentPrior(torch.zeros(S), EYE, **k), {"belief_key": "b"}, {}),
+    "moment prior": (lambda **k: MomentPrior(torch.zeros(S), EYE, **k), {"belief_prefix": "b"}, {}),
     "linear transition": (
         lambda **k: LinearTransition(2 * EYE, EYE, **k),
-        {"belief_key": "b", "forecast_key": "f"},
+        {"belief_prefix": "b", "forecast_prefix": "f"},
         {("b", "mean"): (S,), ("b", "cov"): (S, S)},
     ),
     "kalman analysis": (
@@ -141,9 +139,9 @@ CASES = {
         {
             "observation_key": ("r", "y"),
             "observed_key": "ok",
-            "forecast_key": "f",
-            "belief_key": "b",
-            "info_key": "i",
+            "forecast_prefix": "f",
+            "belief_prefix": "b",
+            "info_prefix": "i",
         },
         {("f", "mean"): (S,), ("f", "cov"): (S, S), ("r", "y"): (OBS,)},
     ),

@@ -79,7 +79,7 @@ START = [0.1, 0.1, *STD]
 def test_gaussian_filters_are_the_augmented_kalman_filter(kind):
     _, transition, q, observation, r = parts()
     initial = MomentPrior(torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double).square().diag())
-    filter = kind(transition, q, None, observation, r, initial=initial, observation_key="reading")
+    filter = kind(transition, None, observation, r, process_noise=q, initial=initial, observation_key="reading")
     readings = simulate()[1]
     out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
     mean, cov = augmented_kalman_filter(readings, START)
@@ -93,7 +93,7 @@ def test_an_ensemble_comes_close_to_it():
     initial = GaussianPrior(
         torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double), ensemble_size=20000
     )
-    analysis = EnsembleAnalysis("etkf", sensor_key="reading")
+    analysis = EnsembleAnalysis("etkf", observation_key="reading")
     filter = DEnKF(NoisyTransition(transition, q), None, observation, r, analysis, initial=initial)
     readings = simulate()[1]
     out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
@@ -118,7 +118,7 @@ def test_a_likelihood_learns_size_and_time():
     for part in (transition, q, observation):
         part.bias = bias
     initial = GaussianAround([*START[:2], *STD], state_key="state").double()
-    filter = EKF(transition, q, None, observation, r, initial=initial, observation_key="reading")
+    filter = EKF(transition, None, observation, r, process_noise=q, initial=initial, observation_key="reading")
     runs = 64
     readings = torch.tensor(np.stack([simulate(seed)[1] for seed in range(runs)])).unsqueeze(-1)
     frames = TensorDict({"reading": readings, "state": torch.zeros(runs, STEPS, 4, dtype=torch.double)}, [runs, STEPS])

@@ -13,11 +13,11 @@ from torch_denkf.modules import (
     KalmanAnalysis,
     LinearObservation,
     LocalEnsembleAnalysis,
-    ParticleAnalysis,
     SubModel,
     UKFAnalysis,
     check_analysis,
 )
+from torch_denkf.modules.particles import ParticleAnalysis
 
 H = torch.eye(2, 3)
 OURS = {

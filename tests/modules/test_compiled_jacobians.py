@@ -9,30 +9,28 @@ import torch
 from torch import nn
 
 from tests.filters.factories import has_compiler
-from torch_denkf.filters.inductor import options_for_processors
+from torch_denkf.applications.car import PairObservation, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedTransition
+from torch_denkf.filters._inductor import options_for_processors
+from torch_denkf.fusion.parts import JoinedObservation, StateObservation
 from torch_denkf.modules import (
     BiasedObservation,
     BiasedTransition,
-    Call,
-    ClonedTransition,
     ConstantNoise,
     ContinuousMotion,
     EKFAnalysis,
     EKFTransition,
     FadingBias,
-    JoinedObservation,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
-    PairObservation,
     Select,
-    StateObservation,
     StochasticMLP,
     UKFAnalysis,
     UKFTransition,
-    UnicycleTransition,
     run_module,
 )
+from torch_denkf.modules._call import Call
 
 B, S = 3, 9  # the unicycle's five and two steps of its past; or three times three numbers
 SEEN = ("forecast", "observed")

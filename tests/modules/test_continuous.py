@@ -5,8 +5,10 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from torch_denkf.filters import DEnKF, FusedFilter, FusedSensor
+from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
+from torch_denkf.filters import DEnKF
 from torch_denkf.functional import kalman_predict, kalman_update
+from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
     ConstantNoise,
     ContinuousMotion,
@@ -19,8 +21,6 @@ from torch_denkf.modules import (
     NoisePerSecond,
     Select,
     UKFTransition,
-    UnicycleNoise,
-    UnicycleTransition,
 )
 
 DENSITY, R = 0.3, 0.2
@@ -84,7 +84,7 @@ def test_an_ensemble_of_irregular_steps(float64):
         sensor=None,
         observation=Select([0]),
         noise=ConstantNoise([R], in_key="reading"),
-        analysis=EnsembleAnalysis("etkf", sensor_key="reading", observed_key="reading_observed"),
+        analysis=EnsembleAnalysis("etkf", observation_key="reading", observed_key="reading_observed"),
         initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=20_000),
         process_noise=noise,
     )

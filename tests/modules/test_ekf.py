@@ -7,24 +7,23 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
 from tests.filters.factories import NoisyLinear
+from torch_denkf.applications.car import PairObservation, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedTransition
 from torch_denkf.functional import kalman_update
 from torch_denkf.modules import (
-    ClonedTransition,
     ConstantNoise,
     DiagonalNoise,
     EKFAnalysis,
     EKFTransition,
-    FlipoutLinear,
     LearnedObservation,
     LearnedTransition,
     LinearObservation,
-    PairObservation,
     Select,
     StochasticMLP,
     UKFAnalysis,
     UKFTransition,
-    UnicycleTransition,
 )
+from torch_denkf.modules.stochastic import FlipoutLinear
 
 TRANSITIONS, ANALYSES = [EKFTransition, UKFTransition], [EKFAnalysis, UKFAnalysis]
 

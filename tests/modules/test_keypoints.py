@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.modules import ImageSensor, KeypointTrunk, SpatialSoftArgmax
+from torch_denkf.modules import ImageSensor, KeypointTrunk
+from torch_denkf.modules.keypoints import SpatialSoftArgmax
 
 
 def bump(column, row, height=24, width=36, sigma=2.0):

@@ -120,7 +120,7 @@ def test_learned_likelihood_takes_the_mean_of_members():
 def test_learned_likelihood_sees_the_innovation():
     """By hand: the encoding, and the compressed innovation of the mean reading; nothing where not observed."""
     scale = torch.tensor([0.5, 3.0])
-    model = LearnedLikelihood(F, OBS, num_cells=(8,), scale=scale, reading_key=("sensor", "ensemble"))
+    model = LearnedLikelihood(F, OBS, num_cells=(8,), scale=scale, observation_key=("sensor", "ensemble"))
     td = reading((4,), members=3)
     innovation = (td["sensor", "ensemble"].mean(-2, keepdim=True) - td["forecast", "observation"]) / scale
     features = td["sensor", "encoding"].unsqueeze(-2).expand(-1, E, -1)
@@ -136,10 +136,10 @@ def test_learned_likelihood_sees_the_innovation():
 
 def test_learned_likelihood_of_an_innovation_has_no_loc():
     with pytest.raises(ValueError, match="scale alone"):
-        LearnedLikelihood(F, OBS, loc=[0.0, 0.0], reading_key=("sensor", "ensemble"))
+        LearnedLikelihood(F, OBS, loc=[0.0, 0.0], observation_key=("sensor", "ensemble"))
 
 
-SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), reading_key=("sensor", "ensemble"))
+SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), observation_key=("sensor", "ensemble"))
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,11 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from benchmarks.common.lorenz96 import lorenz96_step
 from torch_denkf.filters import DEnKF
-from torch_denkf.functional import (
-    Neighbours,
-    gaspari_cohn,
-    neighbours,
-    neighbours_of_taper,
-    relax_to_prior_spread,
-)
+from torch_denkf.functional import neighbours
+from torch_denkf.functional.inflation import relax_to_prior_spread
+from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -21,7 +18,6 @@ from torch_denkf.modules import (
     LocalEnsembleAnalysis,
     Select,
 )
-from torch_denkf.simulation.lorenz96 import lorenz96_step
 
 E, S = 6, 12
 PLACES = torch.arange(S, dtype=torch.float64).unsqueeze(-1)
@@ -156,7 +152,7 @@ def lorenz_filter(variables, members, **noise):
         Select(range(variables)),
         ConstantNoise(torch.ones(variables), in_key="reading", **noise),
         LocalEnsembleAnalysis.around(
-            places, places, 4.0, period=[float(variables)], inflation=1.04, rotate=True, sensor_key="reading"
+            places, places, 4.0, period=[float(variables)], inflation=1.04, rotate=True, observation_key="reading"
         ),
         initial=AroundState(torch.ones(variables), ensemble_size=members),
     )

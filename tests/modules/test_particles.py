@@ -6,13 +6,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.functional import (
-    soft_resample,
-    systematic_resample,
-    transport_resample,
-    weighted_mean,
-    weighted_var,
-)
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -22,12 +18,9 @@ from torch_denkf.modules import (
     GaussianPrior,
     LearnedTransition,
     NoisyTransition,
-    ParticleAnalysis,
-    ResampledTransition,
     SubModel,
-    UnicycleTransition,
-    WithWeights,
 )
+from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 
 E, S, OBS = 7, 3, 2
 BATCHES = [(), (4,), (2, 3)]
@@ -58,7 +51,7 @@ def belief(batch=(), size=E):
 
 @pytest.mark.parametrize("batch", BATCHES)
 def test_initial_weights_are_equal(batch):
-    start = WithWeights(GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=E))
+    start = with_weights(GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=E))
     out = start(TensorDict({}, batch))
     assert (out["belief", "log_weight"] == torch.full((*batch, E), -math.log(E))).all()
     particles, weights = out["belief", "ensemble"], out["belief", "log_weight"]
@@ -68,9 +61,9 @@ def test_initial_weights_are_equal(batch):
 
 
 def test_initial_weights_keep_what_the_belief_reads():
-    assert WithWeights(AroundState(torch.zeros(S), state_key="truth")).in_keys == ["truth"]
-    assert WithWeights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).observation_dim == 2
-    assert not hasattr(WithWeights(AroundState(torch.zeros(S))), "observation_dim")
+    assert with_weights(AroundState(torch.zeros(S), state_key="truth")).in_keys == ["truth"]
+    assert with_weights(FromSensor([0, 1], torch.zeros(S), torch.ones(S))).observation_dim == 2
+    assert not hasattr(with_weights(AroundState(torch.zeros(S))), "observation_dim")
 
 
 # ------------------------------------------------------------------------------------------------ motion noise
@@ -318,13 +311,13 @@ def test_a_tempered_likelihood_is_that_of_more_noise(float64):
     weights = []
     for variance, tempering in ((0.5, 0.25), (2.0, 1.0)):
         td["sensor", "noise"] = torch.full((3, 2), variance)
-        out = ParticleAnalysis(tempering=tempering)(GaussianLikelihood(sensor_key="y")(td.copy()))
+        out = ParticleAnalysis(tempering=tempering)(GaussianLikelihood(observation_key="y")(td.copy()))
         weights.append(out["belief", "log_weight"])
     torch.testing.assert_close(*weights, rtol=0, atol=1e-12)
 
 
 def test_the_innovation_of_angles_is_the_shorter_way_round():
-    likelihood = GaussianLikelihood(angles=[0], sensor_key="y")
+    likelihood = GaussianLikelihood(angles=[0], observation_key="y")
     predicted, weights = torch.tensor([[3.0], [-3.0]]), torch.tensor([0.25, 0.75]).log()
     forecast = {"ensemble": predicted, "observation": predicted, "log_weight": weights}
     td = TensorDict({"forecast": forecast, "y": torch.tensor([-2.5]), "sensor": {"noise": torch.tensor([0.01])}})

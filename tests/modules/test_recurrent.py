@@ -6,7 +6,10 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
-from torch_denkf.modules import GaussianAround, LSTMUpdate, MomentPrior, UnicyclePose, UnicycleTransition, WithMemory
+from torch_denkf.applications.car import UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
+from torch_denkf.modules import GaussianAround, MomentPrior
+from torch_denkf.modules.recurrent import LSTMUpdate, with_memory
 
 BATCHES = [(), (3,), (2, 3)]
 KEYS = {"encoding_key": "code", "observation_key": "reading", "extra_keys": ["steps"]}
@@ -101,6 +104,8 @@ def test_gradients(float64):
         ({"features": 4}, {"observation_key": "y"}, "observation_dim=0"),
         ({"features": 4, "extra_features": 1}, {}, "extra_features=1"),
         ({}, {"encoding_key": None}, "something to read"),
+        ({"observation_dim": -1}, {"observation_key": "y", "encoding_key": None}, "observation_dim"),
+        ({"features": 4, "extra_features": -1}, {"extra_keys": ["u"]}, "extra_features"),
     ],
 )
 def test_sizes_and_keys_belong_together(sizes, keys, match):
@@ -118,11 +123,11 @@ def test_errors_name_what_is_wrong():
 
 def test_memory_is_empty_at_reset(float64):
     prior = MomentPrior(torch.ones(2), torch.eye(2))
-    start = WithMemory(prior, 5, num_layers=2)(TensorDict({}, [3]))["belief"]
+    start = with_memory(prior, 5, num_layers=2)(TensorDict({}, [3]))["belief"]
     for name in ("hidden", "cell"):
         assert start[name].equal(torch.zeros(3, 2, 5))
     assert start["mean"].equal(torch.ones(3, 2))
-    assert WithMemory(GaussianAround([0.1] * 5), 5).state_dim == 5
+    assert with_memory(GaussianAround([0.1] * 5), 5).state_dim == 5
 
 
 @pytest.mark.parametrize("batch", BATCHES)

@@ -10,7 +10,8 @@ import torch
 from torch.distributions import Normal, kl_divergence
 from torch.nn import functional as F
 
-from torch_denkf.modules import FlipoutLinear, StochasticMLP, deterministic
+from torch_denkf.modules import StochasticMLP, deterministic
+from torch_denkf.modules.stochastic import FlipoutLinear
 
 LAYERS = ["dropout", "flipout"]
 

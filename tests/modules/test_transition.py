@@ -5,7 +5,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.modules import LearnedTransition, StochasticMLP, UnicycleMotion, UnicycleTransition
+from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
+from torch_denkf.modules import LearnedTransition, StochasticMLP
 
 BATCHES = [(), (3,), (2, 3)]
 

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.modules import (
     ConstantNoise,
     LearnedObservation,
@@ -17,7 +18,6 @@ from torch_denkf.modules import (
     StochasticMLP,
     UKFAnalysis,
     UKFTransition,
-    UnicycleTransition,
 )
 
 

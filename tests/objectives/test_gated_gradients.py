@@ -8,19 +8,17 @@ from torch.testing import assert_close
 
 from tests.filters.differences_for_tests import check_largest_gradients
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import FusedFilter, FusedSensor, Gated, Monitored
+from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianPrior,
-    InnovationMonitor,
     LearnedObservation,
     LearnedTransition,
     MomentPrior,
-    MonitoredSensor,
     Select,
-    SensorAttention,
     StochasticMLP,
 )
+from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 
 STATES = 2

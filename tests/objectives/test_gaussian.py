@@ -9,9 +9,10 @@ from torch.distributions import MultivariateNormal, Normal
 
 from tests.filters.factories import linear_kalman
 from tests.filters.gaussian_for_tests import learned_filter, learned_frames, linear_filter, linear_frames
+from torch_denkf.applications.car.modules.pairs import ClonedPrior
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ClonedPrior, GaussianAround, KalmanAnalysis
+from torch_denkf.modules import GaussianAround, KalmanAnalysis
 from torch_denkf.objectives import GaussianLoss
 
 OFF = {"state": 0.0, "transition": 0.0, "sensor": 0.0}

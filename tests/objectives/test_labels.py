@@ -16,6 +16,7 @@ from torch_denkf.data import Recording, RecordingReplay, Table
 from torch_denkf.filters import DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianLikelihood, LinearObservation, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
+from torch_denkf.objectives._labels import Truth
 
 NAN = math.nan
 
@@ -146,7 +147,7 @@ def test_the_mean_of_particles_on_both_sides_of_pi():
         NoisyLinear(torch.eye(1)),
         None,
         Select([0]),
-        GaussianLikelihood(sensor_key="y"),
+        GaussianLikelihood(observation_key="y"),
         noise=ConstantNoise([1.0], in_key="y"),
         initial=FixedEnsemble(members),
     )
@@ -317,7 +318,9 @@ def test_rows_of_a_recording_count_where_the_truth_was_measured(tmp_path):
     assert rows["state_observed"].sum() == 10
     assert (rows["state"][1:4] == rows["state"][0]).all()
     one = torch.eye(1)
-    filter = KalmanFilter(one, 0.1 * one, one, one, mean=torch.zeros(1), cov=one, observation_key="y")
+    filter = KalmanFilter(
+        one, one, process_noise_cov=0.1 * one, noise_cov=one, mean=torch.zeros(1), cov=one, observation_key="y"
+    )
     mean = filter.sequence(rows.copy())["belief", "mean"]
     expected = torch.stack([(mean[k] - math.sin(0.1 * k) - 0.1).square() for k in range(4, len(rows), 4)]).mean()
     value = GaussianLoss(filter, score="mse", transition=0.0)(rows)["loss_state"]
@@ -345,8 +348,9 @@ def test_the_masks_of_renamed_labels_are_those_that_data_sets_write():
 def test_scores_of_labels_with_gaps_compile_without_a_break(name):
     _, frames, out, loss = case(name, terms=["state"], state_scale=SCALE, dims=[0, 1, 2], angles=[1])
     frames = hidden(frames, gaps()[1], "NaN")
-    expected, rows = loss._state(frames, out)
-    compiled = torch.compile(lambda: loss._state(frames, out), fullgraph=True, backend="eager")()
+    term = lambda: loss.terms[0](out, Truth(loss, frames, out))  # noqa: E731
+    expected, rows = term()
+    compiled = torch.compile(term, fullgraph=True, backend="eager")()
     assert compiled[0].equal(expected)
     assert compiled[1].equal(rows)
 

@@ -120,7 +120,7 @@ def known_filter():
         NoisyLinear(torch.eye(2)),
         None,
         Select([0]),
-        GaussianLikelihood(sensor_key="y"),
+        GaussianLikelihood(observation_key="y"),
         noise=ConstantNoise([1.0], in_key="y"),
         initial=FixedEnsemble(torch.randn(5, 2)),
     )

@@ -121,7 +121,7 @@ def test_weights_count_and_noise_that_is_trained_gets_its_gradient(float64):
         NoisyLinear(torch.eye(1)),
         None,
         Select([0]),
-        GaussianLikelihood(sensor_key="y"),
+        GaussianLikelihood(observation_key="y"),
         noise=noise,
         initial=FixedEnsemble(members),
         resampling=None,

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_system
 from tests.filters.test_kalman import joint_gaussian
 from torch_denkf.filters import Filter, KalmanFilter
-from torch_denkf.functional import ensemble_cov
+from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -44,14 +44,14 @@ def test_two_kalman_analyses(info):
     filter = Filter(
         {
             "transition": LinearTransition(F, Q),
-            "gps": KalmanAnalysis(H[:1], R[:1], observation_key="gps", belief_key="between", info_key=info[0]),
+            "gps": KalmanAnalysis(H[:1], R[:1], observation_key="gps", belief_prefix="between", info_prefix=info[0]),
             "odometer": KalmanAnalysis(
-                H[1:], R[1:], observation_key="odometer", forecast_key="between", info_key=info[1]
+                H[1:], R[1:], observation_key="odometer", forecast_prefix="between", info_prefix=info[1]
             ),
         },
         initial=MomentPrior(mean, cov),
     )
-    one = KalmanFilter(F, Q, H, R, mean=mean, cov=cov, observation_key="both")
+    one = KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=mean, cov=cov, observation_key="both")
     frames, off = readings(), {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0, "reduction": "none"}
     value = GaussianLoss(filter, **off)(frames)["loss_nll"]
     torch.testing.assert_close(value, GaussianLoss(one, **off)(frames)["loss_nll"], rtol=1e-10, atol=1e-12)
@@ -77,25 +77,33 @@ def test_two_ensemble_analyses(info):
             "gps_observation": LinearObservation(H[:1]),
             "gps": EnsembleAnalysis(
                 "etkf",
-                sensor_key="gps",
+                observation_key="gps",
                 noise_variance_key=("gps_noise", "R"),
-                belief_key="between",
-                info_key=info[0],
+                belief_prefix="between",
+                info_prefix=info[0],
             ),
             "odometer_observation": LinearObservation(
                 H[1:], in_key=("between", "ensemble"), out_key=("between", "observation")
             ),
             "odometer": EnsembleAnalysis(
                 "etkf",
-                sensor_key="odometer",
+                observation_key="odometer",
                 noise_variance_key=("odometer_noise", "R"),
-                info_key=info[1],
+                info_prefix=info[1],
                 **keys,
             ),
         },
         initial=FixedEnsemble(members),
     )
-    one = KalmanFilter(F, 0 * Q, H, R, mean=members.mean(0), cov=ensemble_cov(members), observation_key="both")
+    one = KalmanFilter(
+        F,
+        H,
+        process_noise_cov=0 * Q,
+        noise=R.sqrt(),
+        mean=members.mean(0),
+        cov=ensemble_cov(members),
+        observation_key="both",
+    )
     frames, weights = readings(), {"state": 0.0, "transition": 0.0, "nll": 1.0, "reduction": "none"}
     value = DEnKFLoss(filter, **weights)(frames)["loss_nll"]
     expected = GaussianLoss(one, **weights)(frames)["loss_nll"]
@@ -105,6 +113,14 @@ def test_two_ensemble_analyses(info):
         log_likelihood=(info[0], "log_likelihood") if len(set(info)) > 1 else ("info", "gps", "log_likelihood")
     )
     first = loss(frames)["loss_nll"]
-    alone = KalmanFilter(F, 0 * Q, H[:1], R[:1], mean=members.mean(0), cov=ensemble_cov(members), observation_key="gps")
+    alone = KalmanFilter(
+        F,
+        H[:1],
+        process_noise_cov=0 * Q,
+        noise=R[:1].sqrt(),
+        mean=members.mean(0),
+        cov=ensemble_cov(members),
+        observation_key="gps",
+    )
     only_first_step = GaussianLoss(alone, **weights)(frames)["loss_nll"][:, 1]
     torch.testing.assert_close(first[:, 1], only_first_step, rtol=1e-9, atol=1e-11)

@@ -9,7 +9,7 @@ from torch import nn
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
-from torch_denkf.objectives._true_steps import forecasts_from_truth
+from torch_denkf.objectives.parts import forecasts_from_truth
 
 NAMES = ("ensemble", "log_weight", "mean", "var", "bias")
 E, S = 4000, 2

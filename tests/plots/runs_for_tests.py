@@ -19,7 +19,7 @@ def kalman_runs(batch=60, steps=80):
     H = torch.eye(2, 4)
     env = LinearGaussianEnv(F, H, [0.01, 0.01, 0.1, 0.1], [0.4, 0.4], missing=0.33, max_steps=steps, batch_size=[batch])
     Q = torch.diag(torch.tensor([1e-4, 1e-4, 0.01, 0.01]))
-    kf = KalmanFilter(F, Q, H, 0.16 * torch.eye(2), mean=torch.zeros(4), cov=torch.eye(4))
+    kf = KalmanFilter(F, H, process_noise_cov=Q, noise_cov=0.16 * torch.eye(2), mean=torch.zeros(4), cov=torch.eye(4))
     with torch.no_grad():
         return kf.sequence(env.rollout(steps)["next"])
 

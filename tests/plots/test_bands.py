@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import DT, ensemble_run, kalman_runs
-from torch_denkf.metrics import wrap_angle
+from torch_denkf.functional import wrap_angle
 from torch_denkf.plots import plot_bands
 
 NORMAL_90 = 1.6448536

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.plots.runs_for_tests import ensemble_run, kalman_runs
-from torch_denkf.metrics import histogram_band, pit, rank_histogram
+from torch_denkf.metrics import pit
+from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots import plot_calibration
 
 

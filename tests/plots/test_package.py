@@ -13,7 +13,6 @@ def test_what_is_missing_is_named_with_its_extra(monkeypatch, tmp_path):
     for module, extra, call in (
         ("matplotlib.figure", "plots", lambda: plots.plot_path(walk)),
         ("PIL", "plots", lambda: plots.write_video(tmp_path / "a.gif", [torch.zeros(8, 8)], 5)),
-        ("rerun", "viewer", lambda: plots.log_rollout(walk)),
     ):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, module, None)

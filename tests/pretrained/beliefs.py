@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_denkf
-from torch_denkf.vision import FLOW_SHAPE, ROAD_SHAPE
+from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 
 _READINGS = {
     "car-odometry": {"flow": FLOW_SHAPE, "road": ROAD_SHAPE, "start": (5,)},

@@ -4,14 +4,16 @@ import hashlib
 import inspect
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-import torch_denkf
-from torch_denkf import from_pretrained, save_pretrained
+from torch_denkf import available, from_pretrained, save_pretrained
+from torch_denkf._registered import weights
+from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.reacher import reacher
+from torch_denkf.applications.ur5.filter import ur5_table
 from torch_denkf.filters import DEnKF, KalmanFilter
 from torch_denkf.modules import (
     ConstantNoise,
@@ -21,10 +23,6 @@ from torch_denkf.modules import (
     LearnedTransition,
     StochasticMLP,
 )
-from torch_denkf.odometry import load_car_filter
-from torch_denkf.pretrained import reacher, ur5_table
-
-WEIGHTS = Path(torch_denkf.__file__).parent / "pretrained" / "weights"
 
 
 def readings(seed=0):
@@ -39,16 +37,16 @@ def believe(model):
 
 
 def copy_of(name, folder):
-    shutil.copytree(WEIGHTS / name, folder / name)
+    shutil.copytree(weights()[name], folder / name)
     return folder / name
 
 
-@pytest.mark.parametrize("name", torch_denkf.available())
+@pytest.mark.parametrize("name", available())
 def test_each_comes_with_its_checksum_and_a_card(name):
-    config = json.loads((WEIGHTS / name / "config.json").read_text())
-    assert config["sha256"] == hashlib.sha256((WEIGHTS / name / "weights.safetensors").read_bytes()).hexdigest()
+    config = json.loads((weights()[name] / "config.json").read_text())
+    assert config["sha256"] == hashlib.sha256((weights()[name] / "weights.safetensors").read_bytes()).hexdigest()
     assert config["training"]["command"].split()[0] in ("denkf", "python")
-    card = (WEIGHTS / name / "card.md").read_text()
+    card = (weights()[name] / "card.md").read_text()
     assert config["training"]["command"] in card
     for heading in ("## Data", "## Training", "## Scores", "## Limits", "## Licence"):
         assert heading in card
@@ -83,7 +81,7 @@ def test_the_same_folder_serves_both_loaders(tmp_path):
 def test_own_builders(tmp_path):
     def still(size):
         eye = torch.eye(size)
-        return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
+        return KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(size), cov=eye)
 
     with pytest.raises(ValueError, match=r"not known what builds this KalmanFilter; pass builder=FUNCTION"):
         save_pretrained(still(2), tmp_path)
@@ -105,7 +103,7 @@ def ball(
         None,
         LearnedObservation(lambda state: gain * state[..., list(seen)]),
         ConstantNoise([std] * len(seen), in_key=key),
-        EnsembleAnalysis(scheme, sensor_key=key),
+        EnsembleAnalysis(scheme, observation_key=key),
         initial=GaussianPrior([0.0, 0.0], [start, 1.0], ensemble_size=members),
         process_noise=0.1,
         variance_ceiling=ceiling,

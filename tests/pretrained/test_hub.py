@@ -5,8 +5,9 @@ from importlib.util import find_spec
 import pytest
 import torch
 
+from torch_denkf.applications.reacher import reacher
 from torch_denkf.filters import KalmanFilter
-from torch_denkf.pretrained import from_pretrained, reacher
+from torch_denkf.pretrained import from_pretrained
 from torch_denkf.pretrained.hub import HubFilter
 
 INSTALLED = find_spec("huggingface_hub") is not None
@@ -14,7 +15,7 @@ INSTALLED = find_spec("huggingface_hub") is not None
 
 def still(size):
     eye = torch.eye(size)
-    return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
+    return KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(size), cov=eye)
 
 
 @pytest.mark.skipif(INSTALLED, reason="huggingface_hub is installed")

@@ -10,10 +10,10 @@ from torch.testing import assert_close
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import directional_check
 from tests.smoothers.joint import drive, joint_beliefs
+from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.functional import enrts_step
+from torch_denkf.functional.smoothing_ensemble import enrts_step
 from torch_denkf.modules import GaussianPrior
-from torch_denkf.odometry import car_filter
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 KINDS = {"EnKS": EnKS, "EnKS 2": partial(EnKS, lag=2), "EnRTS": EnRTS, "EnRTS 2": partial(EnRTS, lag=2)}

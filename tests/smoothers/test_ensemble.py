@@ -16,8 +16,9 @@ from tests.filters.factories import (
 )
 from tests.filters.gaussian_for_tests import directional_check
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
-from torch_denkf.filters import DEnKF, Filter, Gated
-from torch_denkf.functional import enrts_smooth, enrts_step, ensemble_cov
+from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.smoothing_ensemble import enrts_smooth, enrts_step
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -25,6 +26,7 @@ from torch_denkf.modules import (
     LinearObservation,
     LocalEnsembleAnalysis,
 )
+from torch_denkf.monitoring import Gated
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, RTSSmoother
 
 MEMBERS = 10_000
@@ -126,7 +128,7 @@ def test_several_analyses_each_correct_the_past(float64):
     both = linear_denkf("etkf")
 
     def analysis(index, last):
-        keys = {"predicted_key": ("forecast", f"y{index}"), "sensor_key": f"reading{index}"}
+        keys = {"predicted_key": ("forecast", f"y{index}"), "observation_key": f"reading{index}"}
         keys |= {"noise_variance_key": ("sensor", f"noise{index}"), "observed_key": f"observed{index}"}
         keys |= {"forecast_key": ("belief" if last else "forecast", "ensemble")}
         return EnsembleAnalysis("etkf", **keys)
@@ -154,9 +156,9 @@ def test_several_analyses_each_correct_the_past(float64):
 def test_a_local_analysis_of_everything_is_the_global_one(float64):
     R = linear_system()[3]
     frames, filters = drive(2, 6, resets=False), []
-    for analysis in (EnsembleAnalysis("etkf", sensor_key="observation"), None):
+    for analysis in (EnsembleAnalysis("etkf", observation_key="observation"), None):
         if analysis is None:
-            analysis = LocalEnsembleAnalysis(torch.ones(2, 2), sensor_key="observation")
+            analysis = LocalEnsembleAnalysis(torch.ones(2, 2), observation_key="observation")
         plain = linear_denkf("etkf")
         filters.append(
             DEnKF(
@@ -205,7 +207,7 @@ def test_inflation_needs_a_damping(float64, lag):
         None,
         LinearObservation(torch.tensor([[1.0, 0.0], [2.0, 0.0]])),
         linear_denkf("etkf")["noise"],
-        EnsembleAnalysis("etkf", sensor_key="observation"),
+        EnsembleAnalysis("etkf", observation_key="observation"),
         initial=FixedEnsemble(torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])),
     )
     unread = lambda out, key: out[key, "ensemble"][..., 1].std(-1)  # noqa: E731

@@ -6,17 +6,11 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_system
-from tests.filters.test_fused import fused
-from torch_denkf.filters import FusedFilter, FusedSensor, Gated
-from torch_denkf.modules import (
-    GatedAnalysis,
-    GateOptions,
-    GaussianPrior,
-    LearnedTransition,
-    LinearObservation,
-    LinearTransition,
-    MomentPrior,
-)
+from tests.fusion.test_fused import fused
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import GaussianPrior, LearnedTransition, LinearObservation, LinearTransition, MomentPrior
+from torch_denkf.monitoring import Gated, GatedAnalysis
+from torch_denkf.monitoring.gate import GateOptions
 from torch_denkf.smoothers import EnKS, FixedLag
 
 WRONG = (7, 8, 13)
@@ -108,7 +102,7 @@ def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
     torch.manual_seed(0)
     clean = TensorDict({"observation": torch.randn(4, 200, 2)}, [4, 200])
     options = {"response": "huber", "window": 2, "rate": 2e-3, "freedom": 5.0, "patience": 7, "by_component": True}
-    options |= {"adapt_noise": 0.01, "adapt_inflation": 0.02, "gate_key": "door"}
+    options |= {"adapt_noise": 0.01, "adapt_inflation": 0.02, "gate_prefix": "door"}
     assert set(options) == set(GateOptions.__annotations__)
     gated = Gated(linear_denkf(), 2, **options).calibrate([clean], margin=1.5)
     inside = next(module for module in FixedLag(gated, 3).modules() if isinstance(module, GatedAnalysis))

@@ -8,7 +8,8 @@ from torch.testing import assert_close
 from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system, stepwise
 from tests.filters.gaussian_for_tests import directional_check, known_process_noise
 from tests.smoothers.joint import COV, MEAN, drive
-from torch_denkf.functional import analyse, iterated_smoothing
+from torch_denkf.functional import analyse
+from torch_denkf.functional.smoothing_iterated import iterated_smoothing
 from torch_denkf.modules import (
     ConstantNoise,
     GaussianPrior,

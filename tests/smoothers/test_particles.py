@@ -9,7 +9,8 @@ from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
-from torch_denkf.functional import backward_smooth, backward_weights, gaussian_log_prob
+from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.smoothing_particles import backward_smooth, backward_weights
 from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior, LinearObservation, NoisyTransition
 from torch_denkf.smoothers import FixedLag, ParticleSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
@@ -22,7 +23,7 @@ def particles(size, *, control=None, **kwargs):
         NoisyTransition(NoisyLinear(F, control=control), known_process_noise()),
         None,
         LinearObservation(H),
-        GaussianLikelihood(sensor_key="observation"),
+        GaussianLikelihood(observation_key="observation"),
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=size),
         **kwargs,
@@ -121,7 +122,7 @@ def test_what_cannot_be_smoothed_says_so():
         NoisyLinear(F, Q),
         None,
         LinearObservation(H),
-        GaussianLikelihood(sensor_key="observation"),
+        GaussianLikelihood(observation_key="observation"),
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior(MEAN, [1.0, 1.0], ensemble_size=5),
     )

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from tests.filters.factories import linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
 from tests.smoothers.joint import drive, joint_beliefs
-from torch_denkf.functional import rts_smooth
+from torch_denkf.functional.smoothing import rts_smooth
 from torch_denkf.smoothers import FixedLag, RTSSmoother
 
 FILTERS = {"Kalman": linear_kalman, **{name: name for name in ("EKF", "UKF", "BackpropKF")}}

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_denkf.training import checkpoint as module
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 
 @pytest.fixture

@@ -8,7 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
-from torch_denkf.training import Stage, parameters_without, read_checkpoint, train_part
+from torch_denkf.training import Stage
+from torch_denkf.training.checkpoint import read_checkpoint
+from torch_denkf.training.parts import parameters_without, train_part
 
 
 def line_stage(net, updates=150):

@@ -10,7 +10,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tests.training.killed_runs import KILLS
 from tests.training.problem import make_trainer
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint, write_checkpoint
+from torch_denkf.training import FilterTrainer, Stage
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 ROOT = Path(__file__).parents[2]
 

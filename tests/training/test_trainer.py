@@ -14,7 +14,8 @@ from tests.training.problem import make_trainer
 from torch_denkf.filters import EKF, KalmanFilter
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MomentPrior, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
-from torch_denkf.training import FilterTrainer, Stage, read_checkpoint
+from torch_denkf.training import FilterTrainer, Stage
+from torch_denkf.training.checkpoint import read_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.update import Updates, seed_update
 
@@ -183,7 +184,7 @@ def test_the_likelihood_reaches_its_maximum(tmp_path, float64):
 
     best = minimize_scalar(joint, bounds=(0.1, 1.0), method="bounded", options={"xatol": 1e-8})
     one = torch.eye(1)
-    kalman = KalmanFilter(0.3 * one, Q * one, one, R * one, mean=torch.zeros(1), cov=one)
+    kalman = KalmanFilter(0.3 * one, one, process_noise_cov=Q * one, noise_cov=R * one, mean=torch.zeros(1), cov=one)
     del kalman["transition"].matrix
     kalman["transition"].matrix = nn.Parameter(0.3 * one)
     nll = DEnKFLoss(kalman, state=0.0, transition=0.0, sensor=0.0, nll=1.0)

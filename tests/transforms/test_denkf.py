@@ -242,7 +242,7 @@ def test_partial_mask_is_the_filter_of_the_rest(float64):
     start = FixedEnsemble(torch.randn(6, 2))
 
     def make(rows, **kwargs):
-        analysis = EnsembleAnalysis("etkf", sensor_key="observation", **kwargs)
+        analysis = EnsembleAnalysis("etkf", observation_key="observation", **kwargs)
         noise = ConstantNoise(R[rows].sqrt(), in_key="observation")
         return DEnKF(NoisyLinear(F), None, LinearObservation(H[rows]), noise, analysis, initial=start)
 

@@ -20,7 +20,7 @@ FILTERS = {"ensemble": envs.fixed_filter, "Kalman": linear_kalman}
 
 
 def lagged_env(name, **kwargs):
-    env = TransformedEnv(envs.base_env(**kwargs), DEnKFTransform(FILTERS[name](), lag=LAG))
+    env = TransformedEnv(envs.base_env(**kwargs), DEnKFTransform(FixedLag(FILTERS[name](), LAG)))
     return TransformedEnv(env, InitTracker())
 
 
@@ -68,7 +68,7 @@ def test_in_workers_and_in_a_collector():
 
 
 def test_what_is_stored_without_the_ensemble():
-    transform = DEnKFTransform(envs.fixed_filter(), lag=LAG, store_ensemble=False)
+    transform = DEnKFTransform(FixedLag(envs.fixed_filter(), LAG), store_ensemble=False)
     env = TransformedEnv(envs.base_env(batch_size=[2], max_steps=4), transform)
     check_env_specs(env)
     rollout = envs.random_rollout(env)
@@ -76,16 +76,11 @@ def test_what_is_stored_without_the_ensemble():
     assert set(rollout["belief"].keys()) == {"mean", "var"}
 
 
-def test_a_filter_that_cannot_be_smoothed_is_refused():
-    with pytest.raises(TypeError, match="carries a past already"):
-        DEnKFTransform(FixedLag(envs.fixed_filter(), 2), lag=2)
-
-
 def controlled_env(**kwargs):
     """Actions drive the system, and the Kalman filter knows how."""
     F, Q, H, R = linear_system()
     plain = LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), control=CONTROL, missing=0.3, **kwargs)
-    return TransformedEnv(plain, DEnKFTransform(linear_kalman(control=CONTROL), lag=LAG))
+    return TransformedEnv(plain, DEnKFTransform(FixedLag(linear_kalman(control=CONTROL), LAG)))
 
 
 @pytest.mark.parametrize("workers", [0, 2])

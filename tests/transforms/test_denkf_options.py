@@ -296,7 +296,9 @@ def test_a_function_that_writes_an_entry_does_not_declare_it():
 
     def kalman(scale, key):
         options = {"mean": torch.zeros(2), "cov": one, "observation_key": key}
-        return DEnKFTransform(KalmanFilter(0.9 * one, one, scale * one, scale**2 * one, **options))
+        return DEnKFTransform(
+            KalmanFilter(0.9 * one, scale * one, process_noise_cov=one, noise_cov=scale**2 * one, **options)
+        )
 
     for undeclared in (lambda td: td.set("doubled", 2 * td["observation"]), Doubled(declares=False)):
         env = TransformedEnv(envs.base_env(), Compose(undeclared, kalman(2, "doubled")))

@@ -10,9 +10,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
 
-from torch_denkf.data import drive_frames, read_kitti_drive, write_drives
+from torch_denkf.applications.car import KITTIReplayEnv, drive_frames, read_kitti_drive, write_drives
 from torch_denkf.data.cache_entry import CachedTensor
-from torch_denkf.envs import KITTIReplayEnv
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames
 
 ALL = [SaltAndPepper, Blur, Brightness, BlackFrames, OccludingBox]

@@ -22,12 +22,11 @@ _EXTRAS = {
     "plots": (("matplotlib", "PIL"), "pictures"),
     "examples": (("matplotlib", "tensorboard"), "the example programs"),
     "lerobot": (("pyarrow", "av"), "LeRobot recordings"),
-    "viewer": (("rerun",), "beliefs in the viewer rerun"),
     "ray": (("ray",), "collection over machines"),
 }
 _DRAW = """
 import mujoco
-from torch_denkf.simulation.ur5.render import Renderer
+from torch_denkf.applications.ur5.simulation.render import Renderer
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='front'/></worldbody></mujoco>")
 Renderer(model, (8, 8)).close()
 """
@@ -63,7 +62,7 @@ def _opengl() -> str:
 
 
 def _compiler() -> str:
-    from torch_denkf.filters.inductor import need_compiler
+    from torch_denkf.filters._inductor import need_compiler
 
     try:
         need_compiler()

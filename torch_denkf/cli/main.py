@@ -7,21 +7,24 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import torch_denkf
+from torch_denkf import _registered
 
-__all__ = ["main"]
+__all__ = ["commands", "main"]
 
-#: By name: the module whose ``main`` runs it, and what it does.
-COMMANDS = {
-    "info": ("info", "versions, devices, OpenGL, cache, optional extras"),
-    "demo": ("demo", "watch a trained filter follow a car whose camera fails"),
-    "render-kitti": ("render_kitti", "render drives in KITTI's layout"),
-    "train": ("train", "train a car's filter on rendered or recorded drives"),
-    "evaluate": ("evaluate", "errors of a trained filter on drives with known poses"),
-    "odometry": ("odometry", "the path of a car from its camera's images or video"),
-    "plot": ("plot", "draw a path and its uncertainty"),
-    "cache": ("cache", "list, check or clear what is kept of earlier runs"),
-    "collect-ur5": ("collect_ur5", "collect demonstrations of the UR5 table"),
+_OWN = {
+    "info": ("torch_denkf.cli.info", "versions, devices, OpenGL, cache, optional extras"),
+    "cache": ("torch_denkf.cli.cache", "list, check or clear what is kept of earlier runs"),
 }
+
+
+def commands() -> dict[str, tuple[str, str]]:
+    """By name: the module whose ``main`` runs a command, and what it does; applications register theirs.
+
+    Example:
+        >>> sorted(commands())[:2]
+        ['cache', 'collect-ur5']
+    """
+    return {**_OWN, **_registered.commands()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,20 +42,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         usage: denkf COMMAND ...
         ...
     """
+    known = commands()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        lines = [f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items()]
+        lines = [f"  {name:<14}{text}" for name, (_, text) in known.items()]
         end = "denkf COMMAND --help says more. For example: denkf demo --out runs/demo"
         sys.stdout.write("\n".join(["usage: denkf COMMAND ...", "", *lines, "", end, ""]))
         return 0
     if words[0] == "--version":
         sys.stdout.write(f"denkf {torch_denkf.__version__}\n")
         return 0
-    if words[0] not in COMMANDS:
-        sys.stderr.write(f"error: unknown command {words[0]!r}; there are {', '.join(COMMANDS)}\n")
+    if words[0] not in known:
+        sys.stderr.write(f"error: unknown command {words[0]!r}; there are {', '.join(known)}\n")
         return 2
     try:
-        command = import_module(f"torch_denkf.cli.{COMMANDS[words[0]][0]}")
+        command = import_module(known[words[0]][0])
     except KeyboardInterrupt:
         return 130
     return command.main(words[1:])

@@ -4,4 +4,3 @@ import lazy_loader
 
 # __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__ = [name for name in __all__ if name != "LeRobotExperienceReplay"]  # a former name, which warns

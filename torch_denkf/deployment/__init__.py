@@ -3,9 +3,12 @@
 :func:`load_step` needs torch alone. :func:`export_step`, which needs all of torch_denkf, is imported when it is used.
 """
 
-from torch_denkf.deployment.package import PackagedStep, load_step
+from torch_denkf.deployment.package import load_step
 
-__all__ = ["PackagedStep", "export_step", "load_step"]
+__all__ = [
+    "export_step",
+    "load_step",
+]
 
 
 def __getattr__(name: str):

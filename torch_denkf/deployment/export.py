@@ -15,8 +15,8 @@ from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
 from torch_denkf.filters._compared import refuse_other_numbers
+from torch_denkf.filters._inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.filters._rejection import REJECTED
-from torch_denkf.filters.inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.modules._call import Entries
 
 
@@ -80,7 +80,7 @@ def export_step(
         >>> from torch_denkf.deployment import export_step, load_step
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
-        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+        >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
         >>> folder = tempfile.TemporaryDirectory()
         >>> frame = TensorDict({"observation": torch.ones(1)})
         >>> step = load_step(export_step(kf, frame, f"{folder.name}/kf.pt2", compiled=False))

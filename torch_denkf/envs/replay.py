@@ -59,7 +59,8 @@ class ReplayEnv(RowsEnv):
     :class:`~torch_denkf.transforms.DEnKFTransform` reads the ``action`` that the policy wrote, so with this policy it
     is driven by the recorded commands. With another policy it believes in motions that never happened.
 
-    Where nothing was commanded, the action has **width zero**, see :class:`~torch_denkf.envs.KITTIReplayEnv`.
+    Where nothing was commanded, the action has **width zero**, see
+    :class:`~torch_denkf.applications.car.KITTIReplayEnv`.
 
     Args:
         data: a data set, such as :class:`~torch_denkf.data.RecordingReplay`.

@@ -1,17 +1,12 @@
 """Filters: compositions of sub-models on one base."""
 
-from torch_denkf.filters._gaussian import GaussianOptions
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.bkf import BackpropKF
 from torch_denkf.filters.denkf import DEnKF
 from torch_denkf.filters.ekf import EKF
-from torch_denkf.filters.fused import FusedFilter
-from torch_denkf.filters.fused_sensor import FusedSensor
 from torch_denkf.filters.kalman import KalmanFilter
-from torch_denkf.filters.monitored import Gated, Monitored
 from torch_denkf.filters.particle import DPF, PFM, MixtureParticleFilter, ParticleFilter
 from torch_denkf.filters.recurrent import LSTMFilter
-from torch_denkf.filters.refiltering import Refiltering, RefilteringWindow
 from torch_denkf.filters.ukf import UKF
 
 __all__ = [
@@ -26,11 +21,4 @@ __all__ = [
     "MixtureParticleFilter",
     "PFM",
     "LSTMFilter",
-    "FusedFilter",
-    "FusedSensor",
-    "GaussianOptions",
-    "Gated",
-    "Monitored",
-    "Refiltering",
-    "RefilteringWindow",
 ]

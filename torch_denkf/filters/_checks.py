@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torch_denkf._checks import has_values
+from torch_denkf._checks import flag_value, has_values
 from torch_denkf.filters._rejection import LARGEST_READING, rejected_keys
+from torch_denkf.filters._steps import where_rows
 from torch_denkf.filters._structure import Structure, previous_key, submodels
 from torch_denkf.modules._call import Entries
 from torch_denkf.modules._running import random_parts
@@ -80,9 +81,8 @@ def check_inputs(
         )
 
 
-def refuse_unguarded(filter: Filter) -> None:
+def refuse_unguarded(structure: Structure, name: str) -> None:
     """Raises a ``ValueError`` where readings are to be rejected, and one cannot be hidden."""
-    structure, name = filter.structure, type(filter).__name__
     for place, module in structure.unmasked:
         raise ValueError(
             f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads "
@@ -99,7 +99,9 @@ def refuse_unguarded(filter: Filter) -> None:
             )
 
 
-def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, reject: bool) -> None:
+def refuse_non_finite(
+    structure: Structure, entries: Entries, written: Entries, reject: bool, unread: Tensor | None = None
+) -> None:
     """Raises a ``ValueError`` where a reading or the new belief is not finite; the message names the input that is not.
 
     Args:
@@ -107,10 +109,16 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
         entries: what the step read.
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
+        unread: rows ``[*B]`` or ``[*B, 1]`` whose readings were not used.
     """
+    sound = [_is_sound(key, of[key]) for of in (entries, written) for key in structure.carry if key in of]
+    if None in sound:
+        return
+    absurd = [] if reject else rejected_keys(structure.guards, _without_rows(structure, entries, unread))
+    if all(sound) and not absurd:
+        return
     refuse_far_belief(entries, structure.carry)
     finite = all(is_finite(key, written[key]) for key in structure.carry if key in written)
-    absurd = [] if reject else rejected_keys(structure.guards, entries)
     if finite and not absurd and all(is_finite(key, entries[key]) for key in structure.carry if key in entries):
         return
     given = {key: value for key, value in entries.items() if value.is_floating_point()}
@@ -125,9 +133,29 @@ def refuse_non_finite(structure: Structure, entries: Entries, written: Entries, 
     state = "to be trusted" if finite else "finite"
     raise ValueError(
         f"The new belief is not {state}, because of {why}. The tensordict was left as it is. Hide what is broken or "
-        f"missing with a mask ({list(structure.optional)}), or leave it out with step(..., without=[...]) or "
+        f"missing with a mask ({masks_in(structure.optional)}), or leave it out with step(..., without=[...]) or "
         "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
     )
+
+
+def masks_in(optional: Iterable[NestedKey]) -> list[NestedKey]:
+    """Of what a filter may read, all but the weights of particles."""
+    return [key for key in optional if key[-1] != "log_weight"]
+
+
+def _is_sound(key: NestedKey, value: Tensor) -> bool | None:
+    """Whether an entry of a belief is finite and not far, at once; ``None`` where it has no values, as in vmap."""
+    if not value.is_floating_point():
+        return True
+    return flag_value(((value if key[-1] == "log_weight" else value.abs()) <= LARGEST_READING).all())
+
+
+def _without_rows(structure: Structure, entries: Entries, rows: Tensor | None) -> Entries:
+    """The entries, with zeros in place of the readings of some rows."""
+    if rows is None:
+        return entries
+    keys = {key for guard in structure.guards for key in (*guard.whole, *guard.components) if key in entries}
+    return {**entries, **{key: where_rows(rows, torch.zeros_like(entries[key]), entries[key]) for key in keys}}
 
 
 def refuse_far_belief(entries: Mapping[NestedKey, Tensor], keys: Collection[NestedKey]) -> None:

@@ -27,6 +27,7 @@ def refuse_other_numbers(
     outputs: Sequence[NestedKey],
     frames: Collection[NestedKey],
     parameters: Mapping[str, Tensor] | None = None,
+    state: Iterable[Tensor] = (),
     what: str,
     cure: str,
 ) -> None:
@@ -51,6 +52,7 @@ def refuse_other_numbers(
         frames: names of inputs that may be any number: readings, actions, masks.
         parameters: by name; if given, the gradient of the outputs, in one direction, by these and by the frames is
             compared, too. Where there is no backward pass yet, one is compiled.
+        state: buffers that the function may change, such as running means; they are as they were after each run.
         what: was compiled, for the message.
         cure: what to do, for the message.
 
@@ -68,8 +70,13 @@ def refuse_other_numbers(
         labels += [f"gradient by {name!r}" for name in [names[index] for index in by]]
         labels += [f"gradient by the parameter {name}" for name in trained]
 
+    kept = [(value, value.detach().clone()) for value in state]
+
     def run(function: Callable, values: Sequence[Tensor], seed: int = 0) -> list[Tensor]:
-        return _results(function, inputs, values, by, list(trained.values()), seed)
+        try:
+            return _results(function, inputs, values, by, list(trained.values()), seed)
+        finally:
+            _put_back(kept)
 
     same = all(one is other for one, other in zip(given, telling, strict=True))
     finite = all(bool(value.isfinite().all()) for value in given)  # of NaN times zero a compiler may make zero
@@ -94,6 +101,14 @@ def refuse_other_numbers(
                 f"{float(allowed[worst].max()):.1g}. That is an error of torch's compiler (torch {torch.__version__}), "
                 f"and nothing is returned. {cure}"
             )
+
+
+def _put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
+    """Gives tensors their values back; those that have not changed are not written, as a graph may hold them."""
+    with torch.no_grad():
+        for value, before in kept:
+            if not torch.equal(value, before):
+                value.copy_(before)
 
 
 def tensors(value: Any) -> Iterator[Tensor]:

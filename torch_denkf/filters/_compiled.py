@@ -32,14 +32,14 @@ class CompiledSteps:
 
     Args:
         chunk: steps of a sequence in one graph.
-        options: of ``torch.compile``; on a processor, if there are none, the passes of ``filters.inductor``.
+        options: of ``torch.compile``; on a processor, if there are none, the passes of ``filters._inductor``.
     """
 
     def __init__(self, chunk: int, options: Mapping[str, Any]):
         if chunk < 0:
             raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
         if options.get("backend", "inductor") == "inductor":
-            from torch_denkf.filters.inductor import need_compiler
+            from torch_denkf.filters._inductor import need_compiler
 
             need_compiler()
         self.chunk, self.options = chunk, dict(options)
@@ -113,7 +113,7 @@ class CompiledSteps:
         kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
-                from torch_denkf.filters.inductor import clear_damaged_libraries
+                from torch_denkf.filters._inductor import clear_damaged_libraries
 
                 clear_damaged_libraries()
             function = make()
@@ -134,6 +134,7 @@ class CompiledSteps:
                 frames=_frames(steps, names),
                 # Who records gradients of single steps seldom wants them; a backward pass takes as long to compile.
                 parameters=None if kind[0] == "step" else _parameters(steps),
+                state=[value for _, module in steps.structure.modules for value in module.buffers()],
                 what=kind[0] if kind[0] == "step" else "sequence",
                 cure='Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
                 "filter.compile(chunk=0); and please report the filter.",
@@ -152,7 +153,7 @@ class CompiledSteps:
     def _arguments(self, device: torch.device) -> dict[str, Any]:
         if self.options or device.type != "cpu":
             return self.options
-        from torch_denkf.filters.inductor import options_for_processors  # importing inductor takes half a second
+        from torch_denkf.filters._inductor import options_for_processors  # importing inductor takes half a second
 
         return {"options": options_for_processors()}
 

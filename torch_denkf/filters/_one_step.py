@@ -104,7 +104,8 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
         written.update(steps.advance(entries, call, reset, start))
         blank(steps, written, reset)
     if filter.check_finite and not torch.compiler.is_compiling():
-        refuse_non_finite(structure, entries, written, filter.reject)
+        unread = None if filter.update_at_reset else reset
+        refuse_non_finite(structure, entries, written, filter.reject, unread)
     some = written[structure.carry[0]]
     following = {("next", *previous_key(key)): written[key] for key in structure.carry}
     following["next", *KNOWN] = torch.ones(*tensordict.batch_size, 1, dtype=torch.bool, device=some.device)

@@ -215,7 +215,7 @@ def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Se
             f"The reading {key!r} is {list(value.shape)}, and the batch is {list(batch_size)}: {value.ndim - size - 1} "
             "dimension(s) too many. Readings of several robots need a belief for each: filter a tensordict whose batch "
             "holds the robots, such as tensordict['agents'] of a group. Readings of one robot: put them side by side, "
-            "with flatten(-2)."
+            "with flatten(-2). Samples of one reading: under a key whose last name is 'ensemble'."
         )
 
 

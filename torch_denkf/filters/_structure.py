@@ -204,8 +204,11 @@ def _sorted(
             on_action.update(writes(module))
         else:
             frames.append((place, module))
-    if not steps:
-        raise ValueError(f"No module forecasts {list(carry)}: each that reads the belief writes over it.")
+    if not steps:  # the first that reads the belief forecasts it, and writes over it
+        first = next(
+            index for index, (_, module) in enumerate(driven) if not {*carry}.isdisjoint(chain(*reads(module)))
+        )
+        steps.append(driven.pop(first))
     made = {key: place for place, module in driven for key in writes(module) if key not in carry}
     for key in chain(*reads(steps[0][1])):
         if key in made:
@@ -362,7 +365,7 @@ def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[P
 def _refuse_overwriting(modules: Sequence[Placed]) -> None:
     """Raises where all that a module writes is written again before anybody has read it."""
     for index, (place, module) in enumerate(modules):
-        info = getattr(module, "info_key", None)
+        info = getattr(module, "info_prefix", None)
         unread = {key for key in writes(module) if info is None or key[0] != info}
         used = False
         for other_place, other in modules[index + 1 :]:
@@ -373,7 +376,7 @@ def _refuse_overwriting(modules: Sequence[Placed]) -> None:
                 raise ValueError(
                     f"{other_place!r} ({type(other).__name__}) writes {sorted(map(str, lost))} over what {place!r} "
                     f"({type(module).__name__}) wrote, before any module has read it. Give one of them other keys, "
-                    "e.g. out_key=, or belief_key= of the first analysis and forecast_key= of the second."
+                    "e.g. out_key=, or belief_prefix= of the first analysis and forecast_key= of the second."
                 )
 
 
@@ -392,7 +395,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):
-            info = getattr(part, "info_key", None)
+            info = getattr(part, "info_prefix", None)
             if info is not None:
                 writers.setdefault(info, []).append((place, part))
     own_info: dict[str, dict[NestedKey, NestedKey]] = {}
@@ -404,7 +407,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
         if inside:
             raise ValueError(
                 f"Several analyses write their diagnostics under {info!r}, and in the sequence {inside[0]!r} they "
-                "would be overwritten: give each its own info_key."
+                "would be overwritten: give each its own info_prefix."
             )
         for place, module in placed:
             keys = [key for key in writes(module) if key[0] == info]
@@ -421,6 +424,6 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     for place, module in steps:
         for part in in_sequences(module):
             for key in writes(part):
-                if key[0] == getattr(part, "info_key", None) and key[-1] == "log_likelihood":
+                if key[0] == getattr(part, "info_prefix", None) and key[-1] == "log_likelihood":
                     found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDictBase
 
 from torch_denkf.filters._entries import own, write
-from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var, weighted_mean, weighted_var
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 

@@ -92,7 +92,7 @@ class Filter(Checked, TensorDictSequential):
         >>> from torch_denkf.filters import KalmanFilter
         >>> from tensordict import TensorDict
         >>> one = torch.eye(1)
-        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one)
+        >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
         >>> kf.carry_keys
         [('belief', 'mean'), ('belief', 'cov')]
         >>> drives = TensorDict({"observation": torch.ones(4, 10, 1)}, [4, 10])
@@ -153,7 +153,7 @@ class Filter(Checked, TensorDictSequential):
         self.out_keys = [self.outer(key) for key in written]
         self._all_keys = list(dict.fromkeys([*structure.in_keys(self.init_key), *chain(*reads(self.initial))]))
         if self.reject:
-            refuse_unguarded(self)
+            refuse_unguarded(structure, type(self).__name__)
         self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
 
     @property

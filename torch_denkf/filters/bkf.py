@@ -26,13 +26,13 @@ class BackpropKF(GaussianFilter):
 
     Args:
         transition: A, ``[S, S]``.
-        process_noise: Q, ``[S, S]``, or a module that writes it, e.g.
-            :class:`~torch_denkf.modules.CholeskyNoise`.
         sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is :math:`z_t`; ``None`` where it is in
             the tensordict, under ``observation_key``.
         observation: C, ``[O, S]``.
         noise: writes R: variances (:class:`~torch_denkf.modules.DiagonalNoise`) or a covariance
             (:class:`~torch_denkf.modules.CholeskyNoise`), usually from the sensor's encoding.
+        process_noise_cov: Q, ``[S, S]``, or a module that writes it, e.g.
+            :class:`~torch_denkf.modules.CholeskyNoise`.
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
@@ -50,7 +50,7 @@ class BackpropKF(GaussianFilter):
         >>> sensor = VectorSensor(4, 2, ensemble_size=1, layer="none", in_key="features")
         >>> r = CholeskyNoise(2, constant=False, in_features=4, in_key="features", out_key=("sensor", "noise"))
         >>> prior = MomentPrior(torch.zeros(2), torch.eye(2))
-        >>> bkf = BackpropKF(torch.eye(2), 0.1 * torch.eye(2), sensor, torch.eye(2), r, initial=prior)
+        >>> bkf = BackpropKF(torch.eye(2), sensor, torch.eye(2), r, process_noise_cov=0.1 * torch.eye(2), initial=prior)
         >>> bkf.sequence(TensorDict({"features": torch.randn(3, 5, 4)}, [3, 5]))["belief", "mean"].shape
         torch.Size([3, 5, 2])
     """
@@ -58,11 +58,11 @@ class BackpropKF(GaussianFilter):
     def __init__(
         self,
         transition: torch.Tensor,
-        process_noise: torch.Tensor | TensorDictModuleBase,
         sensor: TensorDictModuleBase | None,
         observation: torch.Tensor,
         noise: TensorDictModuleBase,
         *,
+        process_noise_cov: torch.Tensor | TensorDictModuleBase,
         initial: TensorDictModuleBase,
         control: torch.Tensor | None = None,
         trainable: bool = False,
@@ -74,12 +74,12 @@ class BackpropKF(GaussianFilter):
         check_one_dtype(transition=a, observation=c)
         check_values("transition", a)
         check_values("observation", c)
-        if not isinstance(process_noise, nn.Module):
-            check_covariance("process_noise", as_floating(process_noise, "process_noise"), len(a))
+        if not isinstance(process_noise_cov, nn.Module):
+            check_covariance("process_noise_cov", as_floating(process_noise_cov, "process_noise_cov"), len(a))
         action: dict[str, Any] = {}
         if control is not None:
             action = {"control": control, "action_key": options.get("control_keys", ("action",))[0]}
-        forecast = LinearTransition(transition, process_noise, trainable=trainable, **action)
+        forecast = LinearTransition(transition, process_noise_cov, trainable=trainable, **action)
         super().__init__(
             sensor, noise, forecast, partial(KalmanAnalysis, observation, None), initial=initial, **options
         )

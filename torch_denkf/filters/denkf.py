@@ -107,7 +107,7 @@ class DEnKF(Filter):
                 *_, last = in_sequences(sensor)
                 reading = writes(last)[0]
             mask = "observed" if observed_key is None else observed_key
-            keys = {"sensor_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
+            keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)

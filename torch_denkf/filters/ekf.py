@@ -25,12 +25,12 @@ class EKF(GaussianFilter):
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
-        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
-            :mod:`torch_denkf.modules.process_noise`.
         sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
             reading is in the tensordict, under ``observation_key``.
         observation: observes ensembles, writes ``("forecast", "observation")``.
         noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
+            :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
@@ -43,14 +43,15 @@ class EKF(GaussianFilter):
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.modules import ConstantNoise, GaussianAround, Select, UnicycleNoise, UnicycleTransition
+        >>> from torch_denkf.modules import ConstantNoise, GaussianAround, Select
+        >>> from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
         >>> q = ConstantNoise([0.5, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
         >>> ekf = EKF(
         ...     UnicycleTransition(torch.zeros_like, dt=0.1),
-        ...     UnicycleNoise(q, dt=0.1),
         ...     None,
         ...     Select([3, 4]),
         ...     ConstantNoise([0.3, 0.05], in_key="reading"),
+        ...     process_noise=UnicycleNoise(q, dt=0.1),
         ...     initial=GaussianAround([0.0, 0.0, 0.0, 1.0, 0.1]),
         ...     observation_key="reading",
         ... )
@@ -62,11 +63,11 @@ class EKF(GaussianFilter):
     def __init__(
         self,
         transition: TensorDictModuleBase,
-        process_noise: TensorDictModuleBase | Sequence[float] | float,
         sensor: TensorDictModuleBase | None,
         observation: TensorDictModuleBase,
         noise: TensorDictModuleBase,
         *,
+        process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
         stop_jacobian_gradient: bool = False,
         **options: Unpack[GaussianOptions],

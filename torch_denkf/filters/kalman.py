@@ -26,9 +26,11 @@ class KalmanFilter(Filter):
 
     Args:
         transition: F, ``[S, S]``.
-        transition_noise: Q, ``[S, S]``.
         observation: H, ``[O, S]``.
-        observation_noise: R, ``[O]`` variances or ``[O, O]``.
+        process_noise: standard deviations of the process noise ``[S]``, in the state's units; or ``process_noise_cov``.
+        process_noise_cov: Q, ``[S, S]``.
+        noise: standard deviations of the readings ``[O]``, in their units; or ``noise_cov``.
+        noise_cov: R, ``[O, O]``.
         mean: of the initial belief, ``[S]``.
         cov: of the initial belief, ``[S, S]``.
         control: B, ``[S, A]``, of the action; ``None`` for none.
@@ -39,12 +41,13 @@ class KalmanFilter(Filter):
             ``update_at_reset``, ``variance_ceiling``, ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
-        ValueError: if the shapes do not fit, a number is not finite, or Q, R or ``cov`` is no covariance.
+        ValueError: if the shapes do not fit, a number is not finite, Q, R or ``cov`` is no covariance, or one noise is
+            given twice or not at all.
 
     Example:
         >>> from tensordict import TensorDict
         >>> one = torch.eye(1)
-        >>> kf = KalmanFilter(one, 0 * one, one, one, mean=torch.zeros(1), cov=one)
+        >>> kf = KalmanFilter(one, one, process_noise=[0.0], noise=[1.0], mean=torch.zeros(1), cov=one)
         >>> td = kf.initialise(TensorDict({"observation": torch.ones(1)}))
         >>> kf.step(td)["belief", "mean"]
         tensor([0.5000])
@@ -53,10 +56,12 @@ class KalmanFilter(Filter):
     def __init__(
         self,
         transition: torch.Tensor,
-        transition_noise: torch.Tensor,
         observation: torch.Tensor,
-        observation_noise: torch.Tensor,
         *,
+        process_noise: Sequence[float] | torch.Tensor | None = None,
+        process_noise_cov: torch.Tensor | None = None,
+        noise: Sequence[float] | torch.Tensor | None = None,
+        noise_cov: torch.Tensor | None = None,
         mean: torch.Tensor,
         cov: torch.Tensor,
         control: torch.Tensor | None = None,
@@ -65,24 +70,22 @@ class KalmanFilter(Filter):
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
     ):
-        given = {"transition": transition, "transition_noise": transition_noise, "observation": observation}
-        given |= {"observation_noise": observation_noise, "mean": mean, "cov": cov}
+        given: dict[str, Any] = {"transition": transition, "observation": observation, "mean": mean, "cov": cov}
+        noises: dict[str, Any] = {"process_noise": process_noise, "process_noise_cov": process_noise_cov}
+        noises |= {"noise": noise, "noise_cov": noise_cov}
+        given |= {name: value for name, value in noises.items() if value is not None}
         constants = {name: as_floating(value, name) for name, value in given.items()}
         check_one_dtype(**constants)
-        f, q, h, r, m, p = constants.values()
+        f, h, m, p = (constants[name] for name in ("transition", "observation", "mean", "cov"))
         check_square("transition", f)
         size, readings = len(f), len(h) if h.ndim else 0
         check_shape("observation", h, (readings, size), "[O, S]")
         check_shape("mean", m, (size,), "[S]")
         for name, value in {"transition": f, "observation": h, "mean": m}.items():
             check_values(name, value)
-        check_covariance("transition_noise", q, size)
         check_covariance("cov", p, size)
-        if r.ndim == 2:
-            check_covariance("observation_noise", r, readings, "[O] or [O, O]")
-        else:
-            check_shape("observation_noise", r, (readings,), "[O]")
-            check_values("observation_noise", r, least=0, cure="These are variances")
+        q = _covariance("process_noise", constants, size, "[S]")
+        r = _covariance("noise", constants, readings, "[O]")
         if control is not None:
             b = as_floating(control, "control")
             check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
@@ -92,13 +95,26 @@ class KalmanFilter(Filter):
         if control is not None:
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(
-            transition=LinearTransition(transition, transition_noise, **action),
+            transition=LinearTransition(transition, q.diag() if q.ndim == 1 else q, **action),
             analysis=KalmanAnalysis(
                 observation,
-                observation_noise,
+                r,
                 observation_key=observation_key,
                 observed_key=observed_key,
                 angles=angles,
             ),
         )
         super().__init__(modules, initial=MomentPrior(mean, cov), **kwargs)
+
+
+def _covariance(name: str, given: dict[str, torch.Tensor], size: int, shape: str) -> torch.Tensor:
+    """Variances of standard deviations ``name``, or the covariance ``name_cov``."""
+    if (name in given) == (f"{name}_cov" in given):
+        raise ValueError(f"Give {name}, standard deviations {shape}, or {name}_cov, a matrix, and not both.")
+    if name not in given:
+        check_covariance(f"{name}_cov", given[f"{name}_cov"], size)
+        return given[f"{name}_cov"]
+    std = given[name]
+    check_shape(name, std, (size,), shape)
+    check_values(name, std, least=0, cure="These are standard deviations")
+    return std.square()

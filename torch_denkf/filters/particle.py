@@ -11,16 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
-from torch_denkf.modules import (
-    GaussianLikelihood,
-    NoisyTransition,
-    ParticleAnalysis,
-    ResampledTransition,
-    SubModel,
-    WithWeights,
-    as_process_noise,
-)
+from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
 from torch_denkf.modules._running import check_module
+from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -40,11 +33,12 @@ class ParticleFilter(Filter):
             ``observation_key``, or where ``likelihood`` says.
         observation: writes the predicted observations ``("forecast", "observation")``.
         likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
-        analysis: the update, :class:`~torch_denkf.modules.ParticleAnalysis` by default. With a Gaussian likelihood that
-            writes ``("info", "innovation")`` and ``("info", "nis")``, too.
+        analysis: the update, :class:`~torch_denkf.modules.particles.ParticleAnalysis` by default. With a Gaussian
+            likelihood that writes ``("info", "innovation")`` and ``("info", "nis")``, too.
         noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
         resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
-            :class:`~torch_denkf.modules.ResampledTransition`; a transition that is one already is left as it is.
+            :class:`~torch_denkf.modules.particles.ResampledTransition`; a transition that is one already is left as it
+        is.
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
@@ -119,11 +113,12 @@ class ParticleFilter(Filter):
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
             reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
             keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
-            likelihood = GaussianLikelihood(angles=angles, sensor_key=reading, observed_key=observed_key, **keys)
+            likelihood = GaussianLikelihood(angles=angles, observation_key=reading, observed_key=observed_key, **keys)
         elif angles or observation_key is not None:
             raise ValueError(
                 "angles and observation_key are for the default likelihood; give them to yours instead, the key as "
-                "sensor_key= of a GaussianLikelihood, or as encoding_key= or reading_key= of a LearnedLikelihood."
+                "observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
+                "LearnedLikelihood."
             )
         if analysis is None:
             analysis = ParticleAnalysis(likelihood if isinstance(likelihood, GaussianLikelihood) else None)
@@ -138,7 +133,7 @@ class ParticleFilter(Filter):
                 observed_key=observed_key,
             )
         if unravel_key(transition.in_keys[1]) not in map(unravel_key, initial.out_keys):
-            initial = WithWeights(initial, ensemble_key=transition.in_keys[0], log_weight_key=transition.in_keys[1])
+            initial = with_weights(initial, ensemble_key=transition.in_keys[0], log_weight_key=transition.in_keys[1])
         modules = OrderedDict(
             sensor=sensor,
             noise=noise,
@@ -168,7 +163,8 @@ class DPF(ParticleFilter):
         motion_noise: learned variances of some dimensions of the state, see
             :class:`~torch_denkf.modules.NoisyTransition`; ``None`` where ``transition`` is random already.
         noisy_dims: those dimensions. The noise is added before the motion; to have it after, or inside of a
-            :class:`~torch_denkf.modules.ClonedTransition`, give a ``transition`` with noise instead.
+            :class:`~torch_denkf.applications.car.modules.pairs.ClonedTransition`, give a ``transition`` with noise
+        instead.
         initial: the initial belief.
         **kwargs: of :class:`ParticleFilter`.
 
@@ -178,7 +174,8 @@ class DPF(ParticleFilter):
 
     Example:
         >>> import torch
-        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, Select, UnicycleTransition
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, LearnedLikelihood, Select
+        >>> from torch_denkf.applications.car import UnicycleTransition
         >>> from torch_denkf.modules import VectorSensor
         >>> dpf = DPF(
         ...     UnicycleTransition(torch.nn.Linear(2, 2), dt=0.1),
@@ -236,7 +233,8 @@ class MixtureParticleFilter(ParticleFilter):
 
     Example:
         >>> import torch
-        >>> from torch_denkf.modules import AroundState, DiagonalNoise, Select, UnicycleTransition, VectorSensor
+        >>> from torch_denkf.modules import AroundState, DiagonalNoise, Select, VectorSensor
+        >>> from torch_denkf.applications.car import UnicycleTransition
         >>> from torch_denkf.modules import StochasticMLP
         >>> pf = MixtureParticleFilter(
         ...     UnicycleTransition(StochasticMLP(2, 2), dt=0.1),

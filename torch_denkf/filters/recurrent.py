@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters._gaussian import refuse_other_beliefs
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.kalman import MomentPrior
-from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, UnicyclePose, WithMemory
+from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, with_memory
 
 __all__ = ["LSTMFilter"]
 
@@ -21,7 +22,7 @@ __all__ = ["LSTMFilter"]
 class LSTMFilter(Filter):
     """A recurrent network that reads what a filter's sensor wrote and believes a Gaussian.
 
-    Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")`` (diagonal unless ``dt`` is given) and
+    Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")`` (diagonal unless ``motion`` is given) and
     ``("belief", "var")``, and its memory ``("belief", "hidden")`` and ``("belief", "cell")`` ``[*B, num_layers,
     hidden_size]``; resets, steps, sequences, masks and primer are those of every filter. Train it with
     :class:`~torch_denkf.objectives.GaussianLoss` and ``transition=0``: it has no forecast, and no innovation.
@@ -31,28 +32,28 @@ class LSTMFilter(Filter):
             sensor as that of the filter it is compared with makes the comparison fair.
         features: size of the encoding at ``encoding_key``; 0 where the LSTM does not read it.
         state_dim: S.
-        dt: time step in s, for a vehicle [x m, y m, theta rad, v m/s, theta_dot rad/s]: the LSTM estimates the two
-            velocities, and the pose follows by the known motion (:class:`~torch_denkf.modules.UnicyclePose`).
+        motion: a module that writes the belief from the last one, under ``"forecast"``, and the velocities that the
+            LSTM estimates, ``("velocity", "mean")`` and ``("velocity", "cov")``; it has ``velocity_dim``, their
+            number. Such is :class:`~torch_denkf.applications.car.modules.unicycle_pose.UnicyclePose` for a car.
             ``None``: the LSTM estimates the whole state.
         initial: the belief at reset, a mean and a covariance, e.g. :class:`~torch_denkf.modules.GaussianAround`; by
-            default ``N(loc, scale²)``, which a vehicle does not have.
-        loc: mean of what the LSTM estimates, ``[S]``, or ``[2]`` with ``dt``; zero by default.
+            default ``N(loc, scale²)``, which is no state where ``motion`` is given.
+        loc: mean of what the LSTM estimates, ``[S]``, or one number a velocity with ``motion``; zero by default.
         scale: its standard deviation; one by default.
         hidden_size: of each layer.
         num_layers: of cells.
         observation_dim: O, where the LSTM reads ``observation_key``.
-        encoding_key: see :class:`~torch_denkf.modules.LSTMUpdate`.
+        encoding_key: see :class:`~torch_denkf.modules.recurrent.LSTMUpdate`.
         observation_key: likewise; read where ``observation_dim`` is given.
         control_keys: see :class:`Filter`; give the action's key in ``extra_keys``, too.
         init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`; not with ``dt``, as there is no motion into the first frame.
-        **kwargs: passed on to :class:`~torch_denkf.modules.LSTMUpdate`: ``extra_keys`` and ``extra_features``,
-            ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and ``variance_ceiling``,
-            ``check_finite`` and ``reject`` of :class:`Filter`.
+        update_at_reset: see :class:`Filter`; not with ``motion``: nothing moves into the first frame.
+        **kwargs: passed on to :class:`~torch_denkf.modules.recurrent.LSTMUpdate`: ``extra_keys`` and
+            ``extra_features``, ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and
+            ``variance_ceiling``, ``check_finite`` and ``reject`` of :class:`Filter`.
 
     Raises:
-        ValueError: if a vehicle's state does not have five dimensions, or it lacks ``initial``, or has
-            ``update_at_reset``.
+        ValueError: if there is a ``motion`` and no ``initial``, or ``update_at_reset``.
 
     Reference:
         The LSTM baselines of Haarnoja et al. 2016, arXiv:1605.07148, and Kloss, Martius & Bohg 2021,
@@ -71,7 +72,7 @@ class LSTMFilter(Filter):
         *,
         features: int = 0,
         state_dim: int,
-        dt: float | None = None,
+        motion: SubModel | None = None,
         initial: TensorDictModuleBase | None = None,
         loc: Sequence[float] | torch.Tensor | None = None,
         scale: Sequence[float] | torch.Tensor | None = None,
@@ -85,16 +86,15 @@ class LSTMFilter(Filter):
         update_at_reset: bool = False,
         **kwargs,
     ):
-        vehicle = dt is not None
-        if vehicle and (state_dim != 5 or initial is None or update_at_reset):
+        if motion is not None and (initial is None or update_at_reset):
             raise ValueError(
-                "With dt the state is [x, y, theta, v, theta_dot], known at reset and not updated there: give "
-                f"state_dim=5 and initial=GaussianAround(...), and not update_at_reset; got state_dim={state_dim}, "
-                f"initial={initial}, update_at_reset={update_at_reset}."
+                "With motion= the state is known at reset and not updated there: give initial=, such as "
+                f"GaussianAround(...), and not update_at_reset; got initial={initial}, "
+                f"update_at_reset={update_at_reset}."
             )
         options = {name: kwargs.pop(name) for name in FilterOptions.__annotations__ if name in kwargs}
         update = LSTMUpdate(
-            2 if vehicle else state_dim,
+            state_dim if motion is None else motion.velocity_dim,
             features=features,
             observation_dim=observation_dim,
             hidden_size=hidden_size,
@@ -103,7 +103,7 @@ class LSTMFilter(Filter):
             scale=scale,
             encoding_key=encoding_key if features else None,
             observation_key=observation_key if observation_dim else None,
-            belief_key="velocity" if vehicle else "belief",
+            belief_prefix="belief" if motion is None else "velocity",
             **kwargs,
         )
         if initial is None:
@@ -111,11 +111,11 @@ class LSTMFilter(Filter):
         refuse_other_beliefs(type(self).__name__, initial, [("belief", "mean"), ("belief", "cov")])
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(transition=LSTMTransition(), lstm=update)
-        if vehicle:
-            modules["pose"] = UnicyclePose(dt)
+        if motion is not None:
+            modules["motion"] = motion
         super().__init__(
             modules,
-            initial=WithMemory(initial, hidden_size, num_layers=num_layers),
+            initial=with_memory(initial, hidden_size, num_layers=num_layers),
             control_keys=control_keys,
             init_key=init_key,
             update_at_reset=update_at_reset,

@@ -24,12 +24,12 @@ class UKF(GaussianFilter):
 
     Args:
         transition: see :class:`~torch_denkf.filters.EKF`.
-        process_noise: likewise.
         sensor: likewise.
         observation: likewise.
         noise: likewise.
+        process_noise: likewise.
         initial: likewise; its covariance may be singular.
-        alpha: see :func:`torch_denkf.functional.unscented_weights`.
+        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
         beta: likewise.
         kappa: likewise. Covariances stay positive where no weight is negative, as by default.
         **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
@@ -45,7 +45,7 @@ class UKF(GaussianFilter):
         >>> q = ConstantNoise([0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
         >>> r = ConstantNoise([0.1], in_key="reading")
         >>> ukf = UKF(
-        ...     LearnedTransition(torch.sin, residual=False), q, None, Select([0]), r,
+        ...     LearnedTransition(torch.sin, residual=False), None, Select([0]), r, process_noise=q,
         ...     initial=GaussianAround([0.0]), observation_key="reading",
         ... )
         >>> ukf.sequence(TensorDict({"reading": torch.zeros(3, 1), "state": torch.zeros(3, 1)}, [3]))["belief", "var"]
@@ -57,11 +57,11 @@ class UKF(GaussianFilter):
     def __init__(
         self,
         transition: TensorDictModuleBase,
-        process_noise: TensorDictModuleBase | Sequence[float] | float,
         sensor: TensorDictModuleBase | None,
         observation: TensorDictModuleBase,
         noise: TensorDictModuleBase,
         *,
+        process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
         alpha: float = 1.0,
         beta: float = 0.0,

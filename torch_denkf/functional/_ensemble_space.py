@@ -7,13 +7,12 @@ result is as large as the ensemble.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from typing import overload
 
 import torch
 from torch import Tensor
 
+from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
 from torch_denkf.functional.linalg import cholesky, inverse_square_root
 
 #: Elements of an ensemble in one tile: 256 KiB in single precision, which a core's own cache holds several times.
@@ -86,7 +85,14 @@ def analyse_in_tiles(
     With ``total`` the columns are a share of all there are, and it adds up sums over columns with those of the other
     shares: it takes and returns them as tensors ``[*B, ...]``.
     """
-    tiles = _Tiles(forecast, predicted, observation, noise, scheme, observed, perturbation)
+    samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
+    mask = None if observed is None else observed.expand(noise.shape)
+
+    def tile(start: int) -> tuple[slice, Tensor | None, Whitened]:
+        part = slice(start, start + columns)
+        seen = None if mask is None else mask[..., part]
+        return part, seen, whiten(predicted[..., part], samples[..., part], noise[..., part], seen)
+
     size, dim = predicted.shape[-2:]
     batch = forecast.shape[:-2]
     gram = forecast.new_zeros(*batch, size, size)
@@ -95,91 +101,37 @@ def analyse_in_tiles(
     log_noise = count = forecast.new_zeros(*batch, 1)
     square = forecast.new_zeros(*batch, 1, dtype=torch.double)
     for start in range(0, dim, columns):
-        part = slice(start, start + columns)
-        normalised, mean_shift, shift = tiles(part, innovation[..., part])
-        gram += normalised @ normalised.mT
-        right += normalised @ shift.mT
-        variance, mask = tiles.noise_and_mask(part)
-        log_noise = log_noise + variance.log().sum(-1, keepdim=True)
-        count = count + (variance.shape[-1] if mask is None else mask.sum(-1, keepdim=True))
+        part, seen, reading = tile(start)
+        draws = None if perturbation is None else perturbation[..., part]
+        gram += reading.normalised @ reading.normalised.mT
+        right += reading.normalised @ shift(scheme, reading, seen, draws).mT
+        innovation[..., part] = reading.innovation.squeeze(-2)
+        log_noise = log_noise + reading.noise.log().sum(-1, keepdim=True)
+        count = count + (reading.noise.shape[-1] if seen is None else seen.sum(-1, keepdim=True))
         if total is not None:
-            square += mean_shift.double().square().sum(-1)
+            square += reading.mean_shift.double().square().sum(-1)
     if total is not None:
         gram, right, log_noise, count, square = total(gram, right, log_noise, count, square)
 
     weights, root, log_det = solve_ensemble_space(gram, right, square_root=scheme == "etkf")
     mean_weights = weights.mean(-2, keepdim=True)
     # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
-    nis = mean_weights.square().sum(-1)
+    least = mean_weights.square().sum(-1)
     for start in range(0, 0 if total is not None else dim, columns):
-        normalised, mean_shift, _ = tiles(slice(start, start + columns))
-        nis = nis + (mean_shift - mean_weights @ normalised).square().sum(-1)
+        reading = tile(start)[-1]
+        least = least + (reading.mean_shift - mean_weights @ reading.normalised).square().sum(-1)
     if total is not None:  # the same as a difference, which needs no second sum over all shares
         explained = mean_weights.double() @ right.double().mean(-1, keepdim=True)
-        nis = (square - explained.squeeze(-1)).to(forecast.dtype)
+        least = (square - explained.squeeze(-1)).to(forecast.dtype)
 
     if root is not None and rotation is not None:
         root = rotation @ root
-    seen = (count > 0).unsqueeze(-1)
+    any_seen = (count > 0).unsqueeze(-1)
     ensemble = torch.empty_like(forecast)
     for start in range(0, forecast.shape[-1], columns):
         state = forecast[..., start : start + columns]
         mean = state.mean(-2, keepdim=True)
         anomalies = state - mean
         moved = state + weights @ anomalies if root is None else mean + (weights + root) @ anomalies
-        ensemble[..., start : start + columns] = moved if observed is None else torch.where(seen, moved, state)
-    nis = nis * (size - 1)
-    log_likelihood = -0.5 * (nis + log_det + log_noise + count * math.log(2 * math.pi))
-    return ensemble, innovation, nis, log_likelihood
-
-
-class _Tiles:
-    """Columns of the normalised anomalies Y and of what the gain acts on, made when they are asked for."""
-
-    def __init__(self, forecast, predicted, observation, noise, scheme, observed, perturbation):
-        self.predicted, self.noise, self.observed = predicted, noise, observed
-        self.samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
-        self.scheme, self.perturbation = scheme, perturbation
-        self.size = predicted.shape[-2]
-
-    def noise_and_mask(self, part: slice) -> tuple[Tensor, Tensor | None]:
-        """Variances of these columns, 1 where nothing is observed, and the mask, ``[*B, columns]``."""
-        variance = self.noise[..., part]
-        if self.observed is None:
-            return variance, None
-        mask = self.observed.expand(self.noise.shape)[..., part]
-        return torch.where(mask, variance, 1), mask
-
-    @overload
-    def __call__(self, part: slice, innovation: Tensor) -> tuple[Tensor, Tensor, Tensor]: ...
-
-    @overload
-    def __call__(self, part: slice) -> tuple[Tensor, Tensor, None]: ...
-
-    def __call__(self, part: slice, innovation: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Y, the mean's shift and the members', as in ``analyse``; the last only where the innovation is wanted."""
-        predicted, samples = self.predicted[..., part], self.samples[..., part]
-        variance, mask = self.noise_and_mask(part)
-        if mask is not None:
-            members = mask.unsqueeze(-2)
-            predicted, samples = torch.where(members, predicted, 0), torch.where(members, samples, 0)
-        mean = predicted.mean(-2, keepdim=True)
-        scale = (variance * (self.size - 1)).rsqrt().unsqueeze(-2)
-        normalised = (predicted - mean) * scale
-        difference = samples.mean(-2, keepdim=True) - mean
-        mean_shift = difference * scale
-        if innovation is None:
-            return normalised, mean_shift, None
-        innovation.copy_(difference.squeeze(-2))
-        if self.scheme == "sensor":
-            return normalised, mean_shift, (samples - predicted) * scale
-        if self.scheme == "sakov":
-            return normalised, mean_shift, mean_shift - normalised / 2
-        if self.scheme == "etkf":
-            return normalised, mean_shift, mean_shift
-        given = self.perturbation
-        draws = torch.randn_like(predicted) if given is None else given[..., part]
-        draws = (draws - draws.mean(-2, keepdim=True)) * (math.sqrt(self.size) / (self.size - 1))
-        if mask is not None:
-            draws = torch.where(members, draws, 0)
-        return normalised, mean_shift, mean_shift - normalised + draws
+        ensemble[..., start : start + columns] = moved if observed is None else torch.where(any_seen, moved, state)
+    return ensemble, innovation, *scores(least, log_det, log_noise, count, size)

@@ -10,7 +10,6 @@ Hunt et al. 2007 ("etkf"); Sakov & Oke 2008, Tellus A 60 ("sakov").
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Literal, NamedTuple, get_args
 
@@ -20,6 +19,7 @@ from torch import Tensor
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._small_system import LARGEST, solve_written_out
+from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
 from torch_denkf.functional.linalg import cholesky, inverse_square_root_difference
 
 Scheme = Literal["sensor", "perturbed", "etkf", "sakov"]
@@ -83,7 +83,7 @@ def analyse(
         perturbation: standard normal draws for ``"perturbed"``, ``[*B, E, O]``; they are centred over the
             members and rescaled by sqrt(E / (E − 1)), which keeps their variance. None: drawn here.
         rotation: orthogonal matrices that keep the vector of ones, ``[*B, E, E]``, applied to the
-            analysis anomalies of ``"etkf"`` (:func:`~torch_denkf.functional.random_rotation`).
+            analysis anomalies of ``"etkf"`` (:func:`~torch_denkf.functional.inflation.random_rotation`).
         taper: localisation: factors in [0, 1] on the sample covariances of state and predicted observation
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
@@ -107,123 +107,33 @@ def analyse(
         >>> print(f"{result.ensemble.mean():.2f} {result.ensemble.var():.2f}")
         2.00 1.00
     """
-    check_analysis_arguments(
-        forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space
-    )
+    given = forecast, predicted, observation, noise
+    check_analysis_arguments(*given, scheme, observed, perturbation, rotation, taper, space)
     size, dim = predicted.shape[-2:]
-    has_samples = observation.ndim == forecast.ndim
     in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
-    if not in_observation_space:
-        columns = columns_in_a_tile(forecast, predicted, observation, noise, perturbation)
-        if columns is not None:
-            tiled = analyse_in_tiles(
-                forecast,
-                predicted,
-                observation,
-                noise,
-                scheme=scheme,
-                columns=columns,
-                observed=observed,
-                perturbation=perturbation,
-                rotation=rotation,
-            )
-            return Analysis(*tiled)
+    columns = None if in_observation_space else columns_in_a_tile(*given, perturbation)
+    if columns is not None:
+        tiled = partial(analyse_in_tiles, scheme=scheme, columns=columns, rotation=rotation)
+        return Analysis(*tiled(*given, observed=observed, perturbation=perturbation))
 
-    if observed is not None:  # masked components: anomalies and innovation 0, variance 1
-        members_observed = observed.unsqueeze(-2)
-        predicted = torch.where(members_observed, predicted, 0)
-        observation = torch.where(members_observed if has_samples else observed, observation, 0)
-        noise = torch.where(observed, noise, 1)
-
-    samples = observation if has_samples else observation.unsqueeze(-2)
-    predicted_mean = predicted.mean(-2, keepdim=True)
-    innovation = samples.mean(-2, keepdim=True) - predicted_mean
-    scale = (noise * (size - 1)).rsqrt().unsqueeze(-2)
-    normalised = (predicted - predicted_mean) * scale  # Y
-    mean_shift = innovation * scale
+    samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
+    reading = whiten(predicted, samples, noise, observed)  # eqs. 6 to 8
     mean = forecast.mean(-2, keepdim=True)
-    anomalies = forecast - mean
-
-    # What the gain acts on, one row a member (or one for all), in units of R^1/2 sqrt(E - 1).
-    if scheme == "sensor":
-        shift = (samples - predicted) * scale
-    elif scheme == "perturbed":
-        draws = torch.randn_like(predicted) if perturbation is None else perturbation
-        draws = (draws - draws.mean(-2, keepdim=True)) * (math.sqrt(size) / (size - 1))
-        if observed is not None:
-            draws = torch.where(members_observed, draws, 0)
-        shift = mean_shift - normalised + draws
-    elif scheme == "sakov":
-        shift = mean_shift - normalised / 2
-    else:
-        shift = mean_shift
-
+    anomalies = forecast - mean  # A, eq. 10
+    acted_on = shift(scheme, reading, observed, perturbation)
+    # Both spaces solve with S, eq. 9, in units of the noise; the increment is K, eq. 11, times what it acts on.
     solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
-    increment, square_root, nis, log_det = solve(normalised, anomalies, shift, mean_shift, square_root=scheme == "etkf")
-    if square_root is None:
-        ensemble = forecast + increment
-    elif rotation is None:
-        ensemble = mean + increment + square_root
-    else:
-        ensemble = mean + increment + rotation @ square_root
+    increment, root, square, log_det = solve(reading, anomalies, acted_on, square_root=scheme == "etkf")
+    if root is not None and rotation is not None:
+        root = rotation @ root
+    ensemble = forecast + increment if root is None else mean + increment + root  # eq. 12
 
     count: int | Tensor = dim
     if observed is not None:
-        seen = observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype)
-        ensemble = torch.where((seen > 0).unsqueeze(-1), ensemble, forecast)
-        count = seen
-    nis = nis * (size - 1)
-    log_det = log_det + noise.log().sum(-1, keepdim=True)
-    log_likelihood = -0.5 * (nis + log_det + count * math.log(2 * math.pi))
-    return Analysis(ensemble, innovation.squeeze(-2), nis, log_likelihood)
-
-
-def _observation_space(
-    normalised: Tensor,
-    anomalies: Tensor,
-    shift: Tensor,
-    mean_shift: Tensor,
-    *,
-    square_root: bool,
-    taper: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YᵀY, O x O.
-
-    Returns:
-        The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
-        ``[*B, E, S]``, if asked for; mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ and log det (I + YᵀY), ``[*B, 1]``.
-    """
-    gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
-    if taper is not None:
-        gram, cross = gram * taper[1], cross * taper[0].mT
-    transformed = None
-    if square_root:
-        transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
-    if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
-        increment, square, log_det = solve_written_out(gram, cross, shift, mean_shift)
-        return increment, transformed, square, log_det
-    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
-    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
-    increment = shift @ torch.cholesky_solve(cross, factor)
-    return increment, transformed, whitened.square().sum(-2), _log_det(factor)
-
-
-def _ensemble_space(
-    normalised: Tensor, anomalies: Tensor, shift: Tensor, mean_shift: Tensor, *, square_root: bool
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
-    weights, root, log_det = solve_ensemble_space(
-        normalised @ normalised.mT, normalised @ shift.mT, square_root=square_root
-    )
-    mean_weights = weights.mean(-2, keepdim=True)
-    # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
-    residual = mean_shift - mean_weights @ normalised
-    nis = residual.square().sum(-1) + mean_weights.square().sum(-1)
-    return weights @ anomalies, None if root is None else root @ anomalies, nis, log_det
-
-
-def _log_det(factor: Tensor) -> Tensor:
-    return 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+        count = observed.expand(noise.shape).sum(-1, keepdim=True, dtype=noise.dtype)
+        ensemble = torch.where((count > 0).unsqueeze(-1), ensemble, forecast)
+    log_noise = reading.noise.log().sum(-1, keepdim=True)
+    return Analysis(ensemble, reading.innovation.squeeze(-2), *scores(square, log_det, log_noise, count, size))
 
 
 def check_analysis_arguments(
@@ -273,3 +183,47 @@ def check_analysis_arguments(
         if scheme != "etkf":
             raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")
         check_shape("rotation", rotation, (*batch, size, size), "[*B, E, E]")
+
+
+def _observation_space(
+    reading: Whitened,
+    anomalies: Tensor,
+    acted_on: Tensor,
+    *,
+    square_root: bool,
+    taper: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Solve with I + YᵀY, O x O.
+
+    Returns:
+        The increment of each member, ``[*B, E, S]`` or ``[*B, 1, S]``; the square root's anomalies,
+        ``[*B, E, S]``, if asked for; mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ and log det (I + YᵀY), ``[*B, 1]``.
+    """
+    normalised, mean_shift = reading.normalised, reading.mean_shift
+    gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
+    if taper is not None:
+        gram, cross = gram * taper[1], cross * taper[0].mT
+    transformed = None
+    if square_root:
+        transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
+    if torch.compiler.is_compiling() and gram.shape[-1] <= LARGEST:
+        increment, square, log_det = solve_written_out(gram, cross, acted_on, mean_shift)
+        return increment, transformed, square, log_det
+    factor = cholesky(gram + torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))  # of S, eq. 9
+    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
+    increment = acted_on @ torch.cholesky_solve(cross, factor)  # by the gain K, eq. 11
+    return increment, transformed, whitened.square().sum(-2), log_det
+
+
+def _ensemble_space(
+    reading: Whitened, anomalies: Tensor, acted_on: Tensor, *, square_root: bool
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Solve with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
+    y = reading.normalised
+    weights, root, log_det = solve_ensemble_space(y @ y.mT, y @ acted_on.mT, square_root=square_root)
+    mean_weights = weights.mean(-2, keepdim=True)
+    # dᵀ(I + YᵀY)⁻¹d is the minimum over w of |d - Yᵀw|² + |w|²: nothing cancels.
+    residual = reading.mean_shift - mean_weights @ y
+    square = residual.square().sum(-1) + mean_weights.square().sum(-1)
+    return weights @ anomalies, None if root is None else root @ anomalies, square, log_det

@@ -20,6 +20,22 @@ def check_angles(angles: Sequence[int], size: int) -> None:
         raise ValueError(f"angles are components of {size}, 0 to {size - 1}; got {strange} in {list(angles)}")
 
 
+def wrap_angle(angle: Tensor) -> Tensor:
+    """Bring angles to [-π, π).
+
+    Args:
+        angle: in rad, any shape.
+
+    Returns:
+        The same directions in [-π, π), in rad.
+
+    Examples:
+        >>> wrap_angle(torch.tensor([0.5, 4.0, -4.0]))
+        tensor([ 0.5000, -2.2832,  2.2832])
+    """
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
 def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
     """Wraps some components of differences to [-pi, pi).
 
@@ -37,7 +53,7 @@ def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
     if not angles:
         return difference
     check_angles(angles, difference.shape[-1])
-    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+    wrapped = wrap_angle(difference)
     is_angle = torch.zeros(difference.shape[-1], dtype=torch.bool, device=difference.device)
     is_angle[list(angles)] = True
     return torch.where(is_angle, wrapped, difference)

@@ -17,7 +17,7 @@ def dropped_relu(x: Tensor, factor: Tensor, rate: float) -> Tensor:
 
     Args:
         x: output of a linear layer, any shape.
-        factor: 0 or 1 / (1 - rate), of that shape, from :func:`~torch_denkf.functional.dropout_factor`.
+        factor: 0 or 1 / (1 - rate), of that shape, from :func:`~torch_denkf.functional.random_bits.dropout_factor`.
         rate: drop probability in [0, 1).
 
     Returns:

@@ -46,8 +46,8 @@ def analyse_sharded(
         group: the processes; ``None`` for all.
 
     Returns:
-        The :class:`~torch_denkf.functional.Analysis`: ensemble and innovation of this process's components; ``nis``
-        and ``log_likelihood`` of all components.
+        The :class:`~torch_denkf.functional.analysis.Analysis`: ensemble and innovation of this process's components;
+        ``nis`` and ``log_likelihood`` of all components.
 
     Raises:
         RuntimeError: if ``torchrun`` started several processes and no process group was begun, or a tensor requires a

@@ -22,8 +22,8 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     """One step back in time: the smoothed members of t from those of t + 1.
 
     X + (X_s − X_f) A_f⁺ A, with A and A_f the anomalies at t and of the forecast: the gain of
-    :func:`~torch_denkf.functional.rts_step` from sample covariances. The smaller of the two possible systems is solved,
-    S x S or E x E.
+    :func:`~torch_denkf.functional.smoothing.rts_step` from sample covariances. The smaller of the two possible systems
+    is solved, S x S or E x E.
 
     Args:
         ensemble: X, the filter's belief at t, ``[*B, E, S]``.
@@ -87,7 +87,7 @@ def enrts_smooth(
     Args:
         ensemble: the filter's beliefs, ``[*B, T, E, S]``.
         forecast: of each time, the members before it one step on, ``[*B, T, E, S]``.
-        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.rts_smooth`.
+        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.smoothing.rts_smooth`.
         lag: likewise.
         damping: see :func:`enrts_step`.
 

@@ -56,7 +56,7 @@ def backward_smooth(
         log_weights: of the filter's beliefs, normalised, ``[*B, T, E]``.
         log_transition: log-density of each particle at t, in the columns, given each at t − 1, in the rows,
             ``[*B, T, E, E]``.
-        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.rts_smooth`.
+        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.smoothing.rts_smooth`.
         lag: likewise.
 
     Returns:

@@ -173,7 +173,7 @@ def unscented_update(
         angles: components of the observation that are angles in radians.
 
     Returns:
-        A :class:`torch_denkf.functional.GaussianUpdate`.
+        A :class:`torch_denkf.functional.gaussian.GaussianUpdate`.
 
     Raises:
         ValueError: if shapes do not fit.

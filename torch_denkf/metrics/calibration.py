@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf.metrics._paths import wrap_angle
+from torch_denkf.functional import wrap_angle
 from torch_denkf.metrics.state import mean_of_known, state_difference
 
 __all__ = [

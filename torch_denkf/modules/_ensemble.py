@@ -9,7 +9,7 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional import align_angles
+from torch_denkf.functional.angles import align_angles
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._tensors import check_dims
@@ -23,24 +23,24 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
     Attributes:
         forecast_key: forecast ensemble ``[*B, E, S]``; ``("forecast", "ensemble")`` by default.
         predicted_key: predicted observations ``[*B, E, O]``; ``("forecast", "observation")`` by default.
-        sensor_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``; ``("sensor", "ensemble")`` by
+        observation_key: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``; ``("sensor", "ensemble")`` by
             default.
         noise_variance_key: variances ``[*B, O]``; ``("sensor", "noise")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; ``"observed"`` by default.
-        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``;
+        belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``;
             ``"belief"`` by default.
-        info_key: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``;
+        info_prefix: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``;
             ``"info"`` by default. Where a filter holds several analyses of one prefix, each has its own,
-            ``(info_key, place, ...)``, and ``nis`` and ``log_likelihood`` under the prefix are their sums.
+            ``(info_prefix, place, ...)``, and ``nis`` and ``log_likelihood`` under the prefix are their sums.
     """
 
     forecast_key: NestedKey
     predicted_key: NestedKey
-    sensor_key: NestedKey
+    observation_key: NestedKey
     noise_variance_key: NestedKey
     observed_key: NestedKey
-    belief_key: str
-    info_key: str
+    belief_prefix: str
+    info_prefix: str
 
 
 class EnsembleUpdate(SubModel):
@@ -54,11 +54,11 @@ class EnsembleUpdate(SubModel):
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         forecast_key: see :class:`EnsembleAnalysisKeys`, like the other keys.
         predicted_key: likewise.
-        sensor_key: likewise.
+        observation_key: likewise.
         noise_variance_key: likewise.
         observed_key: likewise.
-        belief_key: likewise.
-        info_key: likewise.
+        belief_prefix: likewise.
+        info_prefix: likewise.
 
     Raises:
         ValueError: if ``inflation`` is not positive, or ``relaxation`` is outside [0, 1].
@@ -76,25 +76,25 @@ class EnsembleUpdate(SubModel):
         covariance: bool = False,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
-        sensor_key: NestedKey = ("sensor", "ensemble"),
+        observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
-        belief_key: str = "belief",
-        info_key: str = "info",
+        belief_prefix: str = "belief",
+        info_prefix: str = "info",
     ):
-        moments = [(belief_key, name) for name in ("ensemble", "mean", "var")]
-        diagnostics = [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
+        moments = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
+        diagnostics = [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(
             nn.Identity(),
-            [forecast_key, predicted_key, sensor_key, noise_variance_key],
-            [*moments, *diagnostics, *[(belief_key, "cov")] * covariance],
+            [forecast_key, predicted_key, observation_key, noise_variance_key],
+            [*moments, *diagnostics, *[(belief_prefix, "cov")] * covariance],
             optional_keys=[observed_key],
         )
         check_number("inflation", inflation, above=0)
         check_number("relaxation", relaxation, least=0, most=1)
         check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
-        self.angles, self.info_key, self.reading_keys = list(angles), info_key, self.in_keys[2:]
+        self.angles, self.info_prefix, self.reading_keys = list(angles), info_prefix, self.in_keys[2:]
         self.observed_key = unravel_key(observed_key)
 
     def on_entries(self, entries, call):
@@ -102,7 +102,7 @@ class EnsembleUpdate(SubModel):
         return self.on_aligned(self.aligned(entries), call)
 
     def aligned(self, entries: Entries) -> Entries:
-        """The entries with all angles on one turn, see :func:`~torch_denkf.functional.align_angles`.
+        """The entries with all angles on one turn, see :func:`~torch_denkf.functional.angles.align_angles`.
 
         Predictions and the reading can then be averaged, spread and subtracted like other numbers. Who changes them in
         front of the analysis does so here, and hands them to :meth:`on_aligned`: another alignment would fold a spread

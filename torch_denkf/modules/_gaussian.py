@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional import GaussianUpdate, mean_observation
+from torch_denkf.functional.angles import mean_observation
+from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import check_module, reads, run_module
@@ -25,15 +26,15 @@ class GaussianTransitionKeys(TypedDict, total=False):
     """The keys that a forecast of mean and covariance takes.
 
     Attributes:
-        belief_key: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``"belief"`` by
+        belief_prefix: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``"belief"`` by
             default.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
+        forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
         ensemble_key: what the transition reads, ``("belief", "ensemble")`` by default.
         forecast_ensemble_key: what it writes, ``("forecast", "ensemble")`` by default.
     """
 
-    belief_key: str
-    forecast_key: str
+    belief_prefix: str
+    forecast_prefix: str
     ensemble_key: NestedKey
     forecast_ensemble_key: NestedKey
 
@@ -42,11 +43,11 @@ class GaussianTransition(SubModel):
     """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
 
     Args:
-        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.UnicycleTransition`.
+        transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.applications.car.UnicycleTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
-        belief_key: see :class:`GaussianTransitionKeys`, like the other keys.
-        forecast_key: likewise.
+        belief_prefix: see :class:`GaussianTransitionKeys`, like the other keys.
+        forecast_prefix: likewise.
         ensemble_key: likewise.
         forecast_ensemble_key: likewise.
 
@@ -60,15 +61,15 @@ class GaussianTransition(SubModel):
         transition: TensorDictModuleBase,
         process_noise: TensorDictModuleBase,
         *,
-        belief_key: str = "belief",
-        forecast_key: str = "forecast",
+        belief_prefix: str = "belief",
+        forecast_prefix: str = "forecast",
         ensemble_key: NestedKey = ("belief", "ensemble"),
         forecast_ensemble_key: NestedKey = ("forecast", "ensemble"),
     ):
         check_module("transition", transition)
         check_module("process_noise", process_noise)
         refuse_random_layers(transition, type(self).__name__)
-        in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_key, forecast_key))
+        in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_prefix, forecast_prefix))
         self_made = [unravel_key(ensemble_key), *out_keys]
         further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
         super().__init__(transition, in_keys + further, out_keys, optional_keys=optional)
@@ -116,10 +117,10 @@ class GaussianAnalysisOptions(TypedDict, total=False):
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; ``("sensor", "noise")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, read after the observation model has run;
             ``"observed"`` by default.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
-        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``; ``"belief"`` by
+        forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
+        belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``; ``"belief"`` by
             default.
-        info_key: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``; ``"info"`` by
+        info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``; ``"info"`` by
             default.
         ensemble_key: what the observation model reads, ``("forecast", "ensemble")`` by default.
         predicted_key: what it writes, ``("forecast", "observation")`` by default.
@@ -130,9 +131,9 @@ class GaussianAnalysisOptions(TypedDict, total=False):
     observation_key: NestedKey
     noise_variance_key: NestedKey
     observed_key: NestedKey
-    forecast_key: str
-    belief_key: str
-    info_key: str
+    forecast_prefix: str
+    belief_prefix: str
+    info_prefix: str
     ensemble_key: NestedKey
     predicted_key: NestedKey
 
@@ -148,9 +149,9 @@ class GaussianAnalysis(SubModel):
         observation_key: likewise.
         noise_variance_key: likewise.
         observed_key: likewise.
-        forecast_key: likewise.
-        belief_key: likewise.
-        info_key: likewise.
+        forecast_prefix: likewise.
+        belief_prefix: likewise.
+        info_prefix: likewise.
         ensemble_key: likewise.
         predicted_key: likewise.
 
@@ -170,22 +171,22 @@ class GaussianAnalysis(SubModel):
         observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
-        forecast_key: str = "forecast",
-        belief_key: str = "belief",
-        info_key: str = "info",
+        forecast_prefix: str = "forecast",
+        belief_prefix: str = "belief",
+        info_prefix: str = "info",
         ensemble_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
     ):
         check_module("observation", observation)
         refuse_random_layers(observation, type(self).__name__)
-        in_keys = [(forecast_key, "mean"), (forecast_key, "cov"), observation_key, noise_variance_key]
+        in_keys = [(forecast_prefix, "mean"), (forecast_prefix, "cov"), observation_key, noise_variance_key]
         further, optional = further_keys([observation], [*in_keys, ensemble_key])
-        out_keys = [(belief_key, name) for name in ("mean", "cov", "var")]
-        out_keys += [(info_key, name) for name in ("innovation", "nis", "log_likelihood")]
+        out_keys = [(belief_prefix, name) for name in ("mean", "cov", "var")]
+        out_keys += [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(observation, in_keys + further, out_keys, optional_keys=[observed_key, *optional])
         check_number("inflation", inflation, above=0)
         check_dims("angles", angles)
-        self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
+        self.inflation, self.angles, self.info_prefix = inflation, list(angles), info_prefix
         self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 

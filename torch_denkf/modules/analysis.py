@@ -9,16 +9,10 @@ import torch
 from tensordict import unravel_key
 
 from torch_denkf._checks import check_values
-from torch_denkf.functional import (
-    Analysis,
-    analyse,
-    ensemble_cov,
-    ensemble_mean,
-    ensemble_var,
-    inflate,
-    random_rotation,
-    relax_to_prior_spread,
-)
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional.analysis import Analysis
+from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules._tensors import as_floating, check_dims
 

@@ -138,7 +138,7 @@ class FromSensor(_InitialEnsemble):
         mean: prior mean ``[S]``, in the state's units.
         std: prior standard deviations ``[S]``.
         ensemble_size: E.
-        sensor_key: learned observations ``[*B, E, O]`` or a reading ``[*B, O]``.
+        observation_key: learned observations ``[*B, E, O]`` or a reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
@@ -163,12 +163,12 @@ class FromSensor(_InitialEnsemble):
         std: Sequence[float] | torch.Tensor,
         *,
         ensemble_size: int = 32,
-        sensor_key: NestedKey = ("sensor", "ensemble"),
+        observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [sensor_key, noise_variance_key], out_keys, [observed_key])
+        super().__init__(std, ensemble_size, [observation_key, noise_variance_key], out_keys, [observed_key])
         register_location(self, "mean", mean)
         check_dims("dims", dims, once=True, size=self.state_dim)
         self.register_buffer("dims", torch.tensor(list(dims)), persistent=False)

@@ -10,7 +10,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import GaussianUpdate, ensemble_cov, ensemble_mean, kalman_update, weighted_mean
+from torch_denkf.functional import ensemble_mean, kalman_update
+from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import random_parts, reads
 
@@ -26,11 +29,11 @@ def check_analysis(
     observation_dim: int = 2,
     members: int = 4000,
     samples: bool = False,
-    reading_key: NestedKey = ("sensor", "ensemble"),
+    observation_key: NestedKey = ("sensor", "ensemble"),
     noise_variance_key: NestedKey = ("sensor", "noise"),
     observed_key: NestedKey | None = "observed",
-    belief_key: str = "belief",
-    info_key: str = "info",
+    belief_prefix: str = "belief",
+    info_prefix: str = "info",
     tolerance: float = 0.1,
     seed: int = 0,
 ) -> dict[str, float]:
@@ -55,11 +58,11 @@ def check_analysis(
         observation_dim: O, at most S.
         members: E; with it the errors of stochastic updates fall, like :math:`1/\sqrt{E}`.
         samples: whether the reading is learned observations ``[*B, E, O]``, and not one, ``[*B, O]``.
-        reading_key: the reading.
+        observation_key: the reading.
         noise_variance_key: its variances ``[*B, O]``.
         observed_key: the mask; ``None`` if the analysis reads none, because its reading is never missing.
-        belief_key: prefix of what is written.
-        info_key: prefix of the diagnostics.
+        belief_prefix: prefix of what is written.
+        info_prefix: prefix of the diagnostics.
         tolerance: what may be off, in standard deviations of the exact belief, and as a share of the exact variances.
             Exact updates are off by rounding; of 4000 members 0.1 is three standard errors. An update that is right for
             small gains alone, like ``"sakov"``, needs 0.2: the gain here is about 0.4.
@@ -77,7 +80,7 @@ def check_analysis(
         >>> off["mean"] < 1e-3, off["gain"] < 1e-3
         (True, True)
     """
-    keys = _Keys(reading_key, noise_variance_key, observed_key, belief_key, info_key)
+    keys = _Keys(observation_key, noise_variance_key, observed_key, belief_prefix, info_prefix)
     own = next((v for v in (*analysis.parameters(), *analysis.buffers()) if v.is_floating_point()), None)
     case = _Case(
         state_dim, observation_dim, members, samples, keys, torch.get_default_dtype() if own is None else own.dtype

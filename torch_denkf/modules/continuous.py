@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_square, check_values
-from torch_denkf.functional import discretise
+from torch_denkf.functional.continuous import discretise
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import as_floating, register_constant
@@ -102,7 +102,7 @@ class NoisePerSecond(SubModel):
     r"""What another process noise writes, taken as variance per second: times the seconds since the last step.
 
     It is the noise of a random walk, for motions that read their own ``dt``, such as
-    :class:`~torch_denkf.modules.UnicycleTransition`. In a :class:`UnicycleNoise` put it inside.
+    :class:`~torch_denkf.applications.car.UnicycleTransition`. In a :class:`UnicycleNoise` put it inside.
 
     Args:
         noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]`` per second; its keys are kept.

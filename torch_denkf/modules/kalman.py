@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_covariance, check_number, check_shape, check_square, check_values
-from torch_denkf.functional import kalman_predict, kalman_update, mean_observation, wrap_angles
+from torch_denkf.functional import kalman_predict, kalman_update, wrap_angles
+from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.linalg import product_of_known
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
@@ -27,7 +28,7 @@ class MomentPrior(SubModel):
     Args:
         mean: ``[S]``.
         cov: ``[S, S]``.
-        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
+        belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, or ``cov`` is no covariance.
@@ -38,8 +39,8 @@ class MomentPrior(SubModel):
         torch.Size([3, 2, 2])
     """
 
-    def __init__(self, mean: torch.Tensor, cov: torch.Tensor, *, belief_key: str = "belief"):
-        super().__init__(nn.Identity(), [], [(belief_key, name) for name in ("mean", "cov", "var")])
+    def __init__(self, mean: torch.Tensor, cov: torch.Tensor, *, belief_prefix: str = "belief"):
+        super().__init__(nn.Identity(), [], [(belief_prefix, name) for name in ("mean", "cov", "var")])
         register_constant(self, "mean", mean)
         register_constant(self, "cov", cov)
         if self.mean.ndim != 1:
@@ -62,7 +63,7 @@ class GaussianAround(SubModel):
     Args:
         std: standard deviations ``[S]``, in the state's units; zero where the state is known exactly.
         state_key: the known state ``[*B, S]``.
-        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``.
+        belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``.
 
     Raises:
         ValueError: if a standard deviation is negative.
@@ -77,9 +78,9 @@ class GaussianAround(SubModel):
     """
 
     def __init__(
-        self, std: Sequence[float] | torch.Tensor, *, state_key: NestedKey = "state", belief_key: str = "belief"
+        self, std: Sequence[float] | torch.Tensor, *, state_key: NestedKey = "state", belief_prefix: str = "belief"
     ):
-        super().__init__(nn.Identity(), [state_key], [(belief_key, name) for name in ("mean", "cov", "var")])
+        super().__init__(nn.Identity(), [state_key], [(belief_prefix, name) for name in ("mean", "cov", "var")])
         std = as_standard_deviations("std", std)
         self.register_buffer("std", std)
         self.state_dim = std.numel()
@@ -100,8 +101,8 @@ class LinearTransition(SubModel):
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether F and B are parameters.
         action_key: entry ``[*B, A]``, with ``control``.
-        belief_key: prefix of ``mean`` and ``cov`` of the last analysis.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
+        belief_prefix: prefix of ``mean`` and ``cov`` of the last analysis.
+        forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast.
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, or ``noise`` is no covariance.
@@ -123,10 +124,10 @@ class LinearTransition(SubModel):
         control: torch.Tensor | None = None,
         trainable: bool = False,
         action_key: NestedKey = "action",
-        belief_key: str = "belief",
-        forecast_key: str = "forecast",
+        belief_prefix: str = "belief",
+        forecast_prefix: str = "forecast",
     ):
-        in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_key, forecast_key))
+        in_keys, out_keys = ([(key, name) for name in ("mean", "cov")] for key in (belief_prefix, forecast_prefix))
         in_keys += [] if control is None else [action_key]
         modules = [noise] if isinstance(noise, nn.Module) else []
         further, optional = further_keys(modules, [*in_keys, *out_keys])
@@ -183,9 +184,9 @@ class KalmanAnalysis(SubModel):
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        forecast_key: prefix of ``mean`` and ``cov`` of the forecast.
-        belief_key: prefix of ``mean``, ``cov`` and ``var``.
-        info_key: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
+        forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast.
+        belief_prefix: prefix of ``mean``, ``cov`` and ``var``.
+        info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``.
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, ``noise`` is no covariance, or ``inflation`` is
@@ -214,19 +215,19 @@ class KalmanAnalysis(SubModel):
         observation_key: NestedKey = "observation",
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
-        forecast_key: str = "forecast",
-        belief_key: str = "belief",
-        info_key: str = "info",
+        forecast_prefix: str = "forecast",
+        belief_prefix: str = "belief",
+        info_prefix: str = "info",
     ):
         super().__init__(
             nn.Identity(),
-            [(forecast_key, "mean"), (forecast_key, "cov"), observation_key]
+            [(forecast_prefix, "mean"), (forecast_prefix, "cov"), observation_key]
             + ([noise_variance_key] if noise is None else []),
-            [(belief_key, name) for name in ("mean", "cov", "var")]
-            + [(info_key, name) for name in ("innovation", "nis", "log_likelihood")],
+            [(belief_prefix, name) for name in ("mean", "cov", "var")]
+            + [(info_prefix, name) for name in ("innovation", "nis", "log_likelihood")],
             optional_keys=[observed_key],
         )
-        self.inflation, self.angles, self.info_key = inflation, list(angles), info_key
+        self.inflation, self.angles, self.info_prefix = inflation, list(angles), info_prefix
         register_constant(self, "matrix", matrix, trainable=trainable)
         register_constant(self, "noise", noise)
         check_number("inflation", inflation, above=0)

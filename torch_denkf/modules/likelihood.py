@@ -11,7 +11,8 @@ from tensordict import NestedKey, unravel_key
 from torch import nn
 
 from torch_denkf._checks import check_count
-from torch_denkf.functional import mean_observation, wrap_angles
+from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.angles import mean_observation
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
@@ -32,7 +33,7 @@ class GaussianLikelihood(SubModel):
     Args:
         angles: components of the observation that are angles in radians.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
-        sensor_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
+        observation_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: variances ``[*B, O]``, the diagonal of R.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; what is not may be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats.
@@ -58,13 +59,13 @@ class GaussianLikelihood(SubModel):
         *,
         angles: Sequence[int] = (),
         predicted_key: NestedKey = ("forecast", "observation"),
-        sensor_key: NestedKey = ("sensor", "ensemble"),
+        observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
         out_key: NestedKey = ("forecast", "log_likelihood"),
     ):
         super().__init__(
-            nn.Identity(), [predicted_key, sensor_key, noise_variance_key], [out_key], optional_keys=[observed_key]
+            nn.Identity(), [predicted_key, observation_key, noise_variance_key], [out_key], optional_keys=[observed_key]
         )
 
         check_dims("angles", angles)
@@ -111,7 +112,7 @@ class LearnedLikelihood(SubModel):
     mean of the others in place of the particle's.
 
     So it is in the papers, where the encoding must say what was read. A network that is trained on few recordings does
-    not find that in the encodings of new ones. Where a trained sensor is at hand, ``reading_key`` tells it the
+    not find that in the encodings of new ones. Where a trained sensor is at hand, ``observation_key`` tells it the
     innovation instead:
 
     .. math:: \log l^i = b(g(e \oplus \mathrm{sign}(d^i) \log(1 + |d^i|))), \quad d^i = (y - h(x^i)) / s
@@ -124,22 +125,23 @@ class LearnedLikelihood(SubModel):
         num_cells: hidden layers; both papers have (128, 128).
         bound: ``"scaled"``, :math:`\log(0.004 + 0.996\, \mathrm{sigmoid}(g))` (Jonschkowski et al. 2018), or
             ``"clipped"``, :math:`\max(\log \mathrm{sigmoid}(g), -20)` (the limit of Kloss et al. 2021).
-        loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``reading_key``.
-        scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``reading_key`` what a good
-            reading errs by; one by default.
-        angles: components of the observation that are angles in radians; with a ``reading_key``.
+        loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``observation_key``.
+        scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``observation_key`` what a
+            good reading errs by; one by default.
+        angles: components of the observation that are angles in radians; with a ``observation_key``.
         network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
         encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
             mean is used.
-        reading_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by default,
-            as in the papers.
+        observation_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by
+            default, as in the papers.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
             be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
     Raises:
-        ValueError: on an unknown ``bound``, with both ``loc`` and ``reading_key``, or angles without ``reading_key``.
+        ValueError: on an unknown ``bound``, with both ``loc`` and ``observation_key``, or angles without
+            ``observation_key``.
         KeyError: if an entry is missing.
 
     Reference:
@@ -166,23 +168,25 @@ class LearnedLikelihood(SubModel):
         angles: Sequence[int] = (),
         network: nn.Module | None = None,
         encoding_key: NestedKey = ("sensor", "encoding"),
-        reading_key: NestedKey | None = None,
+        observation_key: NestedKey | None = None,
         predicted_key: NestedKey = ("forecast", "observation"),
         observed_key: NestedKey = "observed",
         out_key: NestedKey = ("forecast", "log_likelihood"),
     ):
         if bound not in ("scaled", "clipped"):
             raise ValueError(f'bound is "scaled" or "clipped"; got {bound!r}.')
-        if loc is not None and reading_key is not None:
-            raise ValueError("with a reading_key the network sees the innovation, which has no loc; pass scale alone.")
-        if angles and reading_key is None:
-            raise ValueError("angles are those of an innovation, which needs a reading_key.")
+        if loc is not None and observation_key is not None:
+            raise ValueError(
+                "with a observation_key the network sees the innovation, which has no loc; pass scale alone."
+            )
+        if angles and observation_key is None:
+            raise ValueError("angles are those of an innovation, which needs a observation_key.")
         check_count("encoding_dim", encoding_dim)
         check_count("observation_dim", observation_dim)
         check_dims("angles", angles, observation_dim)
         if network is None:
             network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
-        in_keys = [key for key in (encoding_key, predicted_key, reading_key) if key is not None]
+        in_keys = [key for key in (encoding_key, predicted_key, observation_key) if key is not None]
         super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
         self.bound, self.observation_dim = bound, observation_dim
         self.angles = list(angles)

@@ -9,16 +9,9 @@ from typing import Unpack
 import torch
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.functional import (
-    Neighbours,
-    ensemble_mean,
-    ensemble_var,
-    letkf,
-    neighbours,
-    neighbours_of_taper,
-    random_rotation,
-    relax_to_prior_spread,
-)
+from torch_denkf.functional import ensemble_mean, ensemble_var, letkf, neighbours
+from torch_denkf.functional.inflation import random_rotation, relax_to_prior_spread
+from torch_denkf.functional.localisation import Neighbours, neighbours_of_taper
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
 from torch_denkf.modules._tensors import mean_of_members, refuse_trained
 
@@ -40,8 +33,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
     ``nis`` is the number of observations, if the filter is consistent.
 
     Args:
-        near: which observations count where: :class:`~torch_denkf.functional.Neighbours`, or a taper ``[S, O]``. From
-            places and a radius: :meth:`around`.
+        near: which observations count where: :class:`~torch_denkf.functional.localisation.Neighbours`, or a taper ``[S,
+            O]``. From places and a radius: :meth:`around`.
         inflation: factor on the analysis anomalies of the components near which anything is observed; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies, the same for all components; rows of which nothing
@@ -111,8 +104,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         Args:
             states: places of the components, ``[S, D]``, in any unit.
             observations: places of the observations, ``[O, D]``.
-            radius: see :func:`~torch_denkf.functional.gaspari_cohn`; the taper ends at 3.65 radii. It is a constant:
-                which observations are near is found once.
+            radius: see :func:`~torch_denkf.functional.localisation.gaspari_cohn`; the taper ends at 3.65 radii. It is a
+                constant: which observations are near is found once.
             period: ``[D]``, circumferences of those coordinates that are circles, ``inf`` for the others.
             **kwargs: passed on to the constructor.
 

@@ -9,7 +9,8 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torch_denkf.functional import semidefinite_root, weighted_mean
+from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import check_module, reads, run_module
@@ -34,7 +35,8 @@ class NoisyTransition(SubModel):
             unless ``before``, the forecast's at ``forecast_mean_key``, which are worked out for it.
         dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
         before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
-            their noise, such as the pose of a :class:`torch_denkf.modules.UnicycleTransition` with its velocities.
+            their noise, such as the pose of a :class:`torch_denkf.applications.car.UnicycleTransition` with its
+        velocities.
         mean_key: the belief's mean ``[*B, S]``.
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.

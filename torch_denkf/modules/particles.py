@@ -12,6 +12,7 @@ then reaches the likelihood also where no gradient flows through resampling.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal
 
 import torch
@@ -20,25 +21,25 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import (
-    align_angles,
-    effective_sample_size,
-    jitter_copies,
-    soft_resample,
-    systematic_resample,
-    transport_resample,
-    weighted_innovation,
-    weighted_mean,
-    weighted_var,
-)
+from torch_denkf.functional import jitter_copies, soft_resample, systematic_resample, transport_resample
+from torch_denkf.functional.angles import align_angles
+from torch_denkf.functional.resampling import effective_sample_size
+from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
 from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.likelihood import GaussianLikelihood
 
-__all__ = ["ParticleAnalysis", "ResampledTransition", "WithWeights"]
+__all__ = ["ParticleAnalysis", "ResampledTransition", "with_weights"]
 
 
-class WithWeights(SubModel):
+def with_weights(
+    initial: TensorDictModuleBase,
+    *,
+    ensemble_key: NestedKey = ("belief", "ensemble"),
+    log_weight_key: NestedKey = ("belief", "log_weight"),
+) -> Beside:
     """An initial belief whose members are particles of equal weight.
 
     Args:
@@ -49,36 +50,16 @@ class WithWeights(SubModel):
     Example:
         >>> from tensordict import TensorDict
         >>> from torch_denkf.modules import GaussianPrior
-        >>> start = WithWeights(GaussianPrior([0.0], [1.0], ensemble_size=4))
+        >>> start = with_weights(GaussianPrior([0.0], [1.0], ensemble_size=4))
         >>> start(TensorDict({}, []))["belief", "log_weight"].exp()
         tensor([0.2500, 0.2500, 0.2500, 0.2500])
     """
+    return Beside(initial, [log_weight_key], partial(_equal_weights, unravel_key(ensemble_key)), nested=True)
 
-    def __init__(
-        self,
-        initial: TensorDictModuleBase,
-        *,
-        ensemble_key: NestedKey = ("belief", "ensemble"),
-        log_weight_key: NestedKey = ("belief", "log_weight"),
-    ):
-        check_module("initial", initial)
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, [*initial.out_keys, log_weight_key], optional_keys=optional)
-        self.ensemble_key = unravel_key(ensemble_key)
-        for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim"):
-            if hasattr(initial, name):
-                setattr(self, name, getattr(initial, name))
 
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
-
-    def on_entries(self, entries, call):
-        """The belief and its weights."""
-        written = run_module(self.module, entries, call.part("initial"))
-        ensemble = written[self.ensemble_key]
-        weights = torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2]))
-        return {**written, unravel_key(self.out_keys[-1]): weights}
+def _equal_weights(ensemble_key: NestedKey, belief: Entries, _: torch.Size) -> list[torch.Tensor]:
+    ensemble = belief[ensemble_key]
+    return [torch.full_like(ensemble[..., 0], -math.log(ensemble.shape[-2]))]
 
 
 class ResampledTransition(SubModel):
@@ -292,12 +273,12 @@ class ParticleAnalysis(SubModel):
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
         log_likelihood_key: :math:`\log p(y | x^i)`, ``[*B, E]``, see :mod:`torch_denkf.modules.likelihood`.
-        belief_key: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
+        belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
             ``var`` ``[*B, S]``.
-        info_key: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
+        info_prefix: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
             and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`; with a ``likelihood``
             also ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``, see
-            :func:`~torch_denkf.functional.weighted_innovation`.
+            :func:`~torch_denkf.functional.weighted.weighted_innovation`.
 
     Raises:
         KeyError: if an entry is missing.
@@ -321,20 +302,20 @@ class ParticleAnalysis(SubModel):
         forecast_key: NestedKey = ("forecast", "ensemble"),
         log_weight_key: NestedKey = ("forecast", "log_weight"),
         log_likelihood_key: NestedKey = ("forecast", "log_likelihood"),
-        belief_key: str = "belief",
-        info_key: str = "info",
+        belief_prefix: str = "belief",
+        info_prefix: str = "info",
     ):
         of_reading = [] if likelihood is None else likelihood.in_keys
         diagnostics = ["ess", "log_likelihood", *["innovation", "nis"] * bool(of_reading)]
         super().__init__(
             nn.Identity(),
             [forecast_key, log_weight_key, log_likelihood_key, *of_reading],
-            [(belief_key, name) for name in ("ensemble", "log_weight", "mean", "var")]
-            + [(info_key, name) for name in diagnostics],
+            [(belief_prefix, name) for name in ("ensemble", "log_weight", "mean", "var")]
+            + [(info_prefix, name) for name in diagnostics],
             optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
         check_number("tempering", tempering, above=0)
-        self.tempering, self.info_key = tempering, info_key
+        self.tempering, self.info_prefix = tempering, info_prefix
         self.angles: list[int] = [] if likelihood is None else likelihood.angles
         self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
 

@@ -16,7 +16,6 @@ from torch import nn
 from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
-from torch_denkf.functional import unicycle_jacobians
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import check_module, reads, run_module
 from torch_denkf.modules._tensors import (
@@ -29,9 +28,8 @@ from torch_denkf.modules._tensors import (
 )
 from torch_denkf.modules.noise import ConstantNoise
 from torch_denkf.modules.stochastic import StochasticMLP
-from torch_denkf.modules.unicycle import check_dt, keys_of_dt
 
-__all__ = ["CholeskyNoise", "MappedNoise", "UnicycleNoise", "as_process_noise"]
+__all__ = ["CholeskyNoise", "MappedNoise", "NoiseThrough", "as_process_noise"]
 
 _BELIEF_MEAN, _FORECAST_NOISE = ("belief", "mean"), ("forecast", "noise")
 
@@ -150,8 +148,8 @@ class CholeskyNoise(SubModel):
         return factor @ factor.mT + self.floor.to(raw.dtype).diag_embed()
 
 
-class _MappedNoise(SubModel):
-    """Runs another noise module and writes G Q G^T in its place, in the same entry; a subclass gives G."""
+class NoiseThrough(SubModel):
+    """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G."""
 
     def __init__(self, noise: TensorDictModuleBase, in_keys: Sequence[NestedKey]):
         check_module("noise", noise)
@@ -181,7 +179,7 @@ class _MappedNoise(SubModel):
         raise NotImplementedError
 
 
-class MappedNoise(_MappedNoise):
+class MappedNoise(NoiseThrough):
     r"""Noise that enters through a known matrix: :math:`G Q G^T`, e.g. some dimensions of the state alone.
 
     Args:
@@ -208,51 +206,3 @@ class MappedNoise(_MappedNoise):
 
     def _matrix(self, entries):
         return self.matrix
-
-
-class UnicycleNoise(_MappedNoise):
-    r"""Noise of the velocities of a vehicle, which moves its pose in the same step.
-
-    :class:`~torch_denkf.modules.UnicycleTransition` moves the pose with the *new* velocities, and an ensemble's noise
-    is in those. A covariance that is added to the velocities *after* the motion would leave the pose of that step
-    uncorrelated with them, and an innovation of the velocities would not correct it. Here
-    :math:`Q = G Q_v G^T` with :math:`G = \partial (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
-
-    Args:
-        noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and
-            (rad/s)^2; its keys are kept. In a filter it may read ``("belief", "mean")``.
-        dt: time step in seconds, or the key of an entry ``[*B, 1]``, as of the transition.
-        belief_key: mean at t-1, ``[*B, S]``, starting with [x, y, theta, v, theta_dot]; further dimensions, such as
-            clones, get no noise.
-        forecast_key: mean of the forecast, ``[*B, S]``; the filter puts it there.
-
-    Raises:
-        ValueError: if the noise does not have two dimensions.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> noise = UnicycleNoise(CholeskyNoise(2, r=[0.5, 0.1], in_features=5), dt=0.1)
-        >>> mean = torch.tensor([0.0, 0.0, 0.0, 10.0, 0.0])
-        >>> td = TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}})
-        >>> noise(td)["forecast", "noise"][0, 3]  # covariance of x and v: dt times the variance of v
-        tensor(0.0250, grad_fn=...)
-    """
-
-    def __init__(
-        self,
-        noise: TensorDictModuleBase,
-        dt: float | NestedKey,
-        *,
-        belief_key: NestedKey = _BELIEF_MEAN,
-        forecast_key: NestedKey = ("forecast", "mean"),
-    ):
-        check_dt(dt)
-        super().__init__(noise, [belief_key, forecast_key, *keys_of_dt(dt)])
-        self.belief_key, self.forecast_key, self.dt = unravel_key(belief_key), unravel_key(forecast_key), dt
-
-    def _matrix(self, entries):
-        before, forecast = self.required(entries, self.belief_key), self.required(entries, self.forecast_key)
-        dt = self.required(entries, self.dt) if keys_of_dt(self.dt) else self.dt
-        _, moved = unicycle_jacobians(before[..., :3], forecast[..., 3:5], dt)
-        own = torch.eye(2, dtype=moved.dtype, device=moved.device).expand(*moved.shape[:-2], 2, 2)
-        return F.pad(torch.cat([moved, own], -2), (0, 0, 0, forecast.shape[-1] - 5))

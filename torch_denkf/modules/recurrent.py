@@ -7,6 +7,7 @@ filters with a mean and a covariance, so that objectives, metrics and environmen
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -16,79 +17,64 @@ from torch.nn import functional as F
 from torchrl.modules import LSTMCell
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import unicycle_jacobians, unicycle_move
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._call import Entries
 from torch_denkf.modules._tensors import as_vector, mean_of_members
-from torch_denkf.modules.unicycle import check_dt, keys_of_dt
+from torch_denkf.modules.carried import Beside
 
-__all__ = ["LSTMTransition", "LSTMUpdate", "UnicyclePose", "WithMemory"]
+__all__ = ["LSTMTransition", "LSTMUpdate", "with_memory"]
 
 _MEMORY = ("hidden", "cell")
 _MOMENTS = ("mean", "cov")
 _MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memory ends
 
 
-class WithMemory(SubModel):
+def with_memory(
+    initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_prefix: str = "belief"
+) -> Beside:
     """An initial belief with an empty memory: hidden and cell states of zero, as in ``torch.nn.LSTM``.
 
     Args:
         initial: the initial belief with a mean: :class:`MomentPrior`, :class:`GaussianAround`.
         hidden_size: H.
         num_layers: L.
-        belief_key: prefix of what is written: that of ``initial``, and ``hidden`` and ``cell`` ``[*B, L, H]``.
+        belief_prefix: prefix of what is written: that of ``initial``, and ``hidden`` and ``cell`` ``[*B, L, H]``.
 
     Example:
         >>> from tensordict import TensorDict
         >>> from torch_denkf.modules import MomentPrior
-        >>> start = WithMemory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)
+        >>> start = with_memory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)
         >>> start(TensorDict({}, [3]))["belief", "hidden"].shape
         torch.Size([3, 1, 8])
     """
+    check_count("hidden_size", hidden_size)
+    check_count("num_layers", num_layers)
+    begin = partial(_empty, (belief_prefix, "mean"), (num_layers, hidden_size))
+    return Beside(initial, [(belief_prefix, name) for name in _MEMORY], begin, nested=True)
 
-    def __init__(
-        self, initial: TensorDictModuleBase, hidden_size: int, *, num_layers: int = 1, belief_key: str = "belief"
-    ):
-        check_module("initial", initial)
-        check_count("hidden_size", hidden_size)
-        check_count("num_layers", num_layers)
-        out_keys = [(belief_key, name) for name in _MEMORY]
-        needed, optional = reads(initial)
-        super().__init__(initial, needed, [*initial.out_keys, *out_keys], optional_keys=optional)
-        self.belief_key, self.memory_shape = belief_key, (num_layers, hidden_size)
-        for name in ("state_dim", "observation_dim", "input_dim"):  # what the primer asks for
-            if getattr(initial, name, None) is not None:
-                setattr(self, name, getattr(initial, name))
 
-    def parts(self):
-        """The initial belief."""
-        return {"initial": self.module}
-
-    def on_entries(self, entries, call):
-        """The belief and its memory."""
-        written = run_module(self.module, entries, call.part("initial"))
-        empty = written[self.belief_key, "mean"].new_zeros(*call.batch_size, *self.memory_shape)
-        return {**written, **dict.fromkeys(self.out_keys[-2:], empty)}
+def _empty(key: NestedKey, shape: tuple[int, int], belief: Entries, batch_size: torch.Size) -> list[torch.Tensor]:
+    return [belief[key].new_zeros(*batch_size, *shape)] * len(_MEMORY)
 
 
 class LSTMTransition(SubModel):
     """Hands memory, mean and covariance of the last belief on: an LSTM has no forecast before it sees its input.
 
     Args:
-        belief_key: prefix of ``hidden``, ``cell``, ``mean`` and ``cov`` of the last belief.
-        forecast_key: prefix of the same, unchanged.
+        belief_prefix: prefix of ``hidden``, ``cell``, ``mean`` and ``cov`` of the last belief.
+        forecast_prefix: prefix of the same, unchanged.
 
     Example:
         >>> from tensordict import TensorDict
         >>> from torch_denkf.modules import MomentPrior
-        >>> td = WithMemory(MomentPrior(torch.ones(2), torch.eye(2)), hidden_size=8)(TensorDict({}))
+        >>> td = with_memory(MomentPrior(torch.ones(2), torch.eye(2)), hidden_size=8)(TensorDict({}))
         >>> LSTMTransition()(td)["forecast", "mean"]
         tensor([1., 1.])
     """
 
-    def __init__(self, *, belief_key: str = "belief", forecast_key: str = "forecast"):
+    def __init__(self, *, belief_prefix: str = "belief", forecast_prefix: str = "forecast"):
         names = (*_MEMORY, *_MOMENTS)
-        in_keys, out_keys = ([(key, name) for name in names] for key in (belief_key, forecast_key))
+        in_keys, out_keys = ([(key, name) for name in names] for key in (belief_prefix, forecast_prefix))
         super().__init__(nn.Identity(), in_keys, out_keys)
 
     def compute(self, *values):
@@ -122,9 +108,10 @@ class LSTMUpdate(SubModel):
         extra_keys: further inputs ``[*B, n]``, which are not masked, e.g. ``"steps"`` or ``"action"``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; what it hides may be NaN. The encoding counts as
             observed where any component is.
-        forecast_key: prefix of ``hidden`` and ``cell`` of the last step.
-        memory_key: prefix of ``hidden`` and ``cell`` ``[*B, L, H]``, written.
-        belief_key: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``, written.
+        forecast_prefix: prefix of ``hidden`` and ``cell`` of the last step.
+        memory_prefix: prefix of ``hidden`` and ``cell`` ``[*B, L, H]``, written.
+        belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``,
+            written.
 
     Raises:
         ValueError: if there is nothing to read, or an input has another size than was said.
@@ -138,7 +125,7 @@ class LSTMUpdate(SubModel):
         >>> from tensordict import TensorDict
         >>> from torch_denkf.modules import MomentPrior
         >>> td = TensorDict({("sensor", "encoding"): torch.randn(3, 16)}, [3])
-        >>> td = LSTMTransition()(WithMemory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)(td))
+        >>> td = LSTMTransition()(with_memory(MomentPrior(torch.zeros(2), torch.eye(2)), hidden_size=8)(td))
         >>> LSTMUpdate(2, features=16, hidden_size=8)(td)["belief", "mean"].shape
         torch.Size([3, 2])
     """
@@ -162,11 +149,16 @@ class LSTMUpdate(SubModel):
         observation_key: NestedKey | None = None,
         extra_keys: Sequence[NestedKey] = (),
         observed_key: NestedKey = "observed",
-        forecast_key: str = "forecast",
-        memory_key: str = "belief",
-        belief_key: str = "belief",
+        forecast_prefix: str = "forecast",
+        memory_prefix: str = "belief",
+        belief_prefix: str = "belief",
     ):
-        check_count("features", features, least=0)
+        for name, size in (
+            ("features", features),
+            ("observation_dim", observation_dim),
+            ("extra_features", extra_features),
+        ):
+            check_count(name, size, least=0)
         for key, size, name in (
             (encoding_key, features, "features"),
             (observation_key, observation_dim, "observation_dim"),
@@ -189,8 +181,8 @@ class LSTMUpdate(SubModel):
         inputs = [key for key in (encoding_key, observation_key) if key is not None]
         super().__init__(
             nn.ModuleDict({"cells": nn.ModuleList(cells), **heads}),
-            [(forecast_key, name) for name in _MEMORY] + [*inputs, *extra_keys],
-            [(memory_key, name) for name in _MEMORY] + [(belief_key, name) for name in (*_MOMENTS, "var")],
+            [(forecast_prefix, name) for name in _MEMORY] + [*inputs, *extra_keys],
+            [(memory_prefix, name) for name in _MEMORY] + [(belief_prefix, name) for name in (*_MOMENTS, "var")],
             optional_keys=[observed_key],
         )
         self.encoding_key, self.observation_key, self.extra_keys = encoding_key, observation_key, list(extra_keys)
@@ -261,57 +253,3 @@ class LSTMUpdate(SubModel):
                 "extra_features=."
             )
         return features
-
-
-class UnicyclePose(SubModel):
-    r"""A vehicle's pose from estimated velocities: the known motion is not left for a network to learn.
-
-    .. math::
-        p_t = f(p_{t-1}, u_t), \qquad
-        P_t = F P_{t-1} F^T + G \Sigma_t G^T, \qquad
-        \mathrm{Cov}(p_t, u_t) = G \Sigma_t
-
-    with the motion f of :class:`UnicycleTransition`, its Jacobians F and G, and velocities :math:`u_t \sim N(\mu_t,
-    \Sigma_t)`. To first order, and as if errors of the velocities at different times were independent: where they are
-    not (a biased network), the pose is less certain than this says.
-
-    Args:
-        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
-        velocity_key: prefix of ``mean`` ``[*B, 2]`` and ``cov`` ``[*B, 2, 2]`` of (v m/s, theta_dot rad/s) at t.
-        forecast_key: prefix of ``mean`` ``[*B, 5]`` and ``cov`` of [x m, y m, theta rad, v, theta_dot] at t-1, as
-            :class:`LSTMTransition` hands them on.
-        belief_key: prefix of ``mean``, ``cov`` and ``var`` at t, written.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> td = TensorDict({
-        ...     "forecast": {"mean": torch.zeros(5), "cov": torch.zeros(5, 5)},
-        ...     "velocity": {"mean": torch.tensor([10.0, 0.0]), "cov": torch.eye(2)},
-        ... })
-        >>> td = UnicyclePose(0.1)(td)
-        >>> td["belief", "mean"].tolist(), td["belief", "var"].tolist()
-        ([1.0, 0.0, 0.0, 10.0, 0.0], [0.01..., 0.0025..., 0.01..., 1.0, 1.0])
-    """
-
-    def __init__(
-        self,
-        dt: float | NestedKey,
-        *,
-        velocity_key: str = "velocity",
-        forecast_key: str = "forecast",
-        belief_key: str = "belief",
-    ):
-        check_dt(dt)
-        in_keys = [(key, name) for key in (forecast_key, velocity_key) for name in _MOMENTS] + keys_of_dt(dt)
-        super().__init__(nn.Identity(), in_keys, [(belief_key, name) for name in (*_MOMENTS, "var")])
-        self.dt = dt
-
-    def compute(self, mean, cov, velocity, velocity_cov, dt=None):
-        """The belief."""
-        pose, dt = mean[..., :3], self.dt if dt is None else dt
-        by_pose, by_velocity = unicycle_jacobians(pose, velocity, dt)
-        cross = by_velocity @ velocity_cov
-        pose_cov = by_pose @ cov[..., :3, :3] @ by_pose.mT + cross @ by_velocity.mT
-        cov = torch.cat([torch.cat([pose_cov, cross], -1), torch.cat([cross.mT, velocity_cov], -1)], -2)
-        moved = unicycle_move(pose, velocity, dt)
-        return torch.cat([moved, velocity], -1), cov, cov.diagonal(dim1=-2, dim2=-1)

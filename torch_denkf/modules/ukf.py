@@ -49,7 +49,7 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
     Args:
         transition: see :class:`EKFTransition`.
         process_noise: likewise.
-        alpha: see :func:`torch_denkf.functional.unscented_weights`.
+        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
         beta: likewise.
         kappa: likewise.
         **keys: see :class:`GaussianTransitionKeys`. The covariance of the last analysis may be singular.
@@ -94,7 +94,7 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
 
     Args:
         observation: see :class:`EKFAnalysis`.
-        alpha: see :func:`torch_denkf.functional.unscented_weights`.
+        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
         beta: likewise.
         kappa: likewise.
         **options: see :class:`GaussianAnalysisOptions`.

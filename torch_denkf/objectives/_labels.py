@@ -1,4 +1,4 @@
-"""Which true values are known, and of which components: the one rule of all objectives.
+"""Which true values are known, and of which components: the one rule of all losses.
 
 Labels ``[*B, N]`` are of the leading N components, or of the components that ``dims`` names. What is NaN, what a mask
 of labels leaves out and what is padding is no label: it has no value and no gradient, and no mean counts it.
@@ -6,18 +6,46 @@ of labels leaves out and what is padding is no label: it has no value and no gra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import wrap_angles
 
-__all__ = ["Labels", "check_row_mask", "labels_of", "mask_of", "true_values"]
+if TYPE_CHECKING:
+    from torch_denkf.objectives.filter_loss import FilterLoss
+
+__all__ = ["Keys", "Labels", "Truth", "check_row_mask", "mean_of"]
+
+
+@dataclass
+class Keys:
+    """The entries that all losses read.
+
+    Attributes:
+        state: true state ``[*B, N]``, of the leading N components of the state; NaN where it is not known. Of
+            sequences ``*B`` ends with time, here and below.
+        state_observed: which of them are known, ``[*B, 1]`` or ``[*B, N]``, bool; by default the state's name and
+            ``_observed``, as data sets write it. It may be missing.
+        target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
+            no parameters, it is that model's observation of the true state.
+        target_observed: likewise, of the true observation.
+        observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
+        sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+    """
+
+    state: NestedKey = "state"
+    state_observed: NestedKey | None = None
+    target_observation: NestedKey = "target_observation"
+    target_observed: NestedKey | None = None
+    observed: NestedKey = "observed"
+    sensor: NestedKey = ("sensor", "ensemble")
 
 
 class Labels(NamedTuple):
@@ -28,25 +56,31 @@ class Labels(NamedTuple):
         mask: ``[*B, N]``, True where there is one.
         dims: of the N components those that count.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
+        angles: components that are angles, whose errors are wrapped.
     """
 
     values: Tensor
     mask: Tensor
     dims: Sequence[int]
-    scale: Tensor | None
+    scale: Tensor | None = None
+    angles: Sequence[int] = ()
 
     @property
     def rows(self) -> Tensor:
         """Which elements have a label, ``[*B]``."""
         return self.mask.any(-1)
 
-    def errors(self, estimate: Tensor, angles: Sequence[int] = ()) -> Tensor:
+    def errors(self, estimate: Tensor) -> Tensor:
         """Scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label."""
         values, mask = self.values, self.mask
         if estimate.ndim > values.ndim:
             values, mask = values.unsqueeze(-2), mask.unsqueeze(-2)
-        errors = wrap_angles(estimate - values, angles)
+        errors = wrap_angles(estimate - values, self.angles)
         return torch.where(mask, errors if self.scale is None else errors / self.scale, 0)
+
+    def mean(self, scores: Tensor) -> Tensor:
+        """The mean of scores ``[*B, N]`` over the components that have a label, ``[*B]``."""
+        return mean_of(scores, self.mask)
 
     def in_all_components(self, name: str, value: Tensor) -> Tensor:
         """One number for each of the N components, 1 where none is given.
@@ -69,96 +103,140 @@ class Labels(NamedTuple):
         out[list(self.dims)] = value
         return out
 
-
-def labels_of(known: Tensor, dims: Sequence[int], name: str, scale: Tensor | None) -> Labels:
-    """What counts of true values.
-
-    Args:
-        known: ``[*B, N]``, NaN where there is no label, see :func:`true_values`.
-        dims: components that count.
-        name: of the scale, for the message.
-        scale: see :meth:`Labels.in_all_components`; a component with infinite scale does not count.
-
-    Raises:
-        ValueError: if the scale has another length.
-    """
-    mask = ~known.isnan()
-    if not isinstance(dims, range):
-        chosen = torch.zeros(known.shape[-1], dtype=torch.bool, device=known.device)
-        chosen[list(dims)] = True
-        mask = mask & chosen
-    labels = Labels(known, mask, dims, None)
-    if scale is not None:
-        scale = labels.in_all_components(name, scale)
-        counting = scale.isfinite()
-        mask, scale = mask & counting, torch.where(counting, scale, 1)
-    return Labels(torch.where(mask, known, 0), mask, dims, scale)
+    def scaled(self, name: str, scale: Tensor | None, angles: Sequence[int]) -> Labels:
+        """With angles, and a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
+        if scale is None:
+            return self._replace(angles=angles)
+        scale = self.in_all_components(name, scale)
+        mask = self.mask & scale.isfinite()
+        scale = torch.where(scale.isfinite(), scale, 1)
+        return Labels(torch.where(mask, self.values, 0), mask, self.dims, scale, angles)
 
 
-def true_values(
-    key: NestedKey,
-    values: Tensor,
-    size: int,
-    batch_size: Sequence[int],
-    *,
-    observed: Tensor | None = None,
-    observed_key: NestedKey = "",
-    padding: Sequence[Tensor] = (),
-    dims: Sequence[int] | None = None,
-) -> Tensor:
-    """Labels in the places of their components, ``[*B, size]``, NaN where there is none.
+class Truth:
+    """What is known of a batch: the labels that terms are scored against, and what the filter wrote.
 
     Args:
-        key: theirs, for messages.
-        values: ``[*B, N]``: of the leading components; or of ``dims``, in their order, where that is N components of
-            which the last are beyond the first N.
-        size: components that there are.
-        batch_size: ``[*B]``.
-        observed: which of them are labels, ``[*B, 1]`` or ``[*B, N]``, bool.
-        observed_key: of this mask, for messages.
-        padding: masks ``[*B]`` or ``[*B, 1]``, False where an element is padding.
-        dims: components that count.
-
-    Raises:
-        ValueError: if values or mask have another shape, or ``dims`` names components that there are not.
-
-    Example:
-        >>> labels = torch.tensor([[1.0], [2.0]])
-        >>> true_values("state", labels, 2, [2], observed=torch.tensor([[True], [False]]), observed_key="seen")
-        tensor([[1., nan],
-                [nan, nan]])
+        loss: whose names of entries, dimensions, scales and angles count.
+        data: the batch.
+        out: the batch with what the filter, or its part, wrote.
     """
-    batch = list(batch_size)
-    if values.ndim != len(batch) + 1 or list(values.shape[:-1]) != batch or not values.shape[-1]:
-        raise ValueError(
-            f"{key!r} must be [*B, N] = {[*batch, 'N']}, N labels in each element of the batch; got "
-            f"{list(values.shape)}. Reshape it, e.g. by unsqueeze(-1)"
-        )
-    given = values.shape[-1]
-    last = max(dims) if dims is not None else given - 1
-    if last >= size:
-        what = f"{key!r} is {list(values.shape)}" if dims is None else f"dims={list(dims)} names component {last}"
-        raise ValueError(
-            f"{what}, but what is scored against it has {size} components. Labels are of the leading ones, at most "
-            f"{size}, or of dims=..., counted from 0"
-        )
-    if dims is not None and last >= given != len(dims):
-        raise ValueError(
-            f"dims={list(dims)} names component {last}, but {key!r} has {given}, from 0, which are taken for the "
-            f"leading ones; pass these, or one for each of dims"
-        )
-    known = torch.ones_like(values[..., :1], dtype=torch.bool)
-    if observed is not None:
-        check_row_mask(observed_key, observed, values)
-        known = known & observed
-    for mask in padding:
-        known = known & mask.reshape(*batch, 1)
-    values = torch.where(known, values, torch.nan)
-    if dims is not None and last >= given:
+
+    def __init__(self, loss: FilterLoss, data: TensorDictBase, out: TensorDictBase):
+        self.loss, self.keys, self.data, self.out = loss, loss.tensor_keys, data, out
+
+    def entry(self, key: NestedKey, cure: str = "", *, given: bool = False) -> Tensor:
+        """An entry that the filter wrote, or that is ``given`` in the batch.
+
+        Raises:
+            KeyError: if it is missing; the message ends with the ``cure``.
+        """
+        source = self.data if given else self.out
+        value = source.get(key, None)
+        if value is None:
+            present = ", ".join(sorted(map(str, source.keys(True, True))))
+            raise KeyError(
+                f"{type(self.loss).__name__} reads {key!r}, which is missing; there are {present}. {cure}Rename it "
+                "with loss.set_keys(...)."
+            )
+        return value
+
+    @cached_property
+    def counts(self) -> Tensor:
+        """Which elements the filter stepped to, ``[*B]``."""
+        return self.loss._counts(self.data)
+
+    def state(self, size: int) -> Labels:
+        """The true state as far as it counts, against an estimate of ``size`` components."""
+        labels = self._labels("state", self.entry(self.keys.state, given=True), size, self.loss.dims)
+        return labels.scaled("state_scale", self.loss.state_scale, self.loss.angles)
+
+    def observation(self, target: Tensor, size: int) -> Labels:
+        """True observations ``target``, as far as they count, against readings of ``size`` components."""
+        scale, angles = self.loss.observation_scale, self.loss.observation_angles
+        return self._labels("target", target, size).scaled("observation_scale", scale, angles)
+
+    def whole_state(self) -> Labels:
+        """The true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
+
+        Raises:
+            ValueError: if the labels lack dimensions.
+        """
+        values = self.entry(self.keys.state, given=True)
+        given = values.shape[-1]
+        size = self.state_size() or given
+        labels = self._labels("state", values, size)
+        if given < size:
+            raise ValueError(
+                f"{type(self.loss).__name__} needs the whole true state of {size} dimensions, but "
+                f"{self.keys.state!r} has {given}. Add the others, with NaN in the rows that have no label"
+            )
+        return labels._replace(mask=labels.mask.all(-1, keepdim=True))
+
+    def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
+        """What a model observes in the true state; what it makes of NaN is NaN: no label."""
+        values, dims = self.entry(self.keys.state, given=True), self.loss.dims
+        size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))
+        return observe(self._known("state", values, size, dims))
+
+    def state_size(self) -> int | None:
+        """S, of the belief where there is one; ``None`` where nobody says."""
+        filter = self.loss.filter
+        values = (self.out.get(key, None) for key in filter.structure.carry if key[-1] in ("ensemble", "mean"))
+        sizes = (value.shape[-1] for value in values if value is not None)
+        return next(sizes, getattr(filter.initial, "state_dim", None))
+
+    def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
+        known = self._known(name, values, size, dims)
+        dims = range(min(values.shape[-1], size)) if dims is None else dims
+        counting = torch.zeros(size, dtype=torch.bool, device=known.device)
+        counting[list(dims)] = True
+        mask = ~known.isnan() & counting
+        return Labels(torch.where(mask, known, 0), mask, dims)
+
+    def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
+        """Labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
+
+        They are of the leading N components; or of ``dims``, in their order, where that is N components of which the
+        last are beyond the first N.
+
+        Raises:
+            ValueError: if values or mask have another shape, or ``dims`` names components that there are not.
+        """
+        key = self.keys.state if name == "state" else self.keys.target_observation
+        batch, given = list(self.data.batch_size), values.shape[-1] if values.ndim else 0
+        if list(values.shape) != [*batch, given] or not given:
+            raise ValueError(
+                f"{key!r} must be [*B, N] = {[*batch, 'N']}, N labels in each element of the batch; got "
+                f"{list(values.shape)}. Reshape it, e.g. by unsqueeze(-1)"
+            )
+        last = given - 1 if dims is None else max(dims)
+        if last >= size:
+            what = f"{key!r} is {list(values.shape)}" if dims is None else f"dims={list(dims)} names component {last}"
+            raise ValueError(
+                f"{what}, but what is scored against it has {size} components. Labels are of the leading ones, at most "
+                f"{size}, or of dims=..., counted from 0"
+            )
+        if dims is not None and last >= given != len(dims):
+            raise ValueError(
+                f"dims={list(dims)} names component {last}, but {key!r} has {given}, from 0, which are taken for the "
+                f"leading ones; pass these, or one for each of dims"
+            )
+        known = torch.ones_like(values[..., :1], dtype=torch.bool)
+        observed_key = getattr(self.keys, f"{name}_observed") or mask_of(key)
+        observed = self.data.get(observed_key, None)
+        if observed is not None:
+            check_row_mask(observed_key, observed, values)
+            known = known & observed
+        for mask_key in self.loss._loss_mask_keys():
+            padding = self.data.get(mask_key, None)
+            if padding is not None:
+                known = known & padding.reshape(*batch, 1)
+        values = torch.where(known, values, torch.nan)
+        places = range(min(given, size)) if dims is None or last < given else dims
         placed = values.new_full((*batch, size), torch.nan)
-        placed[..., list(dims)] = values
+        placed[..., list(places)] = values[..., : len(places)]
         return placed
-    return pad(values[..., :size], (0, size - min(given, size)), value=torch.nan)
 
 
 def check_row_mask(key: NestedKey, mask: Tensor, values: Tensor) -> None:
@@ -180,3 +258,13 @@ def mask_of(key: NestedKey) -> NestedKey:
     """
     key = unravel_key(key)
     return f"{key}_observed" if isinstance(key, str) else (*key[:-1], f"{key[-1]}_observed")
+
+
+def mean_of(values: Tensor, mask: Tensor) -> Tensor:
+    """The mean over the last dimension of what a mask leaves in, ``[*]``; zero of nothing.
+
+    Example:
+        >>> mean_of(torch.tensor([1.0, 5.0]), torch.tensor([False, True]))
+        tensor(5.)
+    """
+    return torch.where(mask, values, 0).sum(-1) / mask.sum(-1).clamp(min=1)

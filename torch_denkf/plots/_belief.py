@@ -8,7 +8,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.functional import ensemble_cov, ensemble_mean, ensemble_var, weighted_mean, weighted_var
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.moments import ensemble_cov
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
 Truth: TypeAlias = Tensor | NestedKey | None
 

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_denkf.metrics import ensemble_interval, wrap_angle
+from torch_denkf.functional import wrap_angle
+from torch_denkf.metrics.calibration import ensemble_interval
 from torch_denkf.plots._axes import (
     BELIEF,
     READING,

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_denkf.metrics import histogram_band, pit, rank_histogram
+from torch_denkf.metrics import pit
+from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots._axes import FILL, TRUTH, axes_for, labels_for, legend_above
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tensordict import TensorDictBase
 
-from torch_denkf.metrics import spread_error
+from torch_denkf.metrics.calibration import spread_error
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, factors_for, labels_for, legend_above
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
 

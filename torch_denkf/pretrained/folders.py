@@ -8,14 +8,12 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from torch_denkf import _registered
 from torch_denkf._files import write_text
-from torch_denkf.deployment.folder import CONFIG, load_folder, save_folder
+from torch_denkf.deployment.folder import load_folder, save_folder
 from torch_denkf.filters import Filter
-from torch_denkf.pretrained.models import BUILDERS
 
 __all__ = ["available", "from_pretrained", "save_pretrained"]
-
-_WEIGHTS = Path(__file__).parent / "weights"
 
 
 def available() -> list[str]:
@@ -25,7 +23,7 @@ def available() -> list[str]:
         >>> available()
         ['car-odometry', 'reacher', 'ur5-table']
     """
-    return sorted(file.parent.name for file in _WEIGHTS.glob(f"*/{CONFIG}"))
+    return sorted(_registered.weights())
 
 
 def from_pretrained(
@@ -55,14 +53,15 @@ def from_pretrained(
     if not isinstance(name_or_folder, str | os.PathLike):
         raise TypeError(f"name_or_folder is a name or a path, such as 'car-odometry'; got {name_or_folder!r}")
     folder = Path(name_or_folder).expanduser()
-    if str(name_or_folder) in available():  # a folder of that name is loaded as "./car-odometry"
-        folder = _WEIGHTS / str(name_or_folder)
+    shipped = _registered.weights()
+    if str(name_or_folder) in shipped:  # a folder of that name is loaded as "./car-odometry"
+        folder = shipped[str(name_or_folder)]
     elif not folder.is_dir():
         raise FileNotFoundError(
             f"there is no trained filter {str(name_or_folder)!r} and no such folder; the library comes with "
-            f"{', '.join(available())}"
+            f"{', '.join(shipped)}"
         )
-    return load_folder(folder, {**BUILDERS, **(builders or {})})  # type: ignore[return-value]
+    return load_folder(folder, {**_registered.builders(), **(builders or {})})  # type: ignore[return-value]
 
 
 def save_pretrained(
@@ -80,8 +79,9 @@ def save_pretrained(
     keys, schemes, shapes, whatever does not come back with the weights. Where the two differ, nothing is written.
 
     Args:
-        model: one that a function of this library built from settings, such as :func:`torch_denkf.odometry.car_filter`.
-            For another one pass ``builder`` and ``settings``.
+        model: one that a function of this library built from settings, such as
+            :func:`torch_denkf.applications.car.odometry.filter.car_filter`. For another one pass ``builder`` and
+        ``settings``.
         folder: gets ``weights.safetensors`` and ``config.json``; a filter in it is replaced.
         training: command, seed, data: plain values, for the record alone.
         card: text of ``card.md``, for people: data, command, scores, limits, licence.
@@ -104,21 +104,22 @@ def save_pretrained(
         >>> from torch_denkf.filters import KalmanFilter
         >>> def still(size):
         ...     eye = torch.eye(size)
-        ...     return KalmanFilter(eye, eye, eye, eye, mean=torch.zeros(size), cov=eye)
+        ...     return KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(size), cov=eye)
         >>> folder = save_pretrained(still(2), tempfile.mkdtemp(), builder=still, settings={"size": 2})
         >>> from_pretrained(folder, builders={"still": still}).carry_keys
         [('belief', 'mean'), ('belief', 'cov')]
     """
+    known = _registered.builders()
     own = getattr(model, "settings", None)
     if builder is None and settings is None and is_dataclass(own) and not isinstance(own, type):
-        builder, settings = BUILDERS.get(getattr(model, "builder", "")), asdict(own)
+        builder, settings = known.get(getattr(model, "builder", "")), asdict(own)
     if builder is None or settings is None:
         raise ValueError(
             f"it is not known what builds this {type(model).__name__}; pass builder=FUNCTION and settings={{...}}, a "
             "function of yours and its arguments; from_pretrained then gets it as builders={NAME: function}"
         )
-    name = next((name for name, known in BUILDERS.items() if known is builder), getattr(builder, "__name__", ""))
-    if name not in BUILDERS and not name.isidentifier():
+    name = next((name for name, each in known.items() if each is builder), getattr(builder, "__name__", ""))
+    if name not in known and not name.isidentifier():
         raise TypeError(f"builder is a function with a name, which the folder holds; got {builder!r}")
     folder = save_folder(model, folder, builder=name, settings=settings, training=training, build=builder)
     if card is not None:

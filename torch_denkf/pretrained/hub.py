@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torch_denkf import _registered
 from torch_denkf.deployment.folder import read_folder_config
 from torch_denkf.filters import Filter
 from torch_denkf.pretrained.folders import from_pretrained, save_pretrained
-from torch_denkf.pretrained.models import BUILDERS
 
 try:
     from huggingface_hub import ModelHubMixin, snapshot_download
@@ -69,6 +69,6 @@ class HubFilter(ModelHubMixin, tags=["torch_denkf", "robotics"]):
         download = {name: options[name] for name in known if name in options}
         folder = Path(model_id if Path(model_id).is_dir() else snapshot_download(model_id, **download))
         filter = from_pretrained(folder, builders=builders)
-        config = read_folder_config(folder, {**BUILDERS, **(builders or {})})
+        config = read_folder_config(folder, {**_registered.builders(), **(builders or {})})
         builder = (builders or {}).get(config["builder"])  # a filter of the library knows what builds it
         return cls(filter, builder=builder, settings=config["settings"] if builder else None)

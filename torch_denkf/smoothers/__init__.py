@@ -1,10 +1,16 @@
 """Smoothers: what later readings say about earlier states, on top of any filter."""
 
-from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.ensemble import EnKS, EnRTS
 from torch_denkf.smoothers.fixed_lag import FixedLag
 from torch_denkf.smoothers.iterated import IEnKS
 from torch_denkf.smoothers.particles import ParticleSmoother
 from torch_denkf.smoothers.rts import RTSSmoother
 
-__all__ = ["Smoother", "FixedLag", "EnKS", "EnRTS", "IEnKS", "RTSSmoother", "ParticleSmoother"]
+__all__ = [
+    "FixedLag",
+    "EnKS",
+    "EnRTS",
+    "IEnKS",
+    "RTSSmoother",
+    "ParticleSmoother",
+]

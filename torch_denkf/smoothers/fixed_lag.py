@@ -9,11 +9,12 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import options_of
-from torch_denkf.modules import GatedAnalysis, ResampledTransition
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._running import named_modules_of
-from torch_denkf.modules.past import EnsemblePast, LaggedAnalysis, LaggedBelief, WithEnsemblePast
-from torch_denkf.modules.past_moments import CrossTransition, LaggedMoments, MomentsPast, WithMomentsPast
+from torch_denkf.modules.carried import AnalysisAround
+from torch_denkf.modules.particles import ResampledTransition
+from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedAnalysis, LaggedBelief, with_past
+from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
 
 __all__ = ["FixedLag", "kind_of", "rebuilt"]
 
@@ -57,7 +58,8 @@ class FixedLag(Filter):
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
-        >>> kf = FixedLag(KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one), lag=2)
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> kf = FixedLag(plain, lag=2)
         >>> out = kf.sequence(TensorDict({"observation": torch.ones(4, 1)}, [4]))
         >>> out["smoothed", "age"].flatten(), out["smoothed", "var"][-1] < out["belief", "var"][-1]
         (tensor([0, 1, 2, 2]), tensor([True]))
@@ -72,13 +74,13 @@ class FixedLag(Filter):
         if kind == "moments":
             forecast = filter.structure.forecast_of[prefix, "mean"][0]
             modules[names[place]] = CrossTransition(modules[names[place]], cross_key=(forecast, "cross"))
-            past = MomentsPast(belief_key=prefix, forecast_key=forecast)
-            last = LaggedMoments(belief_key=prefix, forecast_key=forecast)
-            initial = WithMomentsPast(filter.initial, lag, age=age, belief_key=prefix)
+            past = MomentsPast(belief_prefix=prefix, forecast_prefix=forecast)
+            last = LaggedMoments(belief_prefix=prefix, forecast_prefix=forecast)
+            initial = with_past(filter.initial, lag, MOMENTS_PAST, age=age, belief_prefix=prefix)
         else:
-            initial = WithEnsemblePast(filter.initial, lag, age=age, belief_key=prefix)
-            last = LaggedBelief(belief_key=prefix, weighted=kind == "particles")
-            past = EnsemblePast(belief_key=prefix)
+            initial = with_past(filter.initial, lag, ENSEMBLE_PAST, age=age, belief_prefix=prefix)
+            last = LaggedBelief(belief_prefix=prefix, weighted=kind == "particles")
+            past = EnsemblePast(belief_prefix=prefix)
             if kind == "particles":
                 transition = modules[names[place]]
                 modules[names[place]] = transition.with_past((prefix, "past"), ("forecast", "past"))
@@ -157,9 +159,9 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
         nonlocal found
         if type(module) is TensorDictSequential:
             return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
-        if isinstance(module, GatedAnalysis):
+        if isinstance(module, AnalysisAround):
             return module.around(lagged(module.module))
-        if isinstance(module, EnsembleUpdate) or hasattr(module, "info_key"):
+        if isinstance(module, EnsembleUpdate) or hasattr(module, "info_prefix"):
             found = True
             return LaggedAnalysis(module)  # which refuses what it cannot wrap
         return module

@@ -13,7 +13,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters._options import FilterOptions
 from torch_denkf.modules import NoisyTransition, as_process_noise
 from torch_denkf.modules._running import check_module
-from torch_denkf.modules.iterated import IteratedAnalysis, WithSmoothed
+from torch_denkf.smoothers.iterated_analysis import IteratedAnalysis, with_smoothed
 
 __all__ = ["IEnKS"]
 
@@ -98,9 +98,9 @@ class IEnKS(Filter):
             iterations=iterations,
             inflation=inflation,
             rotate=rotate,
-            sensor_key=reading,
+            observation_key=reading,
             noise_variance_key=noise.out_keys[0],
         )
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, analysis=analysis)
-        super().__init__(modules, initial=WithSmoothed(initial), **kwargs)
+        super().__init__(modules, initial=with_smoothed(initial), **kwargs)

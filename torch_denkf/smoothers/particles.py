@@ -10,14 +10,17 @@ from torch import Tensor
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._structure import previous_key
-from torch_denkf.functional import backward_smooth, cholesky, weighted_mean
-from torch_denkf.modules import NoisyTransition, ResampledTransition
+from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.smoothing_particles import backward_smooth
+from torch_denkf.functional.weighted import weighted_mean
+from torch_denkf.modules import NoisyTransition
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance
 from torch_denkf.modules._running import run_module
-from torch_denkf.modules.past import moments_of
+from torch_denkf.modules.particles import ResampledTransition
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.fixed_lag import kind_of
+from torch_denkf.smoothers.past import moments_of
 
 __all__ = ["ParticleSmoother"]
 
@@ -50,7 +53,7 @@ class ParticleSmoother(Smoother):
         ...     LearnedTransition(torch.nn.Linear(2, 2)),
         ...     None,
         ...     Select([0]),
-        ...     GaussianLikelihood(sensor_key="position"),
+        ...     GaussianLikelihood(observation_key="position"),
         ...     noise=ConstantNoise([0.1], in_key="position"),
         ...     initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=50),
         ...     process_noise=0.1,

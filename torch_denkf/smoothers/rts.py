@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from torch_denkf.filters import Filter
-from torch_denkf.functional import rts_smooth
-from torch_denkf.modules.past_moments import CrossTransition
+from torch_denkf.functional.smoothing import rts_smooth
 from torch_denkf.smoothers.base import Smoother
 from torch_denkf.smoothers.fixed_lag import kind_of, rebuilt
+from torch_denkf.smoothers.past_moments import CrossTransition
 
 __all__ = ["RTSSmoother"]
 
@@ -34,7 +34,8 @@ class RTSSmoother(Smoother):
         >>> from tensordict import TensorDict
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(1)
-        >>> smoother = RTSSmoother(KalmanFilter(one, one, one, one, mean=torch.zeros(1), cov=one))
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> smoother = RTSSmoother(plain)
         >>> out = smoother(TensorDict({"observation": torch.ones(4, 1)}, [4]))
         >>> out["smoothed", "var"][:-1] < out["belief", "var"][:-1]
         tensor([[True],

@@ -1,10 +1,8 @@
 """Training of filters, in stages; then their one number."""
 
 from torch_denkf.training.calibration import choose, choose_for_coverage, hold_last
-from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.logs import RunLogs
-from torch_denkf.training.parts import parameters_without, train_part
 from torch_denkf.training.stage import Stage
 from torch_denkf.training.trainer import FilterTrainer
 
@@ -16,8 +14,4 @@ __all__ = [
     "choose",
     "choose_for_coverage",
     "hold_last",
-    "parameters_without",
-    "read_checkpoint",
-    "train_part",
-    "write_checkpoint",
 ]

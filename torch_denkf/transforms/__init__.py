@@ -3,7 +3,6 @@
 from torch_denkf.filters._primer import LastAction
 from torch_denkf.transforms.denkf import DEnKFTransform
 from torch_denkf.transforms.disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
-from torch_denkf.transforms.flow import OpticalFlow
 from torch_denkf.transforms.hold import HoldReading
 from torch_denkf.transforms.missing import MissingFrames
 
@@ -16,6 +15,5 @@ __all__ = [
     "LastAction",
     "MissingFrames",
     "OccludingBox",
-    "OpticalFlow",
     "SaltAndPepper",
 ]

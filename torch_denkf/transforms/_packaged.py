@@ -13,7 +13,7 @@ __all__ = ["PackagedRun", "Step"]
 
 
 class Step(Protocol):
-    """A packaged step, such as :class:`torch_denkf.deployment.PackagedStep`."""
+    """A packaged step, such as :class:`torch_denkf.deployment.package.PackagedStep`."""
 
     @property
     def inputs(self) -> Mapping[str, tuple[tuple[int, ...], str]]:

@@ -14,8 +14,8 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
-from torch_denkf.filters import Filter, Monitored
-from torch_denkf.filters._checks import is_finite, refuse_far_belief, refuse_unguarded
+from torch_denkf.filters import Filter
+from torch_denkf.filters._checks import is_finite, masks_in, refuse_far_belief, refuse_unguarded
 from torch_denkf.filters._entries import own
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._one_step import first_belief
@@ -23,8 +23,6 @@ from torch_denkf.filters._primer import refuse_resets_of_groups
 from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
 from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
 from torch_denkf.filters._steps import where_rows
-from torch_denkf.modules import InnovationMonitor
-from torch_denkf.smoothers import FixedLag
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
@@ -56,13 +54,10 @@ class DEnKFTransform(Checked, Transform):
     environment without one is refused.
 
     Args:
-        filter: any :class:`~torch_denkf.filters.Filter`, or a ``TensorDictSequential`` of TensorDict modules with
-            its ``initial`` belief.
+        filter: any :class:`~torch_denkf.filters.Filter`, also one inside a :class:`~torch_denkf.smoothers.FixedLag` or
+            a :class:`~torch_denkf.monitoring.Monitored`; or a ``TensorDictSequential`` of TensorDict modules with its
+            ``initial`` belief.
         initial: the initial belief of a plain ``TensorDictSequential``.
-        lag: fixed-lag smoothing: beside the belief of t what is believed of t - lag, ``("smoothed", "mean")``,
-            ``("smoothed", "var")`` and what else :class:`~torch_denkf.smoothers.FixedLag` writes; ``None`` for none.
-        monitor: watches the innovations: beside the belief an alarm, and what speaks for it, see
-            :class:`~torch_denkf.modules.InnovationMonitor`; ``None`` for none.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
         store_ensemble: if ``False``, rollouts and collected data hold means and variances alone; the
             ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
@@ -79,8 +74,7 @@ class DEnKFTransform(Checked, Transform):
             worker, because it cannot be pickled. Resets and specs come from ``filter``.
 
     Raises:
-        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``, or cannot be
-            smoothed although there is a ``lag``.
+        TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
         KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
@@ -89,7 +83,7 @@ class DEnKFTransform(Checked, Transform):
         >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
         >>> from torch_denkf.filters import KalmanFilter
         >>> one = torch.eye(7)
-        >>> kf = KalmanFilter(one, one, one, one, mean=torch.zeros(7), cov=one)
+        >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(7), cov=one)
         >>> env = TransformedEnv(ContinuousActionVecMockEnv(), DEnKFTransform(kf))
         >>> env.rollout(3)["next", "belief", "mean"].shape
         torch.Size([3, 7])
@@ -100,8 +94,6 @@ class DEnKFTransform(Checked, Transform):
         filter: Filter | TensorDictSequential,
         *,
         initial: TensorDictModuleBase | None = None,
-        lag: int | None = None,
-        monitor: InnovationMonitor | None = None,
         diagnostics: Sequence[NestedKey] = (),
         store_ensemble: bool = True,
         no_grad: bool = True,
@@ -117,13 +109,9 @@ class DEnKFTransform(Checked, Transform):
             filter = Filter(*filter._module_iter(), initial=initial)
         elif initial is not None:
             raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
-        if lag is not None:
-            filter = FixedLag(filter, lag)
-        if monitor is not None:
-            filter = Monitored(filter, monitor)
         structure, self._reject = filter.structure, filter.reject or not check_finite
         if self._reject:
-            refuse_unguarded(filter)
+            refuse_unguarded(structure, type(filter).__name__)
         written = [*structure.out_keys, *([REJECTED] if self._reject else [])]
         inner = {filter.outer(key): key for key in written}
         further = [inner.get(key, key) for key in map(unravel_key, diagnostics)]
@@ -265,9 +253,10 @@ class DEnKFTransform(Checked, Transform):
 
     def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
-        refuse_far_belief(entries, self.filter.structure.carry)
         finite = all(is_finite(key, entries[key]) for key in self.filter.structure.carry)
         absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
+        if not absurd:  # otherwise it is the reading that took the belief there
+            refuse_far_belief(entries, self.filter.structure.carry)
         if finite and not absurd:
             return
         given = {key: entries[key] for key in self.in_keys if key in entries}
@@ -277,12 +266,12 @@ class DEnKFTransform(Checked, Transform):
                 f"NaN or infinity in {inputs}" if inputs else f"a reading of more than {LARGEST_READING:g} in {absurd}"
             )
             raise ValueError(
-                f"The belief became {'not to be trusted' if finite else 'non-finite'} because of {what}. Where a frame "
-                f"is missing or broken, set {self._optional} to False for it (it is then not read), or repair it in a "
-                "transform before DEnKFTransform. With check_finite=False such readings count as missing."
+                f"The new belief is not {'to be trusted' if finite else 'finite'}, because of {what}. Where a frame is "
+                f"missing or broken, set {masks_in(self._optional)} to False for it (it is then not read), or repair "
+                "it in a transform before DEnKFTransform. With check_finite=False such readings count as missing."
             )
         raise ValueError(
-            f"The belief became non-finite although all of {self.in_keys} are finite: the filter diverged. Look at "
+            f"The new belief is not finite although all of {self.in_keys} are finite: the filter diverged. Look at "
             "the transition's weights and at the noise floor; normalise the state; clip gradients in training."
         )
 

@@ -60,7 +60,7 @@ class DEnKF(G1Recipe):
         if encoders:
             parts["both"] = WithEncoders(self.target.size, self.target.encoder_std, len(encoders))
             keys = {
-                "sensor_key": ("both", "ensemble"),
+                "observation_key": ("both", "ensemble"),
                 "noise_variance_key": ("both", "noise"),
                 "observed_key": ("both", "observed"),
             }

@@ -7,7 +7,8 @@ from collections import OrderedDict
 from benchmarks.common.arms import AtRest
 from benchmarks.g1.recipes._base import G1Recipe, register
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.modules import GaussianAround, WithMemory
+from torch_denkf.modules import GaussianAround
+from torch_denkf.modules.recurrent import with_memory
 from torch_denkf.objectives import GaussianLoss
 
 HIDDEN = 128
@@ -38,7 +39,7 @@ class LSTM(G1Recipe):
 
     def _initial(self, std, rates):
         size = self.target.size
-        return WithMemory(AtRest(GaussianAround(std, state_key="start"), size, size, "start"), HIDDEN)
+        return with_memory(AtRest(GaussianAround(std, state_key="start"), size, size, "start"), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from benchmarks.common.recipes import Particles
 from benchmarks.g1.recipes._base import G1Recipe, register
-from torch_denkf.modules import AroundState, NoisyTransition, WithWeights
+from torch_denkf.modules import AroundState, NoisyTransition
+from torch_denkf.modules.particles import with_weights
 
 
 @register
@@ -21,4 +22,4 @@ class DPF_M(Particles, G1Recipe):
         return NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True)
 
     def belief(self, std):
-        return WithWeights(AroundState(std, ensemble_size=self.particles, state_key="start"))
+        return with_weights(AroundState(std, ensemble_size=self.particles, state_key="start"))

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from benchmarks.common.recipes import Recipe, Registry
 from benchmarks.kitti.folds import VELOCITIES, Statistics
+from torch_denkf.applications.car import FlowSensor, PairObservation, UnicycleTransition
 from torch_denkf.filters import Filter
-from torch_denkf.modules import DiagonalNoise, FlowSensor, PairObservation, StochasticMLP, SubModel, UnicycleTransition
+from torch_denkf.modules import DiagonalNoise, StochasticMLP, SubModel
 
 REACH = 3.1  # m between the two frames of a pair that the flow sensor can read
 HISTORY = ("belief", "history")  # velocities of the past steps

@@ -8,8 +8,11 @@ from tensordict.nn import TensorDictSequential
 
 from benchmarks.kitti.recipes._base import HISTORY, KITTIRecipe, register
 from benchmarks.kitti.sensors import SAMPLES
-from torch_denkf.modules import AroundState, EnsembleAnalysis, MemberGain, StochasticMLP, UnicycleMotion, WithHistory
-from torch_denkf.odometry.car import velocity_analysis
+from torch_denkf.applications.car import UnicycleMotion
+from torch_denkf.applications.car.modules.pairs import with_history
+from torch_denkf.applications.car.odometry.filter import velocity_analysis
+from torch_denkf.modules import AroundState, EnsembleAnalysis, StochasticMLP
+from torch_denkf.modules.noise import MemberGain
 
 LAGS = 4  # past steps that an innovation may still correct
 
@@ -38,7 +41,7 @@ class DEnKF(KITTIRecipe):
         )
 
     def initial(self, std, state_key):
-        return WithHistory(AroundState(std, ensemble_size=self.size, state_key=state_key), LAGS)
+        return with_history(AroundState(std, ensemble_size=self.size, state_key=state_key), LAGS)
 
     def loss(self, model):
         return self.ensemble_loss(model)

@@ -8,10 +8,10 @@ import torch
 
 from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
+from torch_denkf.applications.car import UnicycleNoise
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
 from torch_denkf.modules import (
     CholeskyNoise,
-    ClonedPrior,
-    ClonedTransition,
     DiagonalNoise,
     EKFAnalysis,
     EKFTransition,
@@ -20,7 +20,6 @@ from torch_denkf.modules import (
     SubModel,
     UKFAnalysis,
     UKFTransition,
-    UnicycleNoise,
 )
 
 

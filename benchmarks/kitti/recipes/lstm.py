@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from benchmarks.kitti.recipes._base import INITIAL_STD, KITTIRecipe, register
+from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.modules import GaussianAround, WithMemory
+from torch_denkf.modules import GaussianAround
+from torch_denkf.modules.recurrent import with_memory
 from torch_denkf.objectives import GaussianLoss
 
 HIDDEN = 64  # about as many parameters as the other filters have
@@ -24,7 +26,7 @@ class LSTM(KITTIRecipe):
             None,
             features=self.encoding,
             state_dim=5,
-            dt=facts.dt,
+            motion=UnicyclePose(facts.dt),
             initial=GaussianAround(INITIAL_STD),
             loc=facts.loc,
             scale=facts.scale,
@@ -35,10 +37,10 @@ class LSTM(KITTIRecipe):
             extra_keys=("steps",),
             extra_features=1,
         )
-        return OrderedDict((name, whole[name]) for name in ("transition", "lstm", "pose"))
+        return OrderedDict((name, whole[name]) for name in ("transition", "lstm", "motion"))
 
     def initial(self, std, state_key):
-        return WithMemory(GaussianAround(std, state_key=state_key), HIDDEN)
+        return with_memory(GaussianAround(std, state_key=state_key), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

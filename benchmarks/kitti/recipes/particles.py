@@ -7,7 +7,9 @@ import torch
 from benchmarks.common.recipes import Particles
 from benchmarks.kitti.recipes._base import KITTIRecipe, register
 from benchmarks.kitti.streams import LONGEST
-from torch_denkf.modules import AroundState, ClonedPrior, ClonedTransition, DiagonalNoise, NoisyTransition, WithWeights
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition
+from torch_denkf.modules import AroundState, DiagonalNoise, NoisyTransition
+from torch_denkf.modules.particles import with_weights
 
 
 class _Particles(Particles, KITTIRecipe):
@@ -34,7 +36,7 @@ class _Particles(Particles, KITTIRecipe):
 
     def initial(self, std, state_key):
         around = AroundState(std, ensemble_size=self.particles, state_key=state_key)
-        return WithWeights(ClonedPrior(around, LONGEST - 1))
+        return with_weights(ClonedPrior(around, LONGEST - 1))
 
 
 @register

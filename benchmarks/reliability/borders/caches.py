@@ -11,49 +11,52 @@ from typing import Any
 import torch
 from tensordict import NonTensorData, TensorDict
 
+from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders import kitti, lerobot, recordings, ur5
-from benchmarks.reliability.case import Case
-from benchmarks.reliability.damage import BYTES, copied, gone, same, written
-from benchmarks.reliability.hostile import MARK, Bomb, ran
+from benchmarks.reliability.damage import copied, gone, instead, same
+from benchmarks.reliability.hostile import MARK, Bomb
+from benchmarks.reliability.target import Target
 
+#: What is kept, and how it is read with a cache.
 READERS: dict[str, tuple[Callable[[], Path], Callable[..., TensorDict]]] = {
-    "kitti": (kitti.sound, kitti.read),
-    "lerobot": (partial(lerobot.sound, 2), lerobot.read),
-    "ur5": (ur5.sound, ur5.read),
-    "recordings": (recordings.sound, partial(recordings.read, camera="images")),
+    "kitti": (kitti.sound, lambda root, cache: kitti.read(root, cache=cache)),
+    "lerobot": (partial(lerobot.sound, 2), lambda root, cache: lerobot.read(root, cache=cache)),
+    "ur5": (ur5.sound, lambda root, cache: ur5.read(root, cache=cache)),
+    "recordings": (
+        recordings.sound,
+        lambda root, cache: recordings.read(root, camera="images", replay={"cache": cache}),
+    ),
 }
-PARTS = ("largest", "smallest", "description")
 
 
-def _read(name: str, root: Path, cache: Any) -> TensorDict:
-    read = READERS[name][1]
-    if name == "recordings":
-        return read(root, replay={"cache": cache})
-    return read(root, cache=cache)
-
-
-def _again(name: str, change: Callable[[Path], Any], folder: Path) -> tuple[TensorDict, TensorDict, bool, list[str]]:
-    """What is read the first time, and again with a changed entry; whether code ran, and what is left half written."""
-    root, cache = copied(READERS[name][0](), folder), folder / "cache"
-    first = _read(name, root, cache).clone()
+def _again(name: str, change: d.Change, folder: Path) -> tuple[TensorDict, TensorDict, list[str]]:
+    """What is read the first time, and again with a changed entry; and what is left half written."""
+    sound, read = READERS[name]
+    root, cache = copied(sound(), folder), folder / "cache"
+    first = read(root, cache).clone()
     (entry,) = [path for path in cache.iterdir() if path.is_dir() and not path.name.startswith(".")]
     change(entry)
-    second = _read(name, root, cache).clone()
-    return first, second, ran(folder), [path.name for path in cache.iterdir() if path.name.startswith(".writing")]
+    second = read(root, cache).clone()
+    return first, second, [path.name for path in cache.iterdir() if path.name.startswith(".writing")]
 
 
-def _right(result: tuple[TensorDict, TensorDict, bool, list[str]]) -> bool:
-    first, second, code_ran, left = result
-    return not code_ran and not left and same(second, first)
+def _right(result: tuple[TensorDict, TensorDict, list[str]]) -> bool:
+    first, second, left = result
+    return not left and same(second, first)
 
 
-def _file(entry: Path, part: str) -> Path:
-    files = sorted(
-        (path for path in entry.rglob("*") if path.is_file()), key=lambda path: (path.stat().st_size, path.name)
-    )
-    if part == "description":
-        return next(path for path in files if path.suffix == ".json")
-    return files[-1] if part == "largest" else next(path for path in files if path.suffix != ".json")
+def of_part(part: str, change: d.Change) -> d.Change:
+    """Changes a file of an entry."""
+
+    def act(entry: Path) -> None:
+        paths = sorted(
+            (path for path in entry.rglob("*") if path.is_file()), key=lambda path: (path.stat().st_size, path.name)
+        )
+        described = [path for path in paths if path.suffix == ".json"]
+        tensors = [path for path in paths if path.suffix != ".json"]
+        change({"largest": paths[-1], "smallest": tensors[0], "description": described[0]}[part])
+
+    return act
 
 
 def _planted(entry: Path) -> None:
@@ -83,36 +86,33 @@ def _half_written(entry: Path) -> None:
     gone(entry)
 
 
-CHANGES: dict[str, Callable[[Path], Any]] = {
-    "planted": _planted,
-    "a pickle beside": _pickle_beside,
-    "pickles as tensors": _pickle_inside,
-    "emptied": lambda entry: [gone(path) for path in entry.iterdir()],
-    "a file in its place": lambda entry: (gone(entry), entry.write_text("")),
-    "a link to nowhere in its place": lambda entry: (gone(entry), entry.symlink_to("nowhere")),
-    "left half written by a killed process": _half_written,
-    "a file more": lambda entry: (entry / "more").write_text("x"),
-}
+ENTRIES = d.Wrong(
+    {
+        "planted": _planted,
+        "a pickle beside": _pickle_beside,
+        "pickles as tensors": _pickle_inside,
+        "emptied": lambda entry: [gone(path) for path in entry.iterdir()],
+        "a file in its place": instead(Path.touch),
+        "a link to nowhere in its place": instead(lambda entry: entry.symlink_to("nowhere")),
+        "left half written by a killed process": _half_written,
+        "a file more": lambda entry: (entry / "more").write_text("x"),
+    }
+)
+NO_FOLDER = d.Wrong({"in a file": "file/below", "in a device": "/dev/null/below", "a number": 3})
 
 
-def cases() -> Iterator[Case]:
+def _nowhere(name: str, cache: Any, folder: Path) -> TensorDict:
+    (folder / "file").touch()
+    sound, read = READERS[name]
+    return read(copied(sound(), folder), cache if isinstance(cache, int) else folder / cache)
+
+
+def targets() -> Iterator[Target]:
     """All changed entries."""
-    for make, _ in READERS.values():
-        make()  # here, not in each case's process
-    for name in READERS:
-        for part in PARTS:
-            for what, change in BYTES.items():
-                act = partial(_again, name, lambda entry, part=part, change=change: written(_file(entry, part), change))
-                yield Case("caches", f"{name}: {part} file {what}", ("cache",), act, _right)
-            act = partial(_again, name, lambda entry, part=part: gone(_file(entry, part)))
-            yield Case("caches", f"{name}: {part} file taken away", ("cache",), act, _right)
-        for what, change in CHANGES.items():
-            yield Case("caches", f"{name}: an entry {what}", ("cache",), partial(_again, name, change), _right)
-        for what, cache in {"in a file": "file/below", "in a device": "/dev/null/below", "a number": 3}.items():
-
-            def act(folder: Path, name: str = name, cache: Any = cache) -> Any:
-                (folder / "file").write_text("")
-                place = cache if isinstance(cache, int) or cache.startswith("/") else folder / cache
-                return _read(name, copied(READERS[name][0](), folder), place)
-
-            yield Case("caches", f"{name}: cache {what}", ("cache",), act)
+    for name, (sound, _) in READERS.items():
+        act, words = partial(_again, name), ("cache",)
+        for part in ("largest", "smallest", "description"):
+            wrong = (d.SEALED.each(d.written) | d.PLACES).each(partial(of_part, part))
+            yield Target("caches", f"{name}, {part} file", words, act, wrong, _right, needs=sound)
+        yield Target("caches", f"{name}, entry", words, act, ENTRIES, _right, needs=sound)
+        yield Target("caches", f"{name}, cache", words, partial(_nowhere, name), NO_FOLDER, needs=sound)

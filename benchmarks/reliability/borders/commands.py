@@ -10,15 +10,20 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from hypothesis import strategies as st
+
 import torch_denkf.cli._command as command_module
-from benchmarks.reliability.borders import kitti, pretrained, ur5
-from benchmarks.reliability.case import Case, Refused, apart, workshop
-from benchmarks.reliability.damage import BYTES, copied, gone, written
+from benchmarks.reliability import damage as d
+from benchmarks.reliability.borders import kitti, pretrained, recordings, ur5
+from benchmarks.reliability.case import Refused, apart, workshop
+from benchmarks.reliability.damage import copied, gone, in_lines, on_row
+from benchmarks.reliability.target import Target
+from torch_denkf.applications.car import track
+from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.car.odometry.paths import write_path
 from torch_denkf.cli.main import main
-from torch_denkf.odometry import load_car_filter, track, write_path
 
 WITHIN = 60.0
-Change = Callable[[Path], Any]
 
 
 def run(words: Sequence[str]) -> str:
@@ -48,14 +53,13 @@ def base() -> Path:
     """A folder with a drive, demos, a path, and a trained filter."""
     root = workshop() / "work"
     root.mkdir()
-    for source in (kitti.sound(), ur5.sound(), pretrained.FOLDERS / "car-odometry"):
+    for source in (kitti.sound(), ur5.sound(), pretrained.FOLDERS["car-odometry"]):
         copied(source, root)
 
     def path() -> None:
         import cv2
 
-        images = sorted(kitti.image(root / "kitti").parent.iterdir())
-        frames = [cv2.imread(str(file)) for file in images]
+        frames = [cv2.imread(str(file)) for file in sorted((root / "kitti" / kitti.IMAGES).iterdir())]
         car = load_car_filter(root / "car-odometry")
         for _ in write_path(track(car, frames, (41.7, 41.7, 35.5, 11.5), fps=10.0), root / "path.csv"):
             pass
@@ -64,17 +68,15 @@ def base() -> Path:
     return root
 
 
-DRIVE = "kitti/sequences/town"
-ODOMETRY = {
-    "": f"{DRIVE}/image_2",
-    "--calibration": f"{DRIVE}/calib.txt",
-    "--times": f"{DRIVE}/times.txt",
-    "--checkpoint": "./car-odometry",
-    "--out": "out",
-    "--no-pictures": None,
-}
 COMMANDS: dict[str, dict[str, Any]] = {
-    "odometry": ODOMETRY,
+    "odometry": {
+        "": f"kitti/{kitti.IMAGES}",
+        "--calibration": f"kitti/{kitti.CALIBRATION_FILE}",
+        "--times": f"kitti/{kitti.TIME_FILE}",
+        "--checkpoint": "./car-odometry",
+        "--out": "out",
+        "--no-pictures": None,
+    },
     "evaluate": {"--checkpoint": "./car-odometry", "--root": "kitti", "--draws": 1, "--window": 3, "--out": "out"},
     "plot": {"": "path.csv", "--out": "out"},
     "render-kitti": {"--out": "out", "--names": "a", "--frames": 3, "--size": "12 36", "--processes": 1},
@@ -91,258 +93,218 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "collect-ur5": {"--out": "out", "--demos": 1, "--no-pixels": None, "--max-steps": 4, "--processes": 1},
     "demo": {"--out": "out", "--frames": 30},
 }
-NUMBER = {"text": "x", "nan": "nan", "inf": "inf", "negative": "-1"}
-WHOLE = {"text": "x", "a fraction": "1.5", "negative": "-1"}
-POSITIVE = {**NUMBER, "zero": "0"}
-AT_LEAST_ONE = {**WHOLE, "zero": "0"}
-NO_FOLDER = {"a file": "path.csv", "in a file": "path.csv/below", "in a device": "/dev/null/x"}
-NOTHING = {"not there": "nowhere", "empty": ""}
-WRONG: dict[str, dict[str, dict[str, str]]] = {
+FRACTIONS = st.floats(0.01, 9.99).map(lambda number: round(number, 2)).filter(lambda number: number % 1)
+BELOW = st.integers(-(10**6), -1).map(str)
+PITCH = d.Wrong({"text": "x", "nan": "nan", "inf": "inf"})
+NUMBER = d.Wrong({**PITCH.named, "negative": "-1"}, d.drawn(BELOW))
+WHOLE = d.Wrong({"text": "x", "a fraction": "1.5", "negative": "-1"}, d.drawn(FRACTIONS.map(str) | BELOW))
+POSITIVE, AT_LEAST_ONE = NUMBER | {"zero": "0"}, WHOLE | {"zero": "0"}
+NO_FOLDER = d.Wrong({"a file": "path.csv", "in a file": "path.csv/below", "in a device": "/dev/null/x"})
+NOTHING = d.Wrong({"not there": "nowhere", "empty": ""})
+NO_FILE = NOTHING | {"a folder": "kitti", "another file": "path.csv"}
+WITHOUT_DRIVES = {"a folder without drives": "ur5"}
+#: Wrong values of options, where they mean the same in all commands.
+OPTIONS = {
+    "--out": NO_FOLDER,
+    "--calibration": NO_FILE,
+    "--times": NO_FILE,
+    "--checkpoint": NOTHING | {"a folder without one": "kitti"},
+    "--camera": d.Wrong({"unknown": "image_9"}),
+    "--size": d.Wrong({"zero": "0 10", "negative": "-4 10", "one number": "10", "text": "a b"}),
+    "--pitch": PITCH,
+    **dict.fromkeys(("--height", "--fps", "--focal"), POSITIVE),
+    **dict.fromkeys(("--seed", "--sensor-updates", "--filter-updates", "--end-to-end-updates"), WHOLE),
+    **dict.fromkeys(("--threads", "--processes", "--draws", "--window", "--frames", "--length"), AT_LEAST_ONE),
+    **dict.fromkeys(("--demos", "--max-steps", "--every"), AT_LEAST_ONE),
+}
+
+
+def _of(shared: str, /, **own: d.Wrong | dict[str, str]) -> dict[str, d.Wrong]:
+    """The options of a command by name, and those whose wrong values are its own."""
+    given = {f"--{name.replace('_', '-')}": wrong for name, wrong in own.items()}
+    wrong = {name: values if isinstance(values, d.Wrong) else d.Wrong(values) for name, values in given.items()}
+    return {f"--{name}": OPTIONS[f"--{name}"] for name in shared.split()} | wrong
+
+
+WRONG: dict[str, dict[str, d.Wrong]] = {
     "odometry": {
-        "": {"not there": "nowhere", "a text file": f"{DRIVE}/times.txt", "an empty folder": "kitti/poses"},
-        "--calibration": {**NOTHING, "a folder": "kitti", "another file": "path.csv"},
-        "--times": {**NOTHING, "a folder": "kitti", "another file": "path.csv"},
-        "--checkpoint": {**NOTHING, "a folder without one": "kitti"},
-        "--out": NO_FOLDER,
-        "--camera": {"unknown": "image_9"},
-        "--height": POSITIVE,
-        "--pitch": {"text": "x", "nan": "nan", "inf": "inf", "a right angle": "1.5708"},
-        "--seed": WHOLE,
-        "--black-level": {**WHOLE, "beyond 255": "300"},
-        "--threads": AT_LEAST_ONE,
-        "--fps": POSITIVE,
-        "--nothing": {"no such option": "1"},
+        "": d.Wrong(
+            {"not there": "nowhere", "a text file": f"kitti/{kitti.TIME_FILE}", "an empty folder": "kitti/poses"}
+        ),
+        **_of(
+            "calibration times checkpoint out camera height seed threads fps",
+            pitch=PITCH | {"a right angle": "1.5708"},
+            black_level=WHOLE | {"beyond 255": "300"},
+            nothing={"no such option": "1"},
+        ),
     },
-    "evaluate": {
-        "--checkpoint": {**NOTHING, "a folder without one": "kitti"},
-        "--root": {**NOTHING, "a file": "path.csv", "a folder without drives": "ur5"},
-        "--drives": {"unknown": "nope", "outside": "../../etc"},
-        "--out": NO_FOLDER,
-        "--camera": {"unknown": "image_9"},
-        "--size": {"zero": "0 10", "negative": "-4 10", "one number": "10", "text": "a b"},
-        "--height": POSITIVE,
-        "--pitch": {"text": "x", "nan": "nan", "inf": "inf"},
-        "--missing": {**NUMBER, "beyond one": "1.5"},
-        "--draws": AT_LEAST_ONE,
-        "--window": AT_LEAST_ONE,
-        "--seed": WHOLE,
-        "--threads": AT_LEAST_ONE,
-    },
+    "evaluate": _of(
+        "checkpoint out camera size height pitch draws window seed threads",
+        root=NOTHING | WITHOUT_DRIVES | {"a file": "path.csv"},
+        drives={"unknown": "nope", "outside": "../../etc"},
+        missing=NUMBER | {"beyond one": "1.5"},
+    ),
     "plot": {
-        "": {"not there": "nowhere", "a folder without one": "kitti"},
-        "--out": NO_FOLDER,
-        "--level": {**POSITIVE, "one": "1"},
+        "": d.Wrong({"not there": "nowhere", "a folder without one": "kitti"}),
+        **_of("out", level=POSITIVE | {"one": "1"}),
     },
-    "render-kitti": {
-        "--out": NO_FOLDER,
-        "--poses": {**NOTHING, "a folder without poses": "ur5", "a file": "path.csv"},
-        "--names": {"outside": "../../x", "absolute": "/tmp/fuzz-outside", "empty": "", "a dot": "."},
-        "--size": {"zero": "0 10", "negative": "-4 10", "one number": "10", "text": "a b"},
-        "--frames": AT_LEAST_ONE,
-        "--seed": WHOLE,
-        "--camera": {"unknown": "image_9"},
-        "--focal": POSITIVE,
-        "--processes": AT_LEAST_ONE,
-    },
-    "train": {
-        "--out": NO_FOLDER,
-        "--root": {**NOTHING, "a folder without drives": "ur5"},
-        "--test": {"unknown": "nope"},
-        "--rendered": {**WHOLE, "one": "1"},
-        "--frames": AT_LEAST_ONE,
-        "--size": {"zero": "0 10", "negative": "-4 10", "one number": "10", "text": "a b"},
-        "--height": POSITIVE,
-        "--sensor-updates": WHOLE,
-        "--filter-updates": WHOLE,
-        "--end-to-end-updates": WHOLE,
-        "--length": AT_LEAST_ONE,
-        "--seed": WHOLE,
-        "--device": {"unknown": "abacus", "not there": "cuda:77"},
-        "--threads": AT_LEAST_ONE,
-        "--processes": AT_LEAST_ONE,
-    },
-    "collect-ur5": {
-        "--out": NO_FOLDER,
-        "--demos": AT_LEAST_ONE,
-        "--size": {"zero": "0", "negative": "-4", "three numbers": "4 4 4", "text": "x"},
-        "--frames": WHOLE,
-        "--domain": {"unknown": "moon"},
-        "--tasks": {"unknown": "juggle", "twice": "pick pick"},
-        "--seed": WHOLE,
-        "--max-steps": AT_LEAST_ONE,
-        "--noise": NUMBER,
-        "--processes": AT_LEAST_ONE,
-    },
-    "demo": {
-        "--out": NO_FOLDER,
-        "--root": {"without a drive": "kitti"},
-        "--drive": {"without a root": "town"},
-        "--height": {"text": "x"},
-        "--frames": {**AT_LEAST_ONE, "too few": "10"},
-        "--every": AT_LEAST_ONE,
-        "--seed": {"text": "x", "negative": "-1"},
-        "--threads": AT_LEAST_ONE,
-    },
+    "render-kitti": _of(
+        "out size frames seed camera focal processes",
+        poses=NOTHING | {"a folder without poses": "ur5", "a file": "path.csv"},
+        names={"outside": "../../x", "absolute": "/tmp/fuzz-outside", "empty": "", "a dot": "."},
+    ),
+    "train": _of(
+        "out frames size height sensor-updates filter-updates end-to-end-updates length seed threads processes",
+        root=NOTHING | WITHOUT_DRIVES,
+        test={"unknown": "nope"},
+        rendered=WHOLE | {"one": "1"},
+        device={"unknown": "abacus", "not there": "cuda:77"},
+    ),
+    "collect-ur5": _of(
+        "out demos seed max-steps processes",
+        size={"zero": "0", "negative": "-4", "three numbers": "4 4 4", "text": "x"},
+        frames=WHOLE,
+        domain={"unknown": "moon"},
+        tasks={"unknown": "juggle", "twice": "pick pick"},
+        noise=NUMBER,
+    ),
+    "demo": _of(
+        "out every threads",
+        root={"without a drive": "kitti"},
+        drive={"without a root": "town"},
+        height={"text": "x"},
+        frames=AT_LEAST_ONE | {"too few": "10"},
+        seed={"text": "x", "negative": "-1"},
+    ),
 }
 ALSO: dict[tuple[str, str], tuple[str, ...]] = {
+    ("odometry", ""): ("FRAMES_OR_VIDEO",),
+    ("plot", ""): ("FRAMES_OR_VIDEO",),
     ("odometry", "--times"): ("fps",),
     ("odometry", "--fps"): ("times",),
-    ("render-kitti", "--names"): ("name", "names"),
+    ("render-kitti", "--names"): ("name",),
     ("train", "--rendered"): ("--root",),
     ("train", "--root"): ("sequences",),
-    ("evaluate", "--root"): ("sequences", "root"),
+    ("evaluate", "--root"): ("sequences",),
     ("evaluate", "--drives"): ("sequences", "poses"),
     ("demo", "--root"): ("--drive",),
     ("demo", "--drive"): ("--root",),
 }
-
-OPTIONAL = {("demo", "--out"), ("evaluate", "--out"), ("plot", "--out")}
+NEEDED = {
+    "odometry": ("--calibration", "--out"),
+    "evaluate": ("--root",),
+    **dict.fromkeys(("render-kitti", "train", "collect-ur5"), ("--out",)),
+}
+LEFT_OUT = object()
 
 
 def _words(name: str, given: dict[str, Any]) -> list[str]:
     words = [name]
     for option, value in given.items():
-        parts = (
-            [] if value is None else [value] if option in ("", "--out", "--root", "--poses") else str(value).split(" ")
-        )
+        whole = option in ("", "--out", "--root", "--poses")  # others take several words
+        parts = [] if value is None else [value] if whole else str(value).split(" ")
         words += ([option] if option else []) + list(map(str, parts))
     return words
-
-
-def _act(name: str, changes: dict[str, Any], change: Change, folder: Path) -> str:
-    root = copied(base(), folder)
-    change(root)
-    with contextlib.chdir(root):
-        return run(_words(name, {**COMMANDS[name], **changes}))
 
 
 def _nothing(root: Path) -> None:
     """No damage but that of the words."""
 
 
+def act(name: str, changes: dict[str, Any], change: d.Change, folder: Path) -> str:
+    """What a command says of a changed copy, with changed words."""
+    root = copied(base(), folder)
+    change(root)
+    given = {option: value for option, value in {**COMMANDS[name], **changes}.items() if value is not LEFT_OUT}
+    with contextlib.chdir(root):
+        return run(_words(name, given))
+
+
 def _as_without_damage(name: str, changes: dict[str, Any], said: str) -> bool:
     """Right where a command says word for word what it says of sound files, and warns of nothing."""
-    return said == _act(name, changes, _nothing, Path.cwd() / "again")
+    return said == act(name, changes, _nothing, Path.cwd() / "again")
 
 
 def _half_of_the_drive(root: Path) -> None:
     """A drive of which there are five frames, and as many poses."""
-    written(kitti.poses(root / "kitti"), BYTES["cut in half"])
+    d.written(d.BYTES.named["cut in half"])(root / "kitti" / kitti.POSE_FILE)
     for number in range(5, kitti.FRAMES):
-        gone(kitti.image(root / "kitti", number))
+        gone(root / "kitti" / kitti.IMAGES / f"{number:06d}.png")
 
 
 def _as_of_half_the_drive(said: str) -> bool:
     """Right where images without poses are warned of, and the rest is as of a drive without these images."""
     warning, _, table = said.partition("\n")
-    shorter = _act("evaluate", {}, _half_of_the_drive, Path.cwd() / "again")
+    shorter = act("evaluate", {}, _half_of_the_drive, Path.cwd() / "again")
     return "town.txt has 5 poses" in warning and "5 of 10 images" in warning and table == shorter
 
 
+FILTER = ("car-odometry/config.json", "car-odometry/weights.safetensors")
 FILES: dict[str, tuple[str, ...]] = {
-    "odometry": (
-        f"{DRIVE}/calib.txt",
-        f"{DRIVE}/times.txt",
-        "car-odometry/config.json",
-        "car-odometry/weights.safetensors",
-    ),
-    "evaluate": ("kitti/poses/town.txt", f"{DRIVE}/calib.txt", "car-odometry/config.json"),
+    "odometry": (f"kitti/{kitti.CALIBRATION_FILE}", f"kitti/{kitti.TIME_FILE}", *FILTER),
+    "evaluate": (f"kitti/{kitti.POSE_FILE}", f"kitti/{kitti.CALIBRATION_FILE}", FILTER[0]),
     "plot": ("path.csv",),
-    "collect-ur5": ("ur5/demo-000001.npz", "ur5/demos.jsonl"),
+    "collect-ur5": (f"ur5/{ur5.DEMO}", f"ur5/{ur5.MANIFEST}"),
+}
+CELLS = {"text": "far", "nan": "nan"}
+PATH = {f"a cell of {what}": on_row(3, recordings.cell(2, value)) for what, value in CELLS.items()} | {
+    "a cell less": on_row(3, recordings.FIFTH["a column less in a row"]),
+    "only a header": recordings.LINES["only a header"],
+    "another header": on_row(0, lambda line: "a,b,c"),
 }
 
 
-def _files() -> Iterator[Case]:
+def _target(name: str, what: str, file: str, wrong: d.Wrong, changes: Any = None, **more: Any) -> Target:
+    """Changes of a file that a command reads."""
+
+    def damaged(change: d.Change, folder: Path) -> str:
+        return act(name, changes or {}, lambda root: change(root / file), folder)
+
+    options = {"within": WITHIN, "needs": base, **more}
+    return Target("commands", f"{name}, {what}", (Path(file).name,), damaged, wrong, **options)
+
+
+def _files() -> Iterator[Target]:
+    # Of a table's or a description's last byte, which ends a line, nothing depends; of calib.txt, rows of other
+    # cameras may be damaged.
+    def rights(name: str, file: str, changes: dict[str, Any]) -> Callable[[str, Any], Any]:
+        def right(what: str, change: Any) -> Any:
+            if (name, file, what) == ("evaluate", f"kitti/{kitti.POSE_FILE}", "cut in half"):
+                return _as_of_half_the_drive
+            ended = what == "cut by a byte" and not file.endswith((".npz", ".safetensors"))
+            other_rows = file.endswith("calib.txt") and "UTF" not in what and what != "taken away"
+            return partial(_as_without_damage, name, changes) if ended or other_rows else None
+
+        return right
+
+    wrong = d.BYTES.but().each(d.written) | {"taken away": gone}
     for name, files in FILES.items():
+        changes = {} if name != "collect-ur5" else {"--out": "ur5", "--verify": None}
         for file in files:
-            for what, change in BYTES.items():
-                # Of a table's or a description's last byte, which ends a line, nothing depends; of calib.txt, rows of
-                # other cameras may be damaged.
-                sound = ("cut by a byte" in what and not file.endswith((".npz", ".safetensors"))) or (
-                    file.endswith("calib.txt") and "UTF" not in what
-                )
-                changes = {} if name != "collect-ur5" else {"--out": "ur5", "--verify": None}
-                act = partial(_act, name, changes, lambda root, file=file, change=change: written(root / file, change))
-                right = partial(_as_without_damage, name, changes) if sound else None
-                if (name, file, what) == ("evaluate", "kitti/poses/town.txt", "cut in half"):
-                    right = _as_of_half_the_drive
-                yield Case(
-                    "commands", f"{name}, {Path(file).name} {what}", (Path(file).name,), act, right, WITHIN, base
-                )
-            act = partial(_act, name, changes, lambda root, file=file: gone(root / file))
-            yield Case("commands", f"{name}, {Path(file).name} taken away", (Path(file).name,), act, None, WITHIN, base)
-    row: dict[str, Callable[[list[str]], list[str]]] = {
-        "a cell of text": lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "far"), *lines[4:]],
-        "a cell of nan": lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "nan"), *lines[4:]],
-        "a cell less": lambda lines: [*lines[:3], lines[3].rsplit(",", 1)[0], *lines[4:]],
-        "only a header": lambda lines: lines[:1],
-        "another header": lambda lines: ["a,b,c", *lines[1:]],
-    }
-    for what, change in row.items():
-
-        def rewrite(root: Path, change: Callable[[list[str]], list[str]] = change) -> None:
-            file = root / "path.csv"
-            file.write_text("\n".join(change(file.read_text().splitlines())) + "\n")
-
-        act = partial(_act, "plot", {}, rewrite)
-        yield Case("commands", f"plot, path.csv {what}", ("path.csv",), act, None, WITHIN, base)
-    for what, change in {**kitti.POSES, "three poses 1e7 m apart": lambda line: line}.items():
-        if what == "an empty line":
-            continue
-
-        def edit(root: Path, what: str = what, change: Callable[[str], str] = change) -> None:
-            file = kitti.poses(root / "kitti")
-            lines = file.read_text().splitlines()[:3]
-            if what.startswith("three"):
-                lines = [kitti._number(11, str(1e7 * k))(line) for k, line in enumerate(lines)]
-            else:
-                lines[1] = change(lines[1])
-            file.write_text("\n".join(lines) + "\n")
-
-        act = partial(_act, "render-kitti", {"--poses": "kitti/poses", "--names": "town"}, edit)
-        yield Case("commands", f"render-kitti, pose 1: {what}", ("town.txt",), act, None, 20.0, base)
+            yield _target(name, Path(file).name, file, wrong, changes, rights=rights(name, file, changes))
+    yield _target("plot", "path.csv's lines", "path.csv", d.Wrong(PATH).each(in_lines))
+    far = lambda lines: [kitti.number(11, str(1e7 * row))(line) for row, line in enumerate(lines)]  # noqa: E731
+    poses = kitti.POSES.but("an empty line").each(lambda change: on_row(1, change)) | {"three poses 1e7 m apart": far}
+    three = poses.each(lambda change: in_lines(lambda lines: change(lines[:3])))
+    given = {"--poses": "kitti/poses", "--names": "town"}
+    yield _target("render-kitti", "pose 1", f"kitti/{kitti.POSE_FILE}", three, given, within=20.0)
 
 
-def cases() -> Iterator[Case]:
-    """All damaged words and files."""
+def targets() -> Iterator[Target]:
+    """All words and files."""
     for name, options in WRONG.items():
-        for option, values in options.items():
-            for what, value in values.items():
-                changes = {option: value}
-                if (name, option) == ("odometry", "--fps"):
-                    changes["--times"] = None
-                words = (
-                    option or "FRAMES_OR_VIDEO",
-                    option.removeprefix("--").replace("-", "_"),
-                    value,
-                    *ALSO.get((name, option), ()),
-                )
-                shown = _without_times if "--times" in changes and option == "--fps" else _act
-                yield Case(
-                    "commands",
-                    f"{name} {option} {what}",
-                    tuple(filter(None, words)),
-                    partial(shown, name, changes, _nothing),
-                    None,
-                    WITHIN,
-                    base,
-                )
-        for option in COMMANDS[name]:
-            if option in ("--out", "--root", "--calibration") and (name, option) not in OPTIONAL:
-                act = partial(_without, name, option)
-                yield Case("commands", f"{name} without {option}", (option,), act, None, WITHIN, base)
-    yield Case("commands", "an unknown command", ("fly",), lambda folder: run(["fly"]))
-    yield Case("commands", "an option that is none", ("--loud",), lambda folder: run(["info", "--loud"]))
+        for option, wrong in options.items():
+            other = {"--times": LEFT_OUT} if (name, option) == ("odometry", "--fps") else {}
+            use = lambda value, folder, name=name, option=option, other=other: (  # noqa: E731
+                act(name, {option: value, **other}, _nothing, folder)
+            )
+            words = (option, option.removeprefix("--").replace("-", "_"), *ALSO.get((name, option), ()))
+            given = {"within": WITHIN, "needs": base, "said": True}
+            yield Target("commands", f"{name} {option}", tuple(filter(None, words)), use, wrong, **given)
+        for option in NEEDED.get(name, ()):
+            use = lambda option, folder, name=name: act(name, {option: LEFT_OUT}, _nothing, folder)  # noqa: E731
+            without = d.Wrong({"left out": option})
+            yield Target("commands", f"{name} without {option}", (option,), use, without, within=WITHIN, needs=base)
+    no_words = d.Wrong({"an unknown command": ["fly"], "an option that is none": ["info", "--loud"]})
+    yield Target("commands", "words", ("fly", "--loud"), lambda words, folder: run(words), no_words)
     yield from _files()
-
-
-def _without(name: str, option: str, folder: Path) -> str:
-    given = {key: value for key, value in COMMANDS[name].items() if key != option}
-    with contextlib.chdir(copied(base(), folder)):
-        return run(_words(name, given))
-
-
-def _without_times(name: str, changes: dict[str, Any], change: Change, folder: Path) -> str:
-    given = {key: value for key, value in {**COMMANDS[name], **changes}.items() if key != "--times"}
-    with contextlib.chdir(copied(base(), folder)):
-        return run(_words(name, given))

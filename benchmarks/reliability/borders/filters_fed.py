@@ -1,4 +1,4 @@
-"""What filters read: in a step, in a sequence, and in an environment."""
+"""What filters and smoothers read: in a step, in a sequence, and in an environment."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from benchmarks.reliability.case import Case
+from benchmarks.reliability import damage as d
 from benchmarks.reliability.damage import finite, leaves, same
+from benchmarks.reliability.target import Target
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf
 from tests.filters.gaussian_for_tests import linear_filter
@@ -24,56 +26,72 @@ from torch_denkf.transforms import DEnKFTransform
 
 B, T = 3, 4
 AT = (1, 2)  # row and time that are damaged
+NAN, INF = float("nan"), float("inf")
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A filter, and the entry that it reads."""
+class Fed:
+    """A filter or a smoother, and the entry that it reads.
+
+    Args:
+        name: for the record.
+        make: makes it.
+        runs: how it is run.
+        reading: the entry.
+        width: its width.
+        near: a factor of the tolerances of what is rounded.
+        types: whether its belief may also come in other types.
+    """
 
     name: str
-    make: Callable[[], Filter]
+    make: Callable[[], Any]
+    runs: tuple[str, ...] = ("step", "sequence", "transform")
     reading: str = "observation"
     width: int = 2
-    action: bool = False
+    near: float = 1.0
+    types: bool = True
+
+    def seeded(self) -> Any:
+        """The same one each time."""
+        torch.manual_seed(0)
+        return self.make()
+
+    def frames(self) -> TensorDict:
+        """Sound frames ``[B, T]``."""
+        random = torch.Generator().manual_seed(1)
+        frames = TensorDict({self.reading: torch.randn(B, T, self.width, generator=random)}, [B, T])
+        frames["action"] = torch.randn(B, T, 2, generator=random)
+        frames["observed"] = torch.ones(B, T, 1, dtype=torch.bool)
+        frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
+        frames["is_init"][:, 0] = True
+        return frames
+
+    def run(self, run: str, change: Change) -> TensorDict:
+        """What comes of damaged frames."""
+        return RUNS[run](self.seeded(), change(self, self.frames()))
 
 
 def _lstm() -> Filter:
     return LSTMFilter(None, observation_dim=2, state_dim=2, observation_key="observation", hidden_size=8)
 
 
-SUBJECTS = (
-    Subject("KalmanFilter", linear_kalman),
-    Subject("EKF", partial(linear_filter, "EKF")),
-    Subject("UKF", partial(linear_filter, "UKF")),
-    Subject("BackpropKF", partial(linear_filter, "BackpropKF")),
-    Subject("DEnKF, etkf", partial(linear_denkf, "etkf")),
-    Subject("DEnKF, sakov", partial(linear_denkf, "sakov")),
-    Subject("DEnKF, perturbed", partial(linear_denkf, "perturbed", noisy=True)),
-    Subject("DEnKF, learned", toy_denkf, "measurement", 4, True),
-    Subject("ParticleFilter, systematic", partial(bootstrap, 16)),
-    Subject("ParticleFilter, soft", partial(bootstrap, 16, resampling="soft")),
-    Subject("ParticleFilter, transport", partial(bootstrap, 16, resampling="transport")),
-    Subject("LSTMFilter", _lstm),
+FILTERS = (
+    Fed("KalmanFilter", linear_kalman),
+    Fed("EKF", partial(linear_filter, "EKF")),
+    Fed("UKF", partial(linear_filter, "UKF")),
+    Fed("BackpropKF", partial(linear_filter, "BackpropKF")),
+    Fed("DEnKF, etkf", partial(linear_denkf, "etkf")),
+    Fed("DEnKF, sakov", partial(linear_denkf, "sakov")),
+    Fed("DEnKF, perturbed", partial(linear_denkf, "perturbed", noisy=True)),
+    Fed("DEnKF, learned", toy_denkf, reading="measurement", width=4),
+    Fed("ParticleFilter, systematic", partial(bootstrap, 16)),
+    Fed("ParticleFilter, soft", partial(bootstrap, 16, resampling="soft")),
+    Fed("ParticleFilter, transport", partial(bootstrap, 16, resampling="transport")),
+    Fed("LSTMFilter", _lstm),
 )
 
 
 # ------------------------------------------------------------------------------------------------------ what is run
-
-
-def _seeded(make: Callable[[], Filter]) -> Filter:
-    torch.manual_seed(0)
-    return make()
-
-
-def _frames(subject: Subject) -> TensorDict:
-    """Sound frames ``[B, T]``."""
-    random = torch.Generator().manual_seed(1)
-    frames = TensorDict({subject.reading: torch.randn(B, T, subject.width, generator=random)}, [B, T])
-    frames["action"] = torch.randn(B, T, 2, generator=random)
-    frames["observed"] = torch.ones(B, T, 1, dtype=torch.bool)
-    frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
-    frames["is_init"][:, 0] = True
-    return frames
 
 
 def _stepped(filter: Filter, frames: TensorDict) -> TensorDict:
@@ -94,6 +112,12 @@ def _sequence(filter: Filter, frames: TensorDict) -> TensorDict:
     return filter.sequence(frames.copy()).select(*filter.belief_keys)
 
 
+def _smoothed(smoother: Any, frames: TensorDict) -> TensorDict:
+    torch.manual_seed(2)
+    keys = getattr(smoother, "smoothed_keys", None) or [key for key in smoother.out_keys if key[0] == "smoothed"]
+    return smoother.sequence(frames.copy()).select(*keys)
+
+
 def _rollout(filter: Filter, frames: TensorDict, **options: Any) -> TensorDict:
     torch.manual_seed(2)
     inner = ReplayedFrames(frames)
@@ -102,155 +126,204 @@ def _rollout(filter: Filter, frames: TensorDict, **options: Any) -> TensorDict:
     return out["next"].select(*filter.belief_keys)
 
 
-RUNS: dict[str, Callable[[Filter, TensorDict], TensorDict]] = {
+RUNS: dict[str, Callable[[Any, TensorDict], TensorDict]] = {
     "step": _stepped,
     "sequence": _sequence,
     "transform": _rollout,
+    "smoothed": _smoothed,
+    "transform without check_finite": partial(_rollout, check_finite=False),
 }
 
-# --------------------------------------------------------------------------------------------------- what is damaged
+# ----------------------------------------------------------------------------------------------------- what is right
 
-Damage = Callable[[Subject, TensorDict], TensorDict]
-
-
-def _value(value: float, *, whole: bool = False) -> Damage:
-    def damage(subject: Subject, frames: TensorDict) -> TensorDict:
-        if whole:
-            frames[subject.reading][AT] = value
-        else:
-            frames[subject.reading][AT][..., 0] = value
-        return frames
-
-    return damage
+Change = Callable[[Fed, TensorDict], TensorDict]
 
 
-def _entry(change: Callable[[Tensor], Tensor | None], key: str | None = None) -> Damage:
-    def damage(subject: Subject, frames: TensorDict) -> TensorDict:
-        name = key or subject.reading
-        changed = change(frames[name])
-        return frames.exclude(name) if changed is None else frames.set(name, changed)
+@dataclass(frozen=True)
+class Damage:
+    """What is done to frames, and whether a result is right, given whom they were fed to, how, and what was done."""
 
-    return damage
-
-
-#: By what is done to the reading.
-READINGS: dict[str, Damage] = {
-    "a NaN": _value(torch.nan),
-    "all NaN": _value(torch.nan, whole=True),
-    "inf": _value(torch.inf),
-    "-inf": _value(-torch.inf),
-    "1e25": _value(1e25),
-    "-1e38": _value(-1e38, whole=True),
-    "missing": _entry(lambda value: None),
-    "too wide": _entry(lambda value: torch.cat([value, value[..., :1]], -1)),
-    "too narrow": _entry(lambda value: value[..., :1]),
-    "without its last dimension": _entry(lambda value: value[..., 0]),
-    "a dimension more": _entry(lambda value: value[..., None].expand(*value.shape, 3)),
-    "float64": _entry(lambda value: value.double()),
-    "float16": _entry(lambda value: value.half()),
-    "int64": _entry(lambda value: value.round().long()),
-}
-
-MASKS: dict[str, Damage] = {
-    "float": _entry(lambda value: value.float(), "observed"),
-    "int64": _entry(lambda value: value.long(), "observed"),
-    "too wide": _entry(lambda value: value.expand(*value.shape[:-1], 5), "observed"),
-    "without its last dimension": _entry(lambda value: value[..., 0], "observed"),
-}
+    change: Change
+    right: Callable[[Fed, str, Damage, TensorDict], bool] | None = None
 
 
-def _damaged(subject: Subject, run: str, damage: Damage, folder: Path) -> TensorDict:
-    filter = _seeded(subject.make)
-    return RUNS[run](filter, damage(subject, _frames(subject)))
+def _sound(fed: Fed, frames: TensorDict) -> TensorDict:
+    return frames
 
 
-def _reference(subject: Subject, run: str, damage: Damage) -> TensorDict:
-    """The result of frames that are right."""
-    return _damaged(subject, run, damage, Path())
+def _rounded(fed: Fed, frames: TensorDict) -> TensorDict:
+    return frames.set(fed.reading, frames[fed.reading].round())
 
 
-def _unobserved(subject: Subject, frames: TensorDict) -> TensorDict:
+def _unobserved(fed: Fed, frames: TensorDict) -> TensorDict:
     frames["observed"][AT] = False
     return frames
 
 
-def _first_unobserved(subject: Subject, frames: TensorDict) -> TensorDict:
+def _first_unobserved(fed: Fed, frames: TensorDict) -> TensorDict:
     """Only the component that is damaged is hidden."""
-    frames["observed"] = frames["observed"].expand(B, T, subject.width).clone()
+    frames["observed"] = frames["observed"].expand(B, T, fed.width).clone()
     frames["observed"][AT][..., 0] = False
     return frames
 
 
 #: By the width of readings: what may be hidden of one that is damaged. A sensor's is hidden as a whole.
-_HIDES = {2: (_unobserved, _first_unobserved), 4: (_unobserved,)}
+HIDES = {2: (_unobserved, _first_unobserved), 4: (_unobserved,)}
 
 
-def _rounded(subject: Subject, frames: TensorDict) -> TensorDict:
-    return frames.set(subject.reading, frames[subject.reading].round())
+def as_of(change: Change, *, tolerance: float = 0.0, precision: bool = False) -> Callable[..., bool]:
+    """Right where a result is that of other frames, in the filter's own precision if that is asked for."""
+
+    def right(fed: Fed, run: str, damage: Any, result: TensorDict) -> bool:
+        near = tolerance * fed.near
+        numbers = [value for value in leaves(result).values() if value.is_floating_point()]
+        kept = not precision or all(value.dtype == torch.float32 for value in numbers)
+        return kept and finite(result) and same(result, fed.run(run, change), rtol=near, atol=near)
+
+    return right
 
 
-def _sound(subject: Subject, frames: TensorDict) -> TensorDict:
-    return frames
-
-
-def _equals(subject: Subject, run: str, damage: Damage, result: TensorDict, *, tolerance: float = 0.0) -> bool:
-    expected = _reference(subject, run, damage)
-    return finite(result) and same(result, expected, rtol=tolerance, atol=tolerance)
-
-
-def _precision(subject: Subject, run: str, result: TensorDict, *, tolerance: float) -> bool:
-    """Right where the filter's own precision is kept, and the numbers are those of its readings."""
-    kept = all(value.dtype == torch.float32 for value in leaves(result).values() if value.is_floating_point())
-    return kept and _equals(subject, run, _sound, result, tolerance=tolerance)
-
-
-def _large(subject: Subject, run: str, damage: Damage, result: TensorDict) -> bool:
+def large(fed: Fed, run: str, damage: Damage, result: TensorDict) -> bool:
     """Right where a reading is treated as missing, or all is finite and as in double precision."""
-    if _equals(subject, run, _unobserved, result):
+    if as_of(_unobserved)(fed, run, damage, result):
         return True
-    filter = _seeded(subject.make).double()
-    frames = damage(subject, _frames(subject))
-    frames[subject.reading] = frames[subject.reading].double()
-    if run == "transform":
+    frames = damage.change(fed, fed.frames())
+    frames[fed.reading] = frames[fed.reading].double()
+    if run.startswith("transform"):
         frames["action"] = frames["action"].double()
     try:
-        expected = leaves(RUNS[run](filter, frames))
+        expected = leaves(RUNS[run](fed.seeded().double(), frames))
     except Exception:
         return False
     found = leaves(result)
-    for key, value in expected.items():
-        size = value[AT[0]].abs().max()
-        if not torch.allclose(found[key].double(), value, rtol=1e-3, atol=float(1e-3 * size)):
-            return False
-    return finite(result)
+    return finite(result) and all(
+        torch.allclose(found[key].double(), value.double(), rtol=1e-3, atol=1e-3 * float(value[AT[0]].abs().max()))
+        for key, value in expected.items()
+    )
 
 
-def _right(subject: Subject, run: str, what: str, damage: Damage) -> Callable[[TensorDict], bool] | None:
-    """What a right result is, where one may come out."""
-    if what in ("1e25", "-1e38"):
-        return partial(_large, subject, run, damage)
-    if what == "int64":
-        return partial(_equals, subject, run, _rounded, tolerance=1e-6)
-    if what in ("float64", "float16"):
-        return partial(_precision, subject, run, tolerance=1e-5 if what == "float64" else 1e-2)
-    return None
+def goes_on(fed: Fed, run: str, damage: Damage, result: TensorDict) -> bool:
+    """Right where only the row that is damaged is as if it had not been observed, or computed right."""
+    rows = [row for row in range(B) if row != AT[0]]
+    near = {"rtol": 1e-5, "atol": 1e-5}
+    hidden = any(same(result[AT[0]], fed.run("transform", hide)[AT[0]], **near) for hide in HIDES[fed.width])
+    others = same(result[rows], fed.run("transform", _sound)[rows], **near)
+    return finite(result) and others and (hidden or large(fed, "transform", damage, result))
 
 
-def _hidden(value: float) -> Damage:
-    def damage(subject: Subject, frames: TensorDict) -> TensorDict:
-        return _value(value, whole=True)(subject, _unobserved(subject, frames))
-
-    return damage
+# --------------------------------------------------------------------------------------------------- what is damaged
 
 
-# ------------------------------------------------------------------------------------------------------- the belief
+def value(number: float, place: Any = 0, at: tuple[int, int] = AT, right: Any = None) -> Damage:
+    """A number in a reading."""
+
+    def change(fed: Fed, frames: TensorDict) -> TensorDict:
+        frames[fed.reading][at][..., place] = number
+        return frames
+
+    return Damage(change, right)
 
 
-def _carried(subject: Subject, number: int, change: Callable[[Tensor], Tensor | None], folder: Path) -> TensorDict:
+def entry(change: Callable[[Tensor], Tensor | None], right: Any = None, key: str = "") -> Damage:
+    """A changed entry, by default the reading; ``None`` takes it away."""
+
+    def damage(fed: Fed, frames: TensorDict) -> TensorDict:
+        name = key or fed.reading
+        changed = change(frames[name])
+        return frames.exclude(name) if changed is None else frames.set(name, changed)
+
+    return Damage(damage, right)
+
+
+def hidden(number: float) -> Damage:
+    """A number that the mask hides."""
+    return Damage(
+        lambda fed, frames: value(number, slice(None)).change(fed, _unobserved(fed, frames)), as_of(_unobserved)
+    )
+
+
+ALL = slice(None)
+DTYPES = {"float64": torch.float64, "float16": torch.float16, "int64": torch.int64}
+SHAPES: dict[str, Callable[[Tensor], Tensor | None]] = {
+    "missing": lambda value: None,
+    "too wide": lambda value: torch.cat([value, value[..., :1]], -1),
+    "without its last dimension": lambda value: value[..., 0],
+}
+PLACES = st.tuples(st.integers(0, B - 1), st.integers(1, T - 1))
+SIGNED = st.floats(1e20, 3e38) | st.floats(-3e38, -1e20)
+BROKEN = d.Wrong({"a NaN": value(NAN), "all NaN": value(NAN, ALL), "inf": value(INF)})
+READINGS = BROKEN | d.Wrong(
+    {
+        "-inf": value(-INF),
+        "1e25": value(1e25, right=large),
+        "-1e38": value(-1e38, ALL, right=large),
+        "too narrow": entry(lambda value: value[..., :1]),
+        "a dimension more": entry(lambda value: value[..., None].expand(*value.shape, 3)),
+        "float64": entry(Tensor.double, as_of(_sound, tolerance=1e-5, precision=True)),
+        "float16": entry(Tensor.half, as_of(_sound, tolerance=1e-2, precision=True)),
+        "int64": entry(lambda value: value.round().long(), as_of(_rounded, tolerance=1e-6)),
+        **{what: entry(change) for what, change in SHAPES.items()},
+    },
+    st.builds(
+        lambda number, place, at: (f"{number} in component {place} at {at}", value(number, place, at)),
+        st.sampled_from([NAN, INF, -INF]),
+        st.integers(0, 1),
+        PLACES,
+    )
+    | SIGNED.map(lambda number: (f"{number}", value(number, right=large))),
+)
+MASKED = d.Wrong(
+    {"nan": hidden(NAN), "inf": hidden(INF), "1e38": hidden(1e38)},
+    st.floats(width=32).map(lambda number: (f"{number}", hidden(number))),
+)
+MASKS = d.Wrong(
+    {
+        "float": entry(Tensor.float, as_of(_sound), "observed"),
+        "int64": entry(Tensor.long, as_of(_sound), "observed"),
+        "without its last dimension": entry(lambda value: value[..., 0], as_of(_sound), "observed"),
+        "too wide": entry(lambda value: value.expand(*value.shape[:-1], 5), None, "observed"),
+    }
+)
+GOES_ON = d.Wrong(
+    {
+        **{what: Damage(damage.change, goes_on) for what, damage in BROKEN.named.items()},
+        "1e25": value(1e25, right=goes_on),
+        "-1e38": value(-1e38, ALL, right=goes_on),
+    }
+)
+
+
+def poke(number: float, place: int = 0) -> Callable[[Tensor], Tensor]:
+    """A number in a belief's entry."""
+
+    def change(tensor: Tensor) -> Tensor:
+        out = tensor.clone()
+        flat = out[0].view(-1)
+        flat[place % len(flat)] = number
+        return out
+
+    return change
+
+
+CARRIED = d.Wrong(
+    {"missing": SHAPES["missing"], "too wide": SHAPES["too wide"], "a dimension less": lambda v: v[..., 0]}
+)
+NUMBERS = d.Wrong(
+    {"a NaN": poke(NAN), "inf": poke(INF)},
+    st.builds(
+        lambda number, place: (f"{number} in place {place}", poke(number, place)),
+        st.sampled_from([NAN, INF]),  # -inf is a particle's weight of zero
+        st.integers(0, 40),
+    ),
+)
+OTHER_TYPES = d.Wrong({"float64": Tensor.double, "int64": Tensor.long})
+
+
+def step_from(fed: Fed, number: int, change: Callable[[Tensor], Tensor | None], folder: Path | None = None) -> Any:
     """A step from a damaged belief."""
-    filter = _seeded(subject.make)
+    filter = fed.seeded()
     torch.manual_seed(3)
-    row = _frames(subject)[:, 1].exclude("is_init")
+    row = fed.frames()[:, 1].exclude("is_init")
     belief = filter.initialise(row.copy())
     for place, key in enumerate(filter.carry_keys):
         value = belief.get(key)
@@ -261,139 +334,90 @@ def _carried(subject: Subject, number: int, change: Callable[[Tensor], Tensor | 
     return filter.step(row)
 
 
-def _unharmed(subject: Subject, result: TensorDict) -> bool:
+def unharmed(fed: Fed, result: TensorDict) -> bool:
     """Right where the filter does not read what is damaged, as an LSTM does not read its last mean."""
-    filter = _seeded(subject.make)
-    expected = _carried(subject, -1, lambda value: value, Path())
-    return same(result.select(*filter.belief_keys), expected.select(*filter.belief_keys))
-
-
-def _poke(value: float) -> Callable[[Tensor], Tensor]:
-    def change(tensor: Tensor) -> Tensor:
-        out = tensor.clone()
-        out[0].view(-1)[0] = value
-        return out
-
-    return change
-
-
-CARRIED: dict[str, Callable[[Tensor], Tensor | None]] = {
-    "a NaN": _poke(torch.nan),
-    "inf": _poke(torch.inf),
-    "missing": lambda value: None,
-    "too wide": lambda value: torch.cat([value, value[..., :1]], -1),
-    "a dimension less": lambda value: value[..., 0],
-    "float64": lambda value: value.double(),
-    "int64": lambda value: value.long(),
-}
-
-
-def _words(key: Any) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else (key[-1], str(key))
+    keys = fed.seeded().belief_keys
+    return same(result.select(*keys), step_from(fed, -1, lambda value: value).select(*keys))
 
 
 # ------------------------------------------------------------------------------------------------ layout and options
 
-
-def _act_layout(subject: Subject, act: Callable[[Filter, TensorDict], Any], folder: Path) -> Any:
-    return act(_seeded(subject.make), _frames(subject))
-
-
-LAYOUTS: dict[str, tuple[tuple[str, ...], Callable[[Filter, TensorDict], Any]]] = {
+Use = Callable[[Any, TensorDict], Any]
+SEQUENCES: dict[str, tuple[tuple[str, ...], Use]] = {
     "a sequence without time": (("batch", "time", "batch_size"), lambda f, x: f.sequence(x[0, 0])),
     "a sequence of no steps": (("step", "time", "batch_size"), lambda f, x: f.sequence(x[:, :0])),
-    "a step before initialise": (("belief", "initialise"), lambda f, x: f.step(x[:, 0].exclude("is_init"))),
-    "is_init as float": (("is_init",), lambda f, x: f.sequence(x.set("is_init", x["is_init"].float()))),
-    "is_init too wide": (("is_init",), lambda f, x: f.sequence(x.set("is_init", x["is_init"].expand(B, T, 3)))),
     "keep names nothing": (("keep",), lambda f, x: f.sequence(x, keep=["nothing"])),
+    "detach_every zero": (("detach_every",), lambda f, x: f.sequence(x, detach_every=0)),
+}
+NOWHERE = ("noise", "nowhere")
+
+
+def _unmarked(filter: Filter, frames: TensorDict) -> Any:
+    episodes = torch.arange(B)[:, None].expand(B, T)
+    return DEnKFTransform(filter)(frames.exclude("is_init").set("episode", episodes).reshape(-1))
+
+
+LAYOUTS: dict[str, tuple[tuple[str, ...], Use]] = {
+    **SEQUENCES,
+    "detach_every negative": (("detach_every",), lambda f, x: f.sequence(x, detach_every=-2)),
+    "a step before initialise": (("belief", "initialise"), lambda f, x: f.step(x[:, 0].exclude("is_init"))),
     "without names nothing": (("without",), lambda f, x: f.step(f.initialise(x[:, 0]), without=["nothing"])),
     "without as text": (("without",), lambda f, x: f.step(f.initialise(x[:, 0]), without="observation")),
-    "detach_every zero": (("detach_every",), lambda f, x: f.sequence(x, detach_every=0)),
-    "detach_every negative": (("detach_every",), lambda f, x: f.sequence(x, detach_every=-2)),
-    "noise of no module": (
-        ("noise", "nowhere"),
-        lambda f, x: f.sequence(x.set(("noise", "nowhere"), torch.zeros(B, T, 2))),
-    ),
+    "noise of no module": (NOWHERE, lambda f, x: f.sequence(x.set(NOWHERE, torch.zeros(B, T, 2)))),
     "chunk negative": (("chunk",), lambda f, x: f.compile(chunk=-1)),
     "chunk a fraction": (("chunk",), lambda f, x: f.compile(chunk=1.5)),
-    "flat slices without marks": (
-        ("is_init", "SliceSampler", "sequence", "episode"),
-        lambda f, x: DEnKFTransform(f)(
-            x.exclude("is_init").set("episode", torch.arange(B)[:, None].expand(B, T)).reshape(-1)
-        ),
-    ),
+    "flat slices without marks": (("is_init", "SliceSampler", "sequence", "episode"), _unmarked),
     "diagnostics that are not written": (("diagnostics",), lambda f, x: DEnKFTransform(f, diagnostics=["nothing"])),
     "a transform of no filter": (("Filter", "filter"), lambda f, x: DEnKFTransform(torch.nn.Linear(2, 2))),
     "a packaged step with gradients": (("packaged",), lambda f, x: DEnKFTransform(f, packaged=f, no_grad=False)),
 }
-#: Layouts that a filter may also get right: as when the flag was boolean, or read no flag at all.
-MAY_BE_RIGHT = {"is_init as float", "is_init too wide"}
+#: That a filter may also get right: as when the flag was boolean, or read no flag at all.
+FLAGS = d.Wrong(
+    {
+        "float": entry(Tensor.float, as_of(_sound), "is_init"),
+        "too wide": entry(lambda value: value.expand(B, T, 3), as_of(_sound), "is_init"),
+    }
+)
 
 
-def cases() -> Iterator[Case]:
-    """All damaged readings, masks, beliefs and layouts."""
-    border = "readings"
-    for subject in SUBJECTS:
-        words = (subject.reading,)
-        for run in RUNS:
-            for what, damage in READINGS.items():
-                right = _right(subject, run, what, damage)
-                act = partial(_damaged, subject, run, damage)
-                yield Case(border, f"{subject.name}, {run}: reading {what}", words, act, right)
-            for value in (torch.nan, torch.inf, 1e38):
-                right = partial(_equals, subject, run, _unobserved)
-                act = partial(_damaged, subject, run, _hidden(value))
-                yield Case(border, f"{subject.name}, {run}: {value} where the mask says missing", words, act, right)
-            for what, damage in MASKS.items():
-                right = (
-                    partial(_equals, subject, run, _sound)
-                    if what in ("float", "int64", "without its last dimension")
-                    else None
-                )
-                act = partial(_damaged, subject, run, damage)
-                yield Case(border, f"{subject.name}, {run}: mask {what}", ("observed",), act, right)
-        for number, key in enumerate(_seeded(subject.make).carry_keys):
-            for what, change in CARRIED.items():
-                act = partial(_carried, subject, number, change)
-                yield Case(
-                    border, f"{subject.name}: belief {key} {what}", _words(key), act, partial(_unharmed, subject)
-                )
-    subject = SUBJECTS[4]
-    for what, (words, act) in LAYOUTS.items():
-        right = partial(_equals, subject, "sequence", _sound) if what in MAY_BE_RIGHT else None
-        if right is not None:
-            run = act
-            act = lambda f, x, run=run: run(f, x).select(*f.belief_keys)  # noqa: E731
-        yield Case(border, what, words, partial(_act_layout, subject, act), right)
-    yield from _rejecting()
+def fed_with(border: str, fed: Fed, run: str, name: str, wrong: d.Wrong, word: str = "") -> Target:
+    """Damaged frames in one run."""
+    act = lambda damage, folder: fed.run(run, damage.change)  # noqa: E731
+    rights = lambda what, damage: damage.right and partial(damage.right, fed, run, damage)  # noqa: E731
+    return Target(border, f"{fed.name}, {run}, {name}", (word or fed.reading,), act, wrong, rights=rights)
 
 
-def _rejecting() -> Iterator[Case]:
-    """A transform that goes on where a reading is broken."""
-    for subject in SUBJECTS:
-        for what in ("a NaN", "all NaN", "inf", "1e25", "-1e38"):
-            damage = READINGS[what]
-
-            def act(folder: Path, subject: Subject = subject, damage: Damage = damage) -> TensorDict:
-                return _rollout(_seeded(subject.make), damage(subject, _frames(subject)), check_finite=False)
-
-            right = partial(_goes_on, subject, damage)
-            yield Case(
-                "readings",
-                f"{subject.name}, transform without check_finite: reading {what}",
-                (subject.reading,),
-                act,
-                right,
-            )
+def laid_out(border: str, fed: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Iterator[Target]:
+    """Frames and calls of a wrong layout."""
+    for what, (words, use) in layouts.items():
+        act = lambda use, folder: use(fed.seeded(), fed.frames())  # noqa: E731
+        yield Target(border, f"{fed.name}, layout, {what}", words, act, d.Wrong({"damaged": use}))
 
 
-def _goes_on(subject: Subject, damage: Damage, result: TensorDict) -> bool:
-    """Right where only the row that is damaged is as if it had not been observed, or computed right."""
-    rows = [row for row in range(B) if row != AT[0]]
-    expected = [_reference(subject, "transform", hide) for hide in _HIDES[subject.width]]
-    others = _reference(subject, "transform", _sound)
-    near = {"rtol": 1e-5, "atol": 1e-5}
-    hidden = any(same(result[AT[0]], hidden[AT[0]], **near) for hidden in expected) or _large(
-        subject, "transform", damage, result
-    )
-    return finite(result) and hidden and same(result[rows], others[rows], **near)
+def carried(border: str, fed: Fed) -> Iterator[Target]:
+    """Damaged beliefs."""
+    for number, key in enumerate(fed.seeded().carry_keys):
+        wrong = CARRIED | NUMBERS if key[-1] != "age" else CARRIED  # an age counts steps, and is no floating number
+        wrong = wrong | OTHER_TYPES if fed.types else wrong
+        words = (key,) if isinstance(key, str) else (key[-1], str(key))
+        yield Target(
+            border, f"{fed.name}, belief {key}", words, partial(step_from, fed, number), wrong, partial(unharmed, fed)
+        )
+
+
+def everything(border: str, fed: Fed) -> Iterator[Target]:
+    """Damaged readings and masks in every run."""
+    for run in fed.runs:
+        yield fed_with(border, fed, run, "reading", READINGS)
+        yield fed_with(border, fed, run, "masked", MASKED)
+        yield fed_with(border, fed, run, "mask", MASKS, "observed")
+
+
+def targets() -> Iterator[Target]:
+    """Readings, masks, beliefs and layouts of filters."""
+    for fed in FILTERS:
+        yield from everything("readings", fed)
+        yield from carried("readings", fed)
+        yield fed_with("readings", fed, "transform without check_finite", "reading", GOES_ON)
+    yield from laid_out("readings", FILTERS[4], LAYOUTS)
+    yield fed_with("readings", FILTERS[4], "sequence", "is_init", FLAGS, "is_init")

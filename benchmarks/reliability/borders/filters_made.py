@@ -8,23 +8,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.borders.subjects import Subject, cases_of
-from benchmarks.reliability.case import Case
-from benchmarks.reliability.damage import (
-    CHOICE,
-    COUNT,
-    COUNT_OR_NONE,
-    LARGE_COUNT,
-    MODULE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    angles,
-    covariance,
-    dims,
-    matrix,
-    vector,
-)
+from benchmarks.reliability import damage as d
+from benchmarks.reliability.target import Subject, Target, targets_of
 from torch_denkf.filters import (
     DPF,
     EKF,
@@ -47,13 +32,16 @@ from torch_denkf.modules import (
     StochasticMLP,
 )
 
-CEILING = {key: value for key, value in POSITIVE.items() if key != "inf"}
-STDS = vector(2, negative=False)
-
-
-def double(values: dict[str, Any], size: tuple[int, ...]) -> dict[str, Any]:
-    """With values of another precision than the other arguments'."""
-    return {**values, "double precision": torch.eye(*size, dtype=torch.float64)}
+STDS = d.vector(2, negative=False)
+#: Matrices of another precision than the other arguments', too.
+TRANSITION = d.matrix(2, 2) | {"double precision": torch.eye(2, dtype=torch.float64)}
+OBSERVATION = TRANSITION.but("a row more")  # that is another number of readings
+SIGMA = {
+    "alpha": d.POSITIVE,
+    "beta": d.FINITE,
+    "kappa": d.FINITE | {"minus the dimension": -2.0},
+}
+IMAGE_SHAPE = d.Wrong({"two numbers": (24, 24), "zero": (3, 0, 24), "negative": (3, -24, 24), "text": "big"})
 
 
 def step_on_zeros(filter: Filter) -> Any:
@@ -73,16 +61,13 @@ def parts(members: int = 8) -> dict[str, Any]:
     }
 
 
+def _linear() -> dict[str, Any]:
+    return {"transition": 0.9 * torch.eye(2), "observation": torch.eye(2)}
+
+
 def _kalman() -> dict[str, Any]:
-    eye = torch.eye(2)
-    return {
-        "transition": 0.9 * eye,
-        "transition_noise": 0.1 * eye,
-        "observation": eye.clone(),
-        "observation_noise": 0.2 * eye,
-        "mean": torch.zeros(2),
-        "cov": eye.clone(),
-    }
+    noise = {"process_noise_cov": 0.1 * torch.eye(2), "noise_cov": 0.2 * torch.eye(2)}
+    return {**_linear(), **noise, "mean": torch.zeros(2), "cov": torch.eye(2)}
 
 
 def _denkf() -> dict[str, Any]:
@@ -91,17 +76,16 @@ def _denkf() -> dict[str, Any]:
 
 def _gaussian() -> dict[str, Any]:
     prior = MomentPrior(torch.zeros(2), torch.eye(2))
-    return {**parts(), "initial": prior, "process_noise": [0.1, 0.1], "observation_key": "observation"}
+    return {**_denkf(), "initial": prior, "process_noise": [0.1, 0.1]}
 
 
 def _backprop() -> dict[str, Any]:
-    eye = torch.eye(2)
-    given = {"transition": 0.9 * eye, "process_noise": 0.1 * eye, "observation": eye.clone()}
-    return {**_gaussian(), **given}
+    plain = {name: value for name, value in _gaussian().items() if name != "process_noise"}
+    return {**plain, **_linear(), "process_noise_cov": 0.1 * torch.eye(2)}
 
 
 def _particle() -> dict[str, Any]:
-    return {**parts(), "likelihood": GaussianLikelihood(sensor_key="observation")}
+    return {**parts(), "likelihood": GaussianLikelihood(observation_key="observation")}
 
 
 def _dpf() -> dict[str, Any]:
@@ -110,7 +94,15 @@ def _dpf() -> dict[str, Any]:
 
 
 def _mixture() -> dict[str, Any]:
-    return {**parts(), "learned_likelihood": GaussianLikelihood(sensor_key="observation")}
+    return {**parts(), "learned_likelihood": GaussianLikelihood(observation_key="observation")}
+
+
+def _lstm() -> dict[str, Any]:
+    return {"sensor": None, "features": 4, "state_dim": 2, "encoding_key": "features"}
+
+
+def _paper() -> dict[str, Any]:
+    return {"state_dim": 2, "observation_dim": 2, "image_shape": (3, 24, 24), "ensemble_size": 4}
 
 
 def _filter() -> dict[str, Any]:
@@ -118,93 +110,42 @@ def _filter() -> dict[str, Any]:
     return {"modules": dict(made.module.items()), "initial": made.initial}
 
 
-def _make_filter(modules: Any, **options: Any) -> Filter:
-    return Filter(modules, **options)
+def _make_filter(modules: Any, initial: Any, variance_ceiling: Any = None) -> Filter:
+    return Filter(modules, initial=initial, variance_ceiling=variance_ceiling)
 
 
-def subjects() -> list[Subject]:
-    """All filters, with what each takes."""
-    modules = dict.fromkeys(("transition", "observation", "noise", "initial"), MODULE)
-    same_for_all = {"variance_ceiling": CEILING}
-    gaussian = {"process_noise": STDS, "inflation": POSITIVE, "angles": angles(2), **same_for_all}
-    sigma = {"alpha": POSITIVE, "beta": {"nan": float("nan"), "inf": float("inf"), "text": "much"}}
-    sigma["kappa"] = {"minus the dimension": -2.0, "nan": float("nan"), "inf": float("inf"), "text": "much"}
-    particle = {
-        "resampling": CHOICE,
-        "alpha": SHARE,
-        "epsilon": POSITIVE,
-        "ess_threshold": SHARE,
-        "process_noise": STDS,
-        **modules,
-        **same_for_all,
+def targets() -> Iterator[Target]:
+    """The arguments of all filters."""
+    use, particles = step_on_zeros, {"alpha": d.SHARE}
+    names = {"transition": ("F",), "observation": ("H",), "process_noise_cov": ("Q",), "noise_cov": ("R",)}
+    kalman = {
+        "transition": TRANSITION,
+        "observation": OBSERVATION,
+        **dict.fromkeys(("process_noise_cov", "noise_cov", "cov"), d.covariance(2)),
+        "control": d.matrix(2, 1).but("a column more"),
     }
-    linear = {"transition": double(matrix(2, 2), (2,)), "observation": double(matrix(2, 2), (2,))}
-    del linear["observation"]["a row more"]  # that is another number of readings
-    use = step_on_zeros
-    return [
-        Subject(
-            "KalmanFilter",
-            KalmanFilter,
-            _kalman,
-            {
-                **linear,
-                "transition_noise": covariance(2),
-                "observation_noise": covariance(2),
-                "cov": covariance(2),
-                "mean": vector(2),
-                "control": {k: v for k, v in matrix(2, 1).items() if k != "a column more"},
-                "angles": angles(2),
-                **same_for_all,
-            },
-            use,
-            also={"transition": ("F",), "observation": ("H",), "transition_noise": ("Q",), "observation_noise": ("R",)},
-        ),
-        Subject("EKF", EKF, _gaussian, {**gaussian, **modules}, use),
-        Subject("UKF", UKF, _gaussian, {**gaussian, **sigma, **modules}, use),
-        Subject(
-            "BackpropKF",
-            BackpropKF,
-            _backprop,
-            {**gaussian, **linear, "process_noise": covariance(2), "initial": MODULE, "noise": MODULE},
-            use,
-        ),
-        Subject("DEnKF", DEnKF, _denkf, {**modules, "process_noise": STDS, "angles": angles(2), **same_for_all}, use),
-        Subject("ParticleFilter", ParticleFilter, _particle, particle, use),
-        Subject("DPF", DPF, _dpf, {"noisy_dims": dims(2), "initial": MODULE}, use, also={"noisy_dims": ("dims",)}),
-        Subject("MixtureParticleFilter", MixtureParticleFilter, _mixture, {"alpha": SHARE, "initial": MODULE}, use),
-        Subject(
-            "LSTMFilter",
-            LSTMFilter,
-            lambda: {"sensor": None, "features": 4, "state_dim": 2, "encoding_key": "features"},
-            {
-                "state_dim": COUNT,
-                "hidden_size": COUNT,
-                "num_layers": COUNT,
-                "features": COUNT_OR_NONE,
-                "loc": vector(2),
-                "scale": vector(2, positive=True),
-                "floor": NOT_NEGATIVE,
-            },
-            use,
-        ),
-        Subject(
-            "DEnKF.paper",
-            DEnKF.paper,
-            lambda: {"state_dim": 2, "observation_dim": 2, "image_shape": (3, 24, 24), "ensemble_size": 4},
-            {
-                "state_dim": COUNT,
-                "observation_dim": COUNT,
-                "ensemble_size": LARGE_COUNT,
-                "rate": {**SHARE, "one": 1.0, "too small for eight bits": 0.001},
-                "r": POSITIVE,
-                "image_shape": {"two numbers": (24, 24), "zero": (3, 0, 24), "negative": (3, -24, 24), "text": "big"},
-            },
-            lambda made: made.step(made.initialise(TensorDict({"pixels": torch.zeros(3, 24, 24)}))),
-        ),
-        Subject("Filter", _make_filter, _filter, {"initial": MODULE, "modules": MODULE, **same_for_all}, use),
-    ]
-
-
-def cases() -> Iterator[Case]:
-    """All damaged arguments."""
-    yield from cases_of("filters", subjects())
+    backprop = {"transition": TRANSITION, "observation": OBSERVATION, "process_noise_cov": d.covariance(2)}
+    lstm = {
+        **dict.fromkeys(("features", "observation_dim"), d.COUNT_OR_NONE),
+        "scale": d.vector(2, positive=True),
+        "floor": d.NOT_NEGATIVE,
+        "initial": None,
+        "modules": None,
+        "dt": None,
+    }
+    paper = {"rate": d.RATE, "r": d.POSITIVE, "image_shape": IMAGE_SHAPE, "initial": None}
+    pictures = lambda made: made.step(made.initialise(TensorDict({"pixels": torch.zeros(3, 24, 24)})))  # noqa: E731
+    yield from targets_of(
+        "filters",
+        Subject(KalmanFilter, _kalman, use, kalman, names),
+        Subject(EKF, _gaussian, use),
+        Subject(UKF, _gaussian, use, SIGMA),
+        Subject(BackpropKF, _backprop, use, backprop),
+        Subject(DEnKF, _denkf, use),
+        Subject(ParticleFilter, _particle, use, {**particles, "noise": d.MODULE}),
+        Subject(DPF, _dpf, use, {**particles, "noisy_dims": d.dims(2)}, {"noisy_dims": ("dims",)}),
+        Subject(MixtureParticleFilter, _mixture, use, particles),
+        Subject(LSTMFilter, _lstm, use, lstm),
+        Subject(DEnKF.paper, _paper, pictures, paper),
+        Subject(_make_filter, _filter, use, name="Filter"),
+    )

@@ -12,21 +12,21 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from benchmarks.reliability.case import Case, apart, workshop
-from benchmarks.reliability.damage import BYTES, copied, finite, gone, same, same_but, written
-from torch_denkf.data import (
-    KITTIOdometryExperienceReplay,
-    list_kitti_drives,
-    read_kitti_drive,
-    with_motion,
-    write_drives,
-)
+from benchmarks.reliability import damage as d
+from benchmarks.reliability.case import apart, workshop
+from benchmarks.reliability.damage import finite, gone, in_lines, instead, on_row, same, same_but, written
+from benchmarks.reliability.target import Folder, Subject, Target, targets_of
+from torch_denkf.applications.car import KITTIOdometryExperienceReplay, read_kitti_drive, with_motion, write_drives
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 
 DRIVE, FRAMES, SIZE = "town", 10, (24, 72)
 ROWS = (0, 4, FRAMES - 1)  # that are damaged
-Change = Callable[[Path], Any]
+POSE_FILE, SEQUENCE = f"poses/{DRIVE}.txt", f"sequences/{DRIVE}"
+IMAGES, TIME_FILE, CALIBRATION_FILE = f"{SEQUENCE}/image_2", f"{SEQUENCE}/times.txt", f"{SEQUENCE}/calib.txt"
+PICTURE = f"{IMAGES}/000004.png"
 
 
 @cache
@@ -48,36 +48,7 @@ def reference() -> TensorDict:
     return read(sound())
 
 
-def _act(change: Change, folder: Path, **options: Any) -> TensorDict:
-    root = copied(sound(), folder)
-    change(root)
-    return read(root, **options)
-
-
-def poses(root: Path) -> Path:
-    """The file of poses."""
-    return root / "poses" / f"{DRIVE}.txt"
-
-
-def sequence(root: Path) -> Path:
-    """The folder of the drive."""
-    return root / "sequences" / DRIVE
-
-
-def image(root: Path, number: int = 4) -> Path:
-    """A frame's file."""
-    return sequence(root) / "image_2" / f"{number:06d}.png"
-
-
-def on_line(file: Callable[[Path], Path], number: int, change: Callable[[str], str]) -> Change:
-    """Changes one line of a text file."""
-
-    def act(root: Path) -> None:
-        lines = file(root).read_text().splitlines()
-        lines[number] = change(lines[number])
-        file(root).write_text("\n".join(lines) + "\n")
-
-    return act
+DRIVES = Folder("kitti", sound, read)
 
 
 # -------------------------------------------------------------------------------------------------------- what is right
@@ -91,25 +62,26 @@ def _equal_so_far(result: TensorDict) -> bool:
     return len(result) > 0 and same(result, reference()[: len(result)])
 
 
-def _equal_or_missing(row: int, result: TensorDict) -> bool:
-    return _equal(result) or same_but(result, reference(), [row], ["frame_valid"])
+def _without_last(result: TensorDict) -> bool:
+    return same(result[: FRAMES - 1], reference()[: FRAMES - 1])
 
 
-def _true_times(row: int, root_times: np.ndarray, result: TensorDict) -> bool:
+def _equal_or_missing(result: TensorDict) -> bool:
+    return _equal(result) or same_but(result, reference(), [4], ["frame_valid"])
+
+
+def _true_times(change: Callable[[np.ndarray], np.ndarray], result: TensorDict, row: int = 5) -> bool:
     """Right where the motion at a gap is that of the true time between frames, or marked as unknown."""
     expected = reference()
-    keep = [k for k in range(FRAMES) if k != row and not (row == 0 and k == 1)]
-    others = torch.equal(result["state"][keep], expected["state"][keep]) if len(result) == FRAMES else False
-    masks = [
-        key
-        for key in result.keys()  # noqa: SIM118 - a tensordict's values are rows
-        if result[key].dtype == torch.bool and key in ("frame_valid", "state_valid", "motion_valid", "observed")
-    ]
+    keep = [k for k in range(FRAMES) if k != row]
+    others = len(result) == FRAMES and torch.equal(result["state"][keep], expected["state"][keep])
+    masks = {"frame_valid", "state_valid", "motion_valid", "observed"} & set(result.keys())
     marked = any(not bool(result[key][row].all()) for key in masks)
-    dt = np.diff(root_times)[max(row - 1, 0)]
-    way = (expected["state"][max(row, 1), :2] - expected["state"][max(row, 1) - 1, :2]).norm()
-    speed = abs(float(result["state"][row, 3]) - float(way) / dt) < 1e-3 * max(1.0, float(way) / dt)
-    return finite(result) and others and (marked or bool(speed))
+    way = float((expected["state"][row, :2] - expected["state"][row - 1, :2]).norm())
+    times = change(np.loadtxt(sound() / TIME_FILE))
+    speed = way / np.diff(times)[row - 1]
+    right = abs(float(result["state"][row, 3]) - speed) < 1e-3 * max(1.0, speed)
+    return finite(result) and others and (marked or bool(right))
 
 
 def _times_masked(result: TensorDict) -> bool:
@@ -129,7 +101,9 @@ def _times_masked(result: TensorDict) -> bool:
 # ------------------------------------------------------------------------------------------------------------ damage
 
 
-def _number(place: int, value: str) -> Callable[[str], str]:
+def number(place: int, value: str) -> Callable[[str], str]:
+    """Another number in a line."""
+
     def change(line: str) -> str:
         words = line.split()
         words[place] = value
@@ -149,234 +123,201 @@ def _rotation(matrix: np.ndarray) -> Callable[[str], str]:
     return change
 
 
-POSES: dict[str, Callable[[str], str]] = {
-    "nan": _number(3, "nan"),
-    "inf": _number(11, "inf"),
-    "a word": _number(5, "far"),
-    "a comma for a point": _number(3, "1,5"),
-    "eleven numbers": lambda line: " ".join(line.split()[:11]),
-    "thirteen numbers": lambda line: line + " 1",
-    "an empty line": lambda line: "",
-    "a comment": lambda line: "# " + line,
-    "no rotation": _rotation(np.zeros((3, 3))),
-    "a reflection": _rotation(np.diag([1.0, 1.0, -1.0])),
-    "a scaled rotation": _rotation(2 * np.eye(3)),
-    "a shear": _rotation(np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])),
-    "1e200": _number(11, "1e200"),
-    "1e30": _number(3, "1e30"),
-    "a jump of 1e9 m": _number(3, "1e9"),
-}
-TIMES: dict[str, Callable[[str], str]] = {
-    "nan": lambda line: "nan",
-    "inf": lambda line: "inf",
-    "a word": lambda line: "noon",
-    "two numbers": lambda line: line + " 1.0",
-    "an empty line": lambda line: "",
-    "1e300": lambda line: "1e300",
-    "an hour back": lambda line: f"{float(line) - 3600:.6e}",
-    "-1e300": lambda line: "-1e300",
-}
-CALIBRATION: dict[str, Callable[[str], str]] = {
-    "fx zero": _number(1, "0"),
-    "fx negative": _number(1, "-700"),
-    "fy zero": _number(6, "0"),
-    "fx nan": _number(1, "nan"),
-    "fx 1e300": _number(1, "1e300"),
-    "fx a word": _number(1, "wide"),
-    "cx inf": _number(3, "inf"),
-    "eleven numbers": lambda line: " ".join(line.split()[:12]),
-    "no numbers": lambda line: "P2:",
-    "another name": lambda line: "Q2:" + line[3:],
-}
+NO_NUMBER = st.sampled_from(["nan", "inf", "-inf", "1e999", "far", "1,5", "0x1f", "1.2.3", "--1"])
+POSES = d.Wrong(
+    {
+        "nan": number(3, "nan"),
+        "inf": number(11, "inf"),
+        "a word": number(5, "far"),
+        "a comma for a point": number(3, "1,5"),
+        "eleven numbers": number(11, ""),
+        "thirteen numbers": lambda line: line + " 1",
+        "an empty line": lambda line: "",
+        "a comment": lambda line: "# " + line,
+        "no rotation": _rotation(np.zeros((3, 3))),
+        "a reflection": _rotation(np.diag([1.0, 1.0, -1.0])),
+        "a scaled rotation": _rotation(2 * np.eye(3)),
+        "a shear": _rotation(np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])),
+        "1e200": number(11, "1e200"),
+        "1e30": number(3, "1e30"),
+        "a jump of 1e9 m": number(3, "1e9"),
+    },
+    st.tuples(st.integers(0, 11), NO_NUMBER).map(lambda one: (f"{one[1]} in place {one[0]}", number(*one))),
+)
+TIMES = d.Wrong(
+    {
+        "nan": lambda line: "nan",
+        "inf": lambda line: "inf",
+        "a word": lambda line: "noon",
+        "two numbers": lambda line: line + " 1.0",
+        "an empty line": lambda line: "",
+        "1e300": lambda line: "1e300",
+        "an hour back": lambda line: f"{float(line) - 3600:.6e}",
+        "-1e300": lambda line: "-1e300",
+    },
+    NO_NUMBER.map(lambda text: (text, lambda line: text)),
+)
+CALIBRATION = d.Wrong(
+    {
+        "fx zero": number(1, "0"),
+        "fx negative": number(1, "-700"),
+        "fy zero": number(6, "0"),
+        "fx nan": number(1, "nan"),
+        "fx 1e300": number(1, "1e300"),
+        "fx a word": number(1, "wide"),
+        "cx inf": number(3, "inf"),
+        "eleven numbers": number(12, ""),
+        "no numbers": lambda line: "P2:",
+        "another name": lambda line: "Q2:" + line[3:],
+    },
+    st.tuples(st.sampled_from([1, 3, 6, 7]), NO_NUMBER).map(lambda one: (f"{one[1]} in place {one[0]}", number(*one))),
+)
 
 
-def _picture(value: np.ndarray, suffix: str = ".png") -> Change:
-    def act(root: Path) -> None:
-        image(root).write_bytes(cv2.imencode(suffix, value)[1].tobytes())
-
-    return act
+def of_lines(wrong: d.Wrong, row: int) -> d.Wrong:
+    """Changes of one line of a text file."""
+    return wrong.each(lambda change: in_lines(on_row(row, change)))
 
 
-def _bomb(root: Path) -> None:
+def _picture(value: np.ndarray, suffix: str = ".png") -> d.Change:
+    return lambda file: file.write_bytes(cv2.imencode(suffix, value)[1].tobytes())
+
+
+def bomb(data: bytes) -> bytes:
     """A picture that says that it is of 60,000 x 60,000 pixels."""
-    data = bytearray(image(root).read_bytes())
-    data[16:24] = struct.pack(">II", 60000, 60000)
-    image(root).write_bytes(bytes(data))
+    return data[:16] + struct.pack(">II", 60000, 60000) + data[24:]
 
 
-def _renamed(name: str) -> Change:
-    return lambda root: image(root).rename(image(root).with_name(name))
-
-
-def _replaced_by_folder(root: Path) -> None:
-    gone(image(root))
-    image(root).mkdir()
-
-
-def _dangling(root: Path) -> None:
-    gone(image(root))
-    image(root).symlink_to("nowhere.png")
-
-
-#: By what is done to the picture of frame 4: the words of an error, and whether a warning and a mask will do.
-PICTURES: dict[str, tuple[Change, bool]] = {
-    **{what: (lambda root, change=change: written(image(root), change), True) for what, change in BYTES.items()},
-    "another size": (_picture(np.full((10, 10, 3), 7, np.uint8)), False),
-    "a JPEG": (_picture(np.full((*SIZE, 3), 7, np.uint8), ".jpg"), True),
-    "taken away": (lambda root: gone(image(root)), True),
-    "a folder": (_replaced_by_folder, True),
-    "a link to nowhere": (_dangling, True),
-    "a bomb": (_bomb, True),
-    "four digits in its name": (_renamed("0004.png"), True),
-    "a minus in its name": (_renamed("-00004.png"), True),
-    "capitals in its name": (_renamed("000004.PNG"), True),
-    "the same number twice": (lambda root: shutil.copy(image(root, 3), image(root).with_name("4.png")), False),
-    "a number beyond the poses": (_renamed("000999.png"), True),
-    "a number of thirty digits": (_renamed("9" * 30 + ".png"), True),
+RENAMED = {
+    "four digits in its name": "0004.png",
+    "a minus in its name": "-00004.png",
+    "capitals in its name": "000004.PNG",
+    "a number beyond the poses": "000999.png",
+    "a number of thirty digits": "9" * 30 + ".png",
+}
+PICTURES = (d.SEALED.each(written) | d.PLACES) | {
+    **{what: (lambda file, name=name: file.rename(file.with_name(name))) for what, name in RENAMED.items()},
+    "a JPEG": _picture(np.full((*SIZE, 3), 7, np.uint8), ".jpg"),
+    "a bomb": written(bomb),
+}
+NO_PICTURES = {
+    "another size": _picture(np.full((10, 10, 3), 7, np.uint8)),
+    "the same number twice": lambda file: shutil.copy(file.with_name("000003.png"), file.with_name("4.png")),
 }
 
 
-def _files() -> Iterator[Case]:
-    files = {
-        "poses": poses,
-        "times.txt": lambda root: sequence(root) / "times.txt",
-        "calib.txt": lambda root: sequence(root) / "calib.txt",
-    }
-    for name, file in files.items():
-        word = f"{DRIVE}.txt" if name == "poses" else name
-        for what, change in BYTES.items():
-            act = partial(_act, lambda root, file=file, change=change: written(file(root), change))
-            right = _equal if name == "calib.txt" else _equal_so_far  # of calib.txt another row may be damaged
-            yield Case("kitti", f"{name} {what}", (word,), act, right)
-        yield Case(
-            "kitti",
-            f"{name} is a folder",
-            (word,),
-            partial(_act, lambda root, file=file: (gone(file(root)), file(root).mkdir())),
-        )
-    for name in ("poses", "calib.txt"):
-        word = f"{DRIVE}.txt" if name == "poses" else name
-        yield Case(
-            "kitti", f"{name} taken away", (word,), partial(_act, lambda root, file=files[name]: gone(file(root)))
-        )
-    for what, (change, may_go_on) in PICTURES.items():
-        right = partial(_equal_or_missing, 4) if may_go_on else None
-        words = ("000004.png", "0004.png", "4.png", "-00004.png", "000004.PNG", "000999.png", "9" * 30 + ".png")
-        yield Case("kitti", f"picture {what}", words, partial(_act, change), right)
-    everything = lambda root: [file.write_bytes(b"") for file in sequence(root).glob("image_2/*")]  # noqa: E731
-    yield Case("kitti", "all pictures empty", ("image_2",), partial(_act, everything))
-    for what, change, words in (
-        ("no pictures", lambda root: [gone(file) for file in sequence(root).glob("image_2/*")], ("image_2", DRIVE)),
-        ("no folder of poses", lambda root: gone(root / "poses"), (f"{DRIVE}.txt",)),
-        ("no folder of the drive", lambda root: gone(sequence(root)), (DRIVE,)),
-        ("no folder of sequences", lambda root: gone(root / "sequences"), ("sequences",)),
-        ("no root", gone, ("sequences",)),
-        ("a file as root", lambda root: (gone(root), root.write_text("")), ("sequences",)),
-    ):
-        yield Case("kitti", what, words, partial(_act, change))
+def _files() -> Iterator[Target]:
+    yield DRIVES.target("poses", d.FILE, _equal_so_far, file=POSE_FILE)
+    optional = {"taken away": _times_as_told, "a link to nowhere": _times_as_told, "a link to itself": _times_as_told}
+    rights = lambda what, change: optional.get(what, _equal_so_far)  # noqa: E731
+    yield DRIVES.target("times.txt", d.FILE, file=TIME_FILE, rights=rights)
+    yield DRIVES.target("calib.txt", d.FILE, _equal, file=CALIBRATION_FILE)  # another row of it may be damaged
+    names = ("000004.png", "4.png", *RENAMED.values())
+    yield DRIVES.target("picture", PICTURES, _equal_or_missing, names, PICTURE)
+    yield DRIVES.target("picture of", NO_PICTURES, None, names, PICTURE)
+    emptied = lambda folder: [file.write_bytes(b"") for file in folder.iterdir()]  # noqa: E731
+    yield DRIVES.one("all pictures empty", emptied, "image_2", file=IMAGES)
+    no_pictures = lambda folder: [gone(file) for file in folder.iterdir()]  # noqa: E731
+    yield DRIVES.one("no pictures", no_pictures, ("image_2", DRIVE), file=IMAGES)
+    yield DRIVES.one("no folder of poses", gone, f"{DRIVE}.txt", file="poses")
+    yield DRIVES.one("no folder of the drive", gone, DRIVE, file=SEQUENCE)
+    yield DRIVES.one("no folder of sequences", gone, "sequences", file="sequences")
+    yield DRIVES.one("no root", gone, "sequences")
+    yield DRIVES.one("a file as root", instead(Path.touch), "sequences")
 
 
-def _numbers() -> Iterator[Case]:
+def _times_as_told(result: TensorDict) -> bool:
+    """Without stamps, frames come ten times a second, and all that needs no time is as it was."""
+    expected = reference()
+    return same(result["state"][:, :3], expected["state"][:, :3]) and same(result["image"], expected["image"])
+
+
+def _restamped(change: Callable[[np.ndarray], np.ndarray]) -> d.Change:
+    return in_lines(lambda lines: [f"{value:.9e}" for value in change(np.array(lines, float))])
+
+
+ROW = np.arange(FRAMES)
+STAMPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "a gap of 100 s": lambda times: times + 100 * (ROW >= 5),
+    "a repeated stamp": lambda times: np.where(ROW == 5, times[4], times),
+    "two stamps swapped": lambda times: times[[0, 1, 2, 3, 5, 4, 6, 7, 8, 9]],
+    "all stamps equal": lambda times: 0 * times,
+    "stamps 1e-300 apart": lambda times: 1e-300 * ROW,
+    "stamps backwards": lambda times: times[::-1],
+    "a clock that starts anew": lambda times: np.where(ROW >= 5, times - times[5], times),
+}
+TOLD = {
+    "two stamps swapped": _times_masked,
+    "a gap of 100 s": partial(_true_times, STAMPS["a gap of 100 s"]),
+    "a repeated stamp": partial(_true_times, STAMPS["a repeated stamp"]),
+}
+
+
+def _numbers() -> Iterator[Target]:
     for row in ROWS:
-        for what, change in POSES.items():
-            right = (
-                (lambda result: _equal(result[: FRAMES - 1]) or same(result, reference()[: FRAMES - 1]))
-                if row == FRAMES - 1 and what == "an empty line"
-                else None
-            )
-            yield Case(
-                "kitti", f"pose {row}: {what}", (f"{DRIVE}.txt",), partial(_act, on_line(poses, row, change)), right
-            )
-        for what, change in TIMES.items():
-            act = partial(_act, on_line(lambda root: sequence(root) / "times.txt", row, change))
-            yield Case("kitti", f"time {row}: {what}", ("times.txt",), act, _times_masked)
-    times = np.array((sequence(sound()) / "times.txt").read_text().split(), float)
-    for what, row, changed in (
-        ("a gap of 100 s", 5, times + 100 * (np.arange(FRAMES) >= 5)),
-        ("a repeated stamp", 5, np.where(np.arange(FRAMES) == 5, times[4], times)),
-        ("two stamps swapped", 5, times[[0, 1, 2, 3, 5, 4, 6, 7, 8, 9]]),
-        ("all stamps equal", 5, np.zeros(FRAMES)),
-        ("stamps 1e-300 apart", 5, 1e-300 * np.arange(FRAMES)),
-        ("stamps backwards", 5, times[::-1]),
-        ("a clock that starts anew", 5, np.where(np.arange(FRAMES) >= 5, times - times[5], times)),
-    ):
-        text = "\n".join(f"{value:.9e}" for value in changed) + "\n"
-        act = partial(_act, lambda root, text=text: (sequence(root) / "times.txt").write_text(text))
-        right = partial(_true_times, row, changed) if what in ("a gap of 100 s", "a repeated stamp") else None
-        right = _times_masked if what == "two stamps swapped" else right
-        yield Case("kitti", what, ("times.txt",), act, right)
-    for what, change in CALIBRATION.items():
-        act = partial(_act, on_line(lambda root: sequence(root) / "calib.txt", 2, change))
-        yield Case("kitti", f"calibration: {what}", ("calib.txt",), act)
+        last = lambda what, change, row=row: (  # noqa: E731
+            _without_last if (row, what) == (FRAMES - 1, "an empty line") else None
+        )
+        yield DRIVES.target(f"pose {row}", of_lines(POSES, row), file=POSE_FILE, rights=last)
+        yield DRIVES.target(f"time {row}", of_lines(TIMES, row), _times_masked, file=TIME_FILE)
+    yield DRIVES.target("calibration", of_lines(CALIBRATION, 2), file=CALIBRATION_FILE)
+    yield DRIVES.target(
+        "stamps", d.Wrong(STAMPS).each(_restamped), file=TIME_FILE, rights=lambda what, _: TOLD.get(what)
+    )
 
 
-ARGUMENTS: dict[str, dict[str, Any]] = {
-    "size": {
-        "zero": (0, 10),
-        "negative": (-5, 10),
-        "one number": (10,),
-        "text": "ab",
-        "fractions": (1.5, 2.5),
-        "a number": 10,
-    },
-    "camera": {"unknown": "image_9", "outside": "../../../etc", "absolute": "/etc", "a number": 2},
-    "drive": {
-        "unknown": "nope",
-        "outside": "../..",
-        "absolute": "/etc",
-        "negative": -1,
-        "a fraction": 0.5,
-        "empty": "",
-    },
-    "colour": {"text": "yes", "a number": 3},
+COUNTS = d.Wrong({"zero": 0, "negative": -4, "a fraction": 2.5, "text": "many"}, d.COUNT.others)
+NO_SHARE = d.SHARE.but("inf")
+OUTSIDE = {"outside": "../../../etc", "absolute": "/etc"}
+ARGUMENTS = {
+    "size": d.SIZE | {"fractions": (1.5, 2.5), "a number": 10},
+    "camera": d.Wrong({"unknown": "image_9", "a number": 2, **OUTSIDE}),
+    "drive": d.Wrong({"unknown": "nope", "negative": -1, "a fraction": 0.5, "empty": "", **OUTSIDE}),
+    "colour": d.Wrong({"text": "yes", "a number": 3}),
 }
-OPTIONS: dict[str, dict[str, Any]] = {
-    "drives": {"none": [], "twice": [DRIVE, DRIVE], "unknown": ["nope"], "outside": ["../../etc"]},
-    "test_share": {"beyond one": 1.5, "negative": -0.1, "nan": float("nan"), "text": "much"},
-    "validation_share": {"one": 1.0, "negative": -0.1, "nan": float("nan"), "text": "much"},
-    "split": {"unknown": "best", "a number": 3},
-    "batch_size": {"zero": 0, "negative": -4, "a fraction": 2.5, "text": "many"},
-    "num_slices": {"zero": 0, "negative": -4, "a fraction": 2.5, "text": "many"},
-    "slice_len": {"zero": 0, "negative": -4, "beyond the drive": 1000, "text": "long"},
-    "cameras": {"unknown": "third", "a folder that is not there": ["image_7"], "none": []},
-    "flow": {"text": "yes", "no flow": lambda drive: drive},
-    "slice_length": {"no such option": 4},
+OPTIONS = {
+    "drives": d.Wrong({"none": [], "twice": [DRIVE, DRIVE], "unknown": ["nope"], "outside": ["../../etc"]}),
+    "test_share": NO_SHARE,
+    "validation_share": NO_SHARE.but("beyond one") | {"one": 1.0},
+    "split": d.CHOICE.but("empty"),
+    "batch_size": COUNTS,
+    "num_slices": COUNTS,
+    "slice_len": COUNTS.but("a fraction") | {"beyond the drive": 1000},
+    "cameras": d.Wrong({"unknown": "third", "a folder that is not there": ["image_7"], "none": []}),
+    "flow": d.Wrong({"text": "yes", "no flow": lambda drive: drive}),
+    "slice_length": d.Wrong({"no such option": 4}),
+}
+ALSO = {
+    "drive": ("sequence", "sequences", "poses", "/etc"),
+    "camera": ("image_9",),
+    "cameras": ("camera", "image_7"),
+    "drives": ("sequences",),
+    "slice_len": ("slices",),
 }
 
 
-def _arguments() -> Iterator[Case]:
-    for name, values in ARGUMENTS.items():
-        for what, value in values.items():
-            words = {"drive": ("sequence", "sequences", "poses", "drive", "/etc"), "camera": ("camera", "image_9")}.get(
-                name, (name,)
-            )
-            yield Case(
-                "kitti", f"read_kitti_drive({name}: {what})", words, partial(_act, lambda root: None, **{name: value})
-            )
-    for name, values in OPTIONS.items():
-        for what, value in values.items():
-
-            def act(folder: Path, name: str = name, value: Any = value) -> Any:
-                data = KITTIOdometryExperienceReplay(
-                    copied(sound(), folder), **{"size": SIZE, "cache": None, name: value}
-                )
-                return data.sample() if name in ("batch_size", "num_slices", "slice_len") else data[:]
-
-            also = {"cameras": ("camera", "image_7"), "drives": ("sequences",), "slice_len": ("slices",)}.get(name, ())
-            words = (name, *also)
-            yield Case("kitti", f"KITTIOdometryExperienceReplay({name}: {what})", words, act)
-    yield Case("kitti", "list_kitti_drives of nothing", ("sequences",), lambda folder: list_kitti_drives(folder))
-    for key in ("image", "frame_valid", "calibration"):
-        act = lambda folder, key=key: with_motion(reference().exclude(key), cache=None)  # noqa: E731
-        yield Case("kitti", f"with_motion without {key}", (key,), act)
-    for height in (0.0, -1.0, float("nan"), "high"):
-        act = lambda folder, height=height: with_motion(reference().clone(), height=height, cache=None)  # noqa: E731
-        yield Case("kitti", f"with_motion(height: {height})", ("height",), act)
+def _replayed(**given: Any) -> Any:
+    data = KITTIOdometryExperienceReplay(sound(), **{"size": SIZE, "cache": None, **given})
+    return data.sample() if {"batch_size", "num_slices", "slice_len"} & set(given) else data[:]
 
 
-def cases() -> Iterator[Case]:
-    """All damaged drives."""
-    sound()  # here, not in each case's process
+def _moved(**given: Any) -> Any:
+    return with_motion(reference().clone(), cache=None, **given)
+
+
+def targets() -> Iterator[Target]:
+    """All of a drive, and the arguments of what reads it."""
     yield from _files()
     yield from _numbers()
-    yield from _arguments()
+    moved = {"height": d.POSITIVE.but("inf")}
+    nothing = {"root": d.Wrong({"nothing in it": "."})}
+    yield from targets_of(
+        "kitti",
+        DRIVES.arguments("read_kitti_drive", wrong=ARGUMENTS, also=ALSO),
+        Subject(_replayed, wrong=OPTIONS, also=ALSO, name="KITTIOdometryExperienceReplay"),
+        Subject(_moved, wrong=moved, name="with_motion"),
+        Subject(list_kitti_drives, wrong=nothing, also={"root": ("sequences",)}),
+    )
+    for key in ("image", "frame_valid", "calibration"):
+        act = lambda key, folder: with_motion(reference().exclude(key), cache=None)  # noqa: E731
+        yield Target("kitti", f"with_motion without {key}", (key,), act, d.Wrong({"taken away": key}))

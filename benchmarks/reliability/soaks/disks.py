@@ -21,14 +21,15 @@ from benchmarks.reliability.borders import kitti, lerobot, recordings, ur5
 from benchmarks.reliability.case import Case, apart, judge
 from benchmarks.reliability.damage import same
 from benchmarks.reliability.soaks.kills import _files, _fork, _left_behind
-from tests.data.ur5.ur5_demos import make_demo, write_folder
+from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.filters.factories import linear_kalman
 from tests.training.problem import make_trainer
-from torch_denkf.data import UR5ExperienceReplay, read_kitti_drive, render_drives, with_motion
+from torch_denkf.applications.car import read_kitti_drive, with_motion
+from torch_denkf.applications.car.kitti.render import render_drives
+from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.envs import collect_ur5_demos
 from torch_denkf.pretrained import from_pretrained, save_pretrained
-from torch_denkf.training import read_checkpoint, write_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 __all__ = ["rows"]
 

@@ -19,13 +19,14 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from tests.data.ur5.ur5_demos import make_demo, write_folder
+from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
 from tests.filters.factories import linear_denkf
 from tests.training.problem import make_trainer
-from torch_denkf.data import UR5ExperienceReplay, read_kitti_drive, render_drives
+from torch_denkf.applications.car import read_kitti_drive
+from torch_denkf.applications.car.kitti.render import render_drives
+from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.envs import collect_ur5_demos
-from torch_denkf.training import read_checkpoint
+from torch_denkf.training.checkpoint import read_checkpoint
 
 __all__ = ["JOBS", "rows"]
 

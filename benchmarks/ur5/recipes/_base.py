@@ -15,7 +15,8 @@ from benchmarks.ur5.demos import JOINTS, STATE
 from benchmarks.ur5.motion import ACCELERATIONS, ERRORS, FADING, NOISY, RATES, SIZE, ArmMotion, BiasedReading
 from benchmarks.ur5.sensors import MEMBERS, NearForecast, Preset, Statistics
 from torch_denkf.filters import Filter
-from torch_denkf.modules import BlackIsMissing, DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
+from torch_denkf.modules import DiagonalNoise, ImageSensor, LearnedObservation, ScaledNoise, SubModel
+from torch_denkf.monitoring import BlackIsMissing
 
 WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
 INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states

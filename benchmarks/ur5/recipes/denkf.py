@@ -47,7 +47,7 @@ class DEnKF(UR5Recipe):
             transition=NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True),
             near=NearForecast(self.preset),
             observation=self.observation(),
-            analysis=EnsembleAnalysis(self.scheme, taper=localisation(self.size), sensor_key=NEAR),
+            analysis=EnsembleAnalysis(self.scheme, taper=localisation(self.size), observation_key=NEAR),
         )
 
     def belief(self, std, state_key):

@@ -11,7 +11,7 @@ from torch_denkf.modules import GaussianAround
 
 
 class _Near(UR5Recipe):
-    reading_key = NEAR
+    observation_key = NEAR
 
     def readings(self):
         return OrderedDict(near=NearForecast(self.preset, ("forecast", "mean")))

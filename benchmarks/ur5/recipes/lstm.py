@@ -8,7 +8,8 @@ from benchmarks.common.arms import AtRest
 from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.recipes._base import INITIAL, UR5Recipe, register
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.modules import GaussianAround, WithMemory
+from torch_denkf.modules import GaussianAround
+from torch_denkf.modules.recurrent import with_memory
 from torch_denkf.objectives import GaussianLoss
 
 HIDDEN = 128
@@ -40,7 +41,7 @@ class LSTM(UR5Recipe):
 
     def belief(self, std, state_key):
         # Of ten numbers: it has no use for rates.
-        return WithMemory(AtRest(GaussianAround(std[:STATE], state_key=state_key), STATE, STATE, state_key), HIDDEN)
+        return with_memory(AtRest(GaussianAround(std[:STATE], state_key=state_key), STATE, STATE, state_key), HIDDEN)
 
     def loss(self, model):
         return GaussianLoss(model, transition=0.0, sensor=0.0, dims=self.dims, state_scale=self.unit)

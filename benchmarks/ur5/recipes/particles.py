@@ -7,14 +7,15 @@ from collections import OrderedDict
 from benchmarks.common.recipes import Particles
 from benchmarks.ur5.recipes._base import UR5Recipe, register
 from benchmarks.ur5.sensors import NEAR, NearForecast
-from torch_denkf.modules import AroundState, NoisyTransition, WithWeights
+from torch_denkf.modules import AroundState, NoisyTransition
+from torch_denkf.modules.particles import with_weights
 
 
 class _Particles(Particles, UR5Recipe):
     """Particles move by the learned motion with its learned noise."""
 
     bias = False  # a hundred particles do not fill ten dimensions more
-    reading_key = NEAR
+    observation_key = NEAR
 
     def noisy_motion(self):
         return NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True)
@@ -23,7 +24,7 @@ class _Particles(Particles, UR5Recipe):
         return OrderedDict(near=NearForecast(self.preset))
 
     def belief(self, std, state_key):
-        return WithWeights(AroundState(std, ensemble_size=self.particles, state_key=state_key))
+        return with_weights(AroundState(std, ensemble_size=self.particles, state_key=state_key))
 
 
 @register

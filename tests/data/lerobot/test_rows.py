@@ -11,7 +11,8 @@ from torchrl.data.datasets.openx import _format_data, _StreamingStorage
 from torchrl.data.video import VideoClipRef
 
 import torch_denkf.data.lerobot.rows as rows_module
-from torch_denkf.data import LeRobotReplay, recording_from_rows
+from torch_denkf.data import LeRobotReplay
+from torch_denkf.data.lerobot.rows import recording_from_rows
 
 SIZE = (12, 16)
 LENGTHS = [5, 7, 4, 6, 8]

@@ -7,7 +7,9 @@ from tensordict import TensorDict
 
 from tests.data import replay_for_tests as shared
 from tests.data.lerobot.lerobot_folder import write_info, write_version_2
-from torch_denkf.data import LeRobotReplay, lag_errors, recording_from_rows, repeated_pictures
+from torch_denkf.data import LeRobotReplay, lag_errors
+from torch_denkf.data.lerobot.repeats import repeated_pictures
+from torch_denkf.data.lerobot.rows import recording_from_rows
 
 EPISODES, LENGTH, SIZE = 20, 60, (24, 32)
 

@@ -71,6 +71,9 @@ def test_videos(tmp_path):
         state=state,
     )
     fails(FileNotFoundError, r"no video .*none.mkv", camera=Video(tmp_path / "none.mkv"))
+    for name, target in (("nowhere.mkv", "none.mkv"), ("itself.mkv", "itself.mkv")):
+        (tmp_path / name).symlink_to(target)
+        fails(FileNotFoundError, rf"no video .*{name}", camera=Video(tmp_path / name))
     write_video(tmp_path / "six.mkv", 6)
     fails(ValueError, r"run.csv has 5 times, but .*six.mkv has 6 pictures",
           camera=Video(tmp_path / "six.mkv", times=tmp_path / "run.csv"))  # fmt: skip

@@ -9,7 +9,8 @@ import torch
 
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, Recording, RecordingReplay, Table
-from torch_denkf.filters import KalmanFilter, Refiltering
+from torch_denkf.filters import KalmanFilter
+from torch_denkf.fusion import Refiltering
 
 open_runs = partial(RecordingReplay, cache=None, size=SIZE, progress=False)
 
@@ -114,7 +115,7 @@ def test_late_readings_give_the_belief_of_readings_in_order(tmp_path):
         warnings.simplefilter("ignore")
         rows = open_runs(recording, span="all")[:]
     filter = KalmanFilter(
-        torch.eye(2), 0.3 * torch.eye(2), torch.eye(2), 0.5 * torch.eye(2),
+        torch.eye(2), torch.eye(2), process_noise_cov=0.3 * torch.eye(2), noise_cov=0.5 * torch.eye(2),
         mean=torch.zeros(2), cov=torch.eye(2), observation_key="gps", observed_key="gps_observed",
     )  # fmt: skip
     late = Refiltering(filter, {"gps_late": ("gps", "gps_observed")}, lag=10)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -77,7 +76,7 @@ class LeRobotReplay(EpisodeReplay):
 
     **Repeated pictures.** A recorder that writes more rows than its camera takes pictures shows some twice.
     ``repeats="mask"`` marks the second one as not observed: it carries no news, and a filter that counts it becomes too
-    sure of itself. See :func:`torch_denkf.data.repeated_pictures`.
+    sure of itself. See :func:`torch_denkf.data.lerobot.repeats.repeated_pictures`.
 
     **Lag.** The picture of row t may show the robot as the states record it ``lag`` rows later (negative: earlier).
     With a ``lag``, each row pairs a state with the picture that shows it: the row of state t has the picture of row
@@ -87,7 +86,7 @@ class LeRobotReplay(EpisodeReplay):
 
     Args:
         root: folder that holds ``meta`` and ``data``; or a recording that
-            :func:`torch_denkf.data.recording_from_rows` made, which has its camera, keys and size already.
+            :func:`torch_denkf.data.lerobot.rows.recording_from_rows` made, which has its camera, keys and size already.
         camera: key of the camera, such as ``"observation.images.top"`` or ``"top"``; None for the only one.
         state_key: feature of the state.
         action_key: feature of the action; None for none, as are data sets without an ``"action"``.
@@ -121,7 +120,7 @@ class LeRobotReplay(EpisodeReplay):
         Rows that are in memory already:
 
         >>> from tensordict import TensorDict
-        >>> from torch_denkf.data import recording_from_rows
+        >>> from torch_denkf.data.lerobot.rows import recording_from_rows
         >>> rows = TensorDict(
         ...     {
         ...         "observation": {"image": torch.zeros(60, 3, 8, 8, dtype=torch.uint8), "state": torch.rand(60, 7)},
@@ -232,14 +231,3 @@ def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | N
         known = f", {', '.join(names)}" if names else ""
         raise ValueError(f"{argument}={list(dims)} names none or others than the {width} numbers there are{known}")
     return chosen
-
-
-def __getattr__(name: str):
-    if name == "LeRobotExperienceReplay":
-        warnings.warn(
-            "LeRobotExperienceReplay is the name of one of torchrl's classes; the one here is now called LeRobotReplay",
-            DeprecationWarning,
-            stacklevel=3,
-        )
-        return LeRobotReplay
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

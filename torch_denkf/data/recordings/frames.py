@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -73,7 +74,7 @@ class Frames:
             ValueError: if none can be decoded, they differ in size, or their times are not as many or do not ascend.
             OSError: if the cache cannot be written.
         """
-        source = Path(self.file).expanduser().resolve()
+        source = Path(os.path.realpath(Path(self.file).expanduser()))  # also of a link to itself
         files = self._files(source)
         folder = cache_folder(cache)
         if folder is None:
@@ -157,7 +158,7 @@ class Video(Frames):
 
     def _files(self, source: Path) -> list[Path]:
         if not source.is_file():
-            raise FileNotFoundError(f"no video {source}; check the path")
+            raise FileNotFoundError(f"no video {self.file}; check the path")
         return [source]
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
@@ -197,7 +198,7 @@ class Images(Frames):
 
     def _files(self, source: Path) -> list[Path]:
         if not source.is_dir():
-            raise FileNotFoundError(f"no folder {source}; check the path")
+            raise FileNotFoundError(f"no folder {self.file}; check the path")
         files = [
             file  # hidden ones, such as ._1.png, are a file manager's
             for file in source.iterdir()

@@ -17,11 +17,11 @@ from torch import Tensor
 from torch_denkf.data.episodes import Episode, hashed_tests
 from torch_denkf.data.options import ReplayOptions, check_options
 from torch_denkf.data.pictures import JoinedPictures, check_size, float_pictures
-from torch_denkf.data.recordings.clock import Span, interpolate, last_reading, nearest_reading, row_times, rows_ago
 from torch_denkf.data.recordings.frames import Frames
 from torch_denkf.data.recordings.tables import Readings, Table
 from torch_denkf.data.replay import EpisodeReplay
 from torch_denkf.data.statistics import picture_statistics
+from torch_denkf.data.times import Span, interpolate, last_reading, nearest_reading, row_times, rows_ago
 
 __all__ = ["Recording", "RecordingReplay"]
 

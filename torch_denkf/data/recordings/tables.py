@@ -15,7 +15,7 @@ import numpy as np
 
 from torch_denkf._checks import check_number, read_number
 from torch_denkf.data.parquet import read_parquet
-from torch_denkf.data.recordings.clock import Way
+from torch_denkf.data.times import Way
 
 __all__ = ["Readings", "Table", "Unit", "check_times", "read_numbers"]
 
@@ -50,7 +50,7 @@ class Table:
         time: name of the column of times, when each reading was taken; they ascend.
         arrived: name of a column of times at which the readings arrived, on the same clock, where they come late. A row
             of the data set shows the last one that had arrived, and ``NAME_late`` says by how many rows it is late, as
-            :class:`~torch_denkf.filters.FusedSensor` reads it. With ``sample="last"`` alone.
+            :class:`~torch_denkf.fusion.FusedSensor` reads it. With ``sample="last"`` alone.
         unit: of the times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
         sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next.
             These two look into the future: ``"nearest"``, the nearest in time, before or after; ``"linear"``, straight

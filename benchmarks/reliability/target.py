@@ -1,0 +1,219 @@
+"""What is attacked: things with arguments, things with files, and the damage that each of them can take."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from hypothesis import strategies as st
+
+from benchmarks.reliability import damage as d
+from benchmarks.reliability.case import SECONDS, Case
+from torch_denkf._arguments import _signature
+
+__all__ = ["Folder", "Subject", "Target"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that may be wrong.
+
+    Args:
+        border: where it comes in.
+        name: what it is; unique in its border.
+        words: arguments, keys or files: a clear message has one of them as a word.
+        act: does what a user would do with a wrong value of it, in an empty folder.
+        wrong: its wrong values.
+        right: whether a result is right, as the sound part of the input tells; ``None`` where it must be refused.
+        rights: returns ``right`` for one of the values, where it differs, given its name and itself.
+        within: s in which it must be over.
+        needs: makes what it starts from, in a process of its own; called once.
+        slow: whether ``needs`` takes so long that small samples leave it out.
+        said: whether a value that is text is a word by itself.
+    """
+
+    border: str
+    name: str
+    words: tuple[str, ...]
+    act: Callable[[Any, Path], Any]
+    wrong: d.Wrong
+    right: Callable[[Any], bool] | None = None
+    rights: Callable[[str, Any], Callable[[Any], bool] | None] | None = None
+    within: float = SECONDS
+    needs: Callable[[], Any] | None = None
+    slow: bool = False
+    said: bool = False
+
+    def case(self, one: tuple[str, Any]) -> Case:
+        """The input with one of the wrong values."""
+        what, value = one
+        right = self.right if self.rights is None else self.rights(what, value)
+        name = f"{self.name}: {what}"
+        words = (*self.words, value) if self.said and isinstance(value, str) and value else self.words
+        return Case(self.border, name, words, lambda folder: self.act(value, folder), right, self.within)
+
+    def matching(self, part: str) -> Target:
+        """With those named cases alone that have this in their names; with all, if it is in its own."""
+        if part in f"{self.border} {self.name}:":
+            return self
+        named = {
+            what: value for what, value in self.wrong.named.items() if part in f"{self.border} {self.name}: {what}"
+        }
+        return replace(self, wrong=d.Wrong(named, self.wrong.others))
+
+    def named(self) -> list[Case]:
+        """Those that are always tried."""
+        return [self.case(one) for one in self.wrong.named.items()]
+
+    def some(self) -> st.SearchStrategy[Case]:
+        """Any of them."""
+        return self.wrong.some().map(self.case)
+
+    def others(self) -> st.SearchStrategy[Case]:
+        """Any but those that are always tried."""
+        return self.wrong.others.map(self.case)
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder, or a file, that is right, and how it is read.
+
+    Args:
+        border: of its targets.
+        sound: makes it.
+        read: reads it; a damaged one is a copy.
+    """
+
+    border: str
+    sound: Callable[[], Path]
+    read: Callable[..., Any]
+
+    def damaged(self, change: d.Change, folder: Path, file: str = "", **options: Any) -> Any:
+        """What a user reads of a changed copy."""
+        root = d.copied(self.sound(), folder)
+        change(root / file)
+        return self.read(root, **options)
+
+    def target(
+        self,
+        name: str,
+        wrong: d.Wrong | Mapping[str, d.Change],
+        right: Callable[[Any], bool] | None = None,
+        words: str | tuple[str, ...] = (),
+        file: str = "",
+        options: Mapping[str, Any] | None = None,
+        **more: Any,
+    ) -> Target:
+        """A target whose wrong values are changes of the folder, or of a file in it."""
+        words = (words,) if isinstance(words, str) else words
+        words = words or (Path(file).name,)
+        wrong = wrong if isinstance(wrong, d.Wrong) else d.Wrong(wrong)
+        act = lambda change, folder: self.damaged(change, folder, file, **(options or {}))  # noqa: E731
+        return Target(self.border, name, words, act, wrong, right, **{"needs": self.sound, **more})
+
+    def arguments(self, name: str, **more: Any) -> Subject:
+        """What it is read with, as arguments of something by this name."""
+        return Subject(lambda **given: self.read(self.sound(), **given), name=name, **more)
+
+    def one(self, name: str, change: d.Change, words: str | tuple[str, ...], **more: Any) -> Target:
+        """A target with one change."""
+        return self.target(name, {"damaged": change}, words=words, **more)
+
+
+#: Wrong values of arguments, by their annotation.
+OF_KINDS: dict[str, d.Wrong] = {
+    "NestedKey": d.Wrong(
+        {"a number": 5, "empty": "", "an empty tuple": (), "numbers": ("info", 3), "a list": ["info"]},
+    ),
+    "Sequence[NestedKey]": d.Wrong({"one key": "action", "a number": 5, "numbers": [1, 2]}),
+    "bool": d.Wrong({"text": "yes", "a number": 2, "nothing": None}),
+    "Callable": d.Wrong({"a number": 3, "text": "sine"}),
+    "torch.Generator": d.Wrong({"a seed": 3, "text": "cpu"}),
+}
+#: Likewise, by their names, where they mean the same everywhere.
+OF_NAMES: dict[str, d.Wrong] = {
+    **dict.fromkeys(("transition", "observation", "noise", "initial", "network", "velocity", "modules"), d.MODULE),
+    **dict.fromkeys(("hidden_size", "num_layers", "lags", "longest", "in_features", "out_features"), d.COUNT),
+    **dict.fromkeys(("observation_dim", "state_dim", "encoding_dim", "dim", "keypoints", "iterations"), d.COUNT),
+    **dict.fromkeys(("in_channels", "pooled", "trunk_memory", "tile", "sensor_updates", "features"), d.COUNT),
+    **dict.fromkeys(("inflation", "epsilon", "prior_std", "tempering", "height", "focal", "reach"), d.POSITIVE),
+    **dict.fromkeys(("ess_threshold", "relaxation", "p"), d.SHARE),
+    **dict.fromkeys(("posterior_std", "floor", "factor"), d.NOT_NEGATIVE),
+    **dict.fromkeys(("resampling", "layer", "scheme", "score", "reduction"), d.CHOICE),
+    "variance_ceiling": d.POSITIVE.but("inf"),
+    "process_noise": d.vector(2, negative=False),
+    "angles": d.angles(2),
+    "mean": d.vector(2),
+    "loc": d.vector(2),
+    "scale": d.vector(2, positive=True).but("inf"),  # infinity hides an input
+    "std": d.vector(2, negative=False, length=False) | {"too long": [1.0] * 3},
+    "ensemble_size": d.LARGE_COUNT,
+    "dt": d.POSITIVE.but("text", "zero"),  # text is a key
+    "rate": d.RATE,
+    "num_cells": d.CELLS,
+    "size": d.SIZE,
+}
+
+
+def annotations(make: Callable[..., Any]) -> dict[str, str]:
+    """The arguments that a class or function takes, with their types, as text."""
+    if isinstance(make, type):
+        signature, options, _ = _signature(make)
+    else:
+        signature, options = inspect.signature(make), {}
+    return {name: str(one.annotation) for name, one in signature.parameters.items()} | options
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Something with arguments.
+
+    Args:
+        make: the class or function.
+        sound: returns right arguments by name.
+        use: what a user would do with what was made, where a mistake may show that the constructor cannot see.
+        wrong: wrong values of arguments, where their names and types do not tell; ``None`` for none.
+        also: other words by which a message may name an argument.
+        right: for some arguments, whether a result is one that the documentation promises for a wrong value.
+        name: for the record.
+    """
+
+    make: Callable[..., Any]
+    sound: Callable[[], dict[str, Any]] = dict
+    use: Callable[[Any], Any] = field(default=lambda made: made)
+    wrong: Mapping[str, d.Wrong | None] = field(default_factory=dict)
+    also: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    right: Mapping[str, Callable[[Any], bool]] = field(default_factory=dict)
+    name: str = ""
+
+    def damage(self) -> dict[str, d.Wrong]:
+        """The wrong values of each argument."""
+        found = {}
+        for name, text in annotations(self.make).items():
+            kind = text.removesuffix(" | None").split("[...")[0]
+            values = OF_NAMES.get(name) or (OF_KINDS.get(kind) if isinstance(self.make, type) else None)
+            if values is not None:
+                optional = "None" in text and "nothing" in values.named
+                found[name] = values.but("nothing") if optional else values
+        return {name: values for name, values in {**found, **self.wrong}.items() if values is not None}
+
+    def targets(self, border: str, **more: Any) -> Iterator[Target]:
+        """A target for every argument."""
+        name = self.name or self.make.__qualname__
+        for argument, wrong in self.damage().items():
+            words = (argument, *self.also.get(argument, ()))
+            act = lambda value, folder, argument=argument: self.act(argument, value)  # noqa: E731
+            yield Target(border, f"{name}({argument})", words, act, wrong, self.right.get(argument), **more)
+
+    def act(self, argument: str, value: Any) -> Any:
+        """Makes it with a wrong value, and uses it."""
+        return self.use(self.make(**{**self.sound(), argument: value}))
+
+
+def targets_of(border: str, *subjects: Subject, **more: Any) -> Iterator[Target]:
+    """The arguments of several subjects."""
+    for subject in subjects:
+        yield from subject.targets(border, **more)

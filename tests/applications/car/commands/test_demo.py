@@ -1,0 +1,38 @@
+"""The demo leaves a picture and an animation, and says what the library's functions give."""
+
+import re
+
+import pytest
+from PIL import Image
+
+from torch_denkf import from_pretrained
+from torch_denkf.applications.car import read_kitti_drive
+from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
+from torch_denkf.cli.main import main
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")
+def test_demo_of_a_rendered_drive(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    words = ["demo", "--out", str(tmp_path), "--frames", "36", "--every", "12"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    drive = read_kitti_drive(tmp_path / "drives", "demo", size=(100, 300), cache=None)
+    scores = drive_scores(track_failing_drive(from_pretrained("car-odometry"), drive, usual_failures(36)))
+    assert re.search(rf"DEnKF +{scores['filter_end_m']:.1f} m .* {scores['filter_mean_m']:.1f} m", said)
+    assert re.search(rf"dead reckoning +{scores['reckoned_end_m']:.1f} m .* {scores['reckoned_mean_m']:.1f} m", said)
+    assert f"hold {100 * scores['held_v']:.0f} % of the true speeds" in said
+    with Image.open(tmp_path / "demo.gif") as animation:
+        assert animation.size == (800, 500)
+        assert animation.n_frames == 3 + 6
+    with Image.open(tmp_path / "demo.png") as picture:
+        assert picture.width >= 800
+
+
+def test_mistakes_of_the_demo(tmp_path, capsys):
+    assert main(["demo", "--root", str(tmp_path)]) == 2
+    assert "pass --root and --drive together, or neither" in capsys.readouterr().err
+    assert main(["demo", "--frames", "3"]) == 2
+    assert "--frames is at least 30" in capsys.readouterr().err
+    assert main(["demo", "--root", str(tmp_path), "--drive", "09", "--out", str(tmp_path)]) == 2
+    assert "error: " in capsys.readouterr().err

@@ -1,0 +1,144 @@
+"""Drives along given poses are read back as given; runs are repeatable, can be resumed, and explain their errors."""
+
+import os
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from torch_denkf.applications.car import read_kitti_drive
+from torch_denkf.applications.car.commands.render_kitti import main
+from torch_denkf.applications.car.kitti import writer
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.files import write_poses
+from torch_denkf.applications.car.kitti.render import random_drive, render_drives
+from torch_denkf.applications.car.street.random_drive import hilly_poses
+from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
+
+cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A folder with pose files of two drives."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for seed, name in enumerate(("00", "01")):
+        rng = np.random.default_rng(seed)
+        write_poses(folder / f"{name}.txt", hilly_poses(random_drive(30, rng), rng))
+    return folder
+
+
+def content(root):
+    return {str(file.relative_to(root)): file.read_bytes() for file in sorted(root.rglob("*")) if file.is_file()}
+
+
+def test_the_reader_gives_back_the_given_poses(recorded, tmp_path):
+    assert render_drives(tmp_path, poses=recorded, frames=12, size=(25, 75), focal=0.8) == ["00", "01"]
+    assert list_kitti_drives(tmp_path) == ["00", "01"]
+    for name in ("00", "01"):
+        drive = read_kitti_drive(tmp_path, name, size=(25, 75), cache=None)
+        given = np.loadtxt(recorded / f"{name}.txt").reshape(-1, 3, 4)[:12]
+        np.testing.assert_allclose(drive["state"], poses_to_state(given, KITTI_DT), atol=1e-5)
+        assert drive["frame_valid"].all()
+        # 0.8 of the width; rows are scaled as KITTI's 376 x 1241 to 25 x 75.
+        focal = [0.8 * 75, 0.8 * 1241 * 25 / 376, 607.1928 * 75 / 1241 - 0.5, 185.2157 * 25 / 376 - 0.5]
+        np.testing.assert_allclose(drive["calibration"][3], focal, rtol=1e-6)
+        assert drive["image"].float().std(dim=(1, 2, 3)).min() > 15
+    grey = tmp_path / "grey"
+    render_drives(grey, poses=recorded, names="01", frames=12, size=(25, 75), focal=0.8, camera="image_0")
+    one = cv2.imread(str(grey / "sequences/01/image_0/000005.png"), cv2.IMREAD_UNCHANGED)
+    three = cv2.imread(str(tmp_path / "sequences/01/image_2/000005.png"))
+    assert one.shape == (25, 75)
+    assert np.abs(one.astype(float) - cv2.cvtColor(three, cv2.COLOR_BGR2GRAY)).mean() < 4  # two kinds of grain
+
+
+def test_bytes_depend_neither_on_processes_nor_on_interruptions(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(writer, "STRETCH", 5)
+    options = {"poses": recorded, "frames": 12, "size": (12, 36)}
+    render_drives(tmp_path / "one", **options)
+    expected = content(tmp_path / "one")
+    assert len(expected) == 2 * (12 + 4)
+
+    render_drives(tmp_path / "two", **options, processes=2)
+    assert content(tmp_path / "two") == expected
+
+    written = []
+
+    def stop(images):
+        written.append(images)
+        if sum(written) >= 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_drives(tmp_path / "three", **options, progress=stop)
+    assert list_kitti_drives(tmp_path / "three") == ["00"]
+    assert [entry.name for entry in (tmp_path / "three/sequences").iterdir()] == ["00"]
+    first = tmp_path / "three/sequences/00/image_2/000001.png"
+    before = first.stat().st_mtime_ns
+    # What a killed run leaves is no drive, and goes once nobody has written to it for a while.
+    half = tmp_path / "three/.01-0123abcd"
+    (half / "image_2").mkdir(parents=True)
+    for folder in (half / "image_2", half):
+        os.utime(folder, (0, 0))
+    written.clear()
+    render_drives(tmp_path / "three", **options, progress=written.append)
+    assert written == [12, 5, 5, 2]
+    assert first.stat().st_mtime_ns == before
+    assert content(tmp_path / "three") == expected
+
+    render_drives(tmp_path / "three", **{**options, "seed": 1}, overwrite=True)
+    assert content(tmp_path / "three")["sequences/00/image_2/000001.png"] != expected["sequences/00/image_2/000001.png"]
+
+
+def test_errors_name_the_file_and_the_remedy(recorded, tmp_path, capsys):
+    with pytest.raises(FileNotFoundError, match=r"no pose files NAME\.txt in .*; pass the folder"):
+        render_drives(tmp_path / "out", poses=tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no pose files for \['07'\] in .*; it has \['00', '01'\]"):
+        render_drives(tmp_path / "out", poses=recorded, names=["00", "07"])
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad/03.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1\n")
+    with pytest.raises(ValueError, match=r"03\.txt:2: expected 12 finite numbers .*got 11 words"):
+        render_drives(tmp_path / "out", poses=tmp_path / "bad")
+    with pytest.raises(ValueError, match="at least 2 frames, got 1"):
+        render_drives(tmp_path / "out", poses=recorded, frames=1)
+    with pytest.raises(ValueError, match=r"camera is one of .*got 'image_9'"):
+        render_drives(tmp_path / "out", camera="image_9")
+    with pytest.raises(ValueError, match="focal length as a share of the width"):
+        render_drives(tmp_path / "out", focal=718.856)
+    with pytest.raises(ValueError, match="processes must be at least 1, got 0"):
+        render_drives(tmp_path / "out", processes=0)
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot write to .*file.*; choose another folder"):
+        render_drives(tmp_path / "file", names="a", frames=2)
+    render_drives(tmp_path / "out", names="a", frames=2, size=(12, 36))
+    with pytest.raises(FileExistsError, match=r"sequences/a is there .*overwrite=True"):
+        render_drives(tmp_path / "out", names="a", frames=3, size=(12, 36))
+    capsys.readouterr()
+    words = ["--out", str(tmp_path / "out"), "--poses", str(tmp_path / "bad"), "--processes", "1"]
+    assert main(words) == 2
+    assert re.match(r"error: .*03\.txt:2: ", capsys.readouterr().err)
+
+
+def test_the_command_writes_what_the_function_does(recorded, tmp_path):
+    words = ["--poses", str(recorded), "--out", str(tmp_path / "a"), "--names", "01", "--size", "12", "36"]
+    words += [
+        "--frames",
+        "4",
+        "--seed",
+        "5",
+        "--camera",
+        "image_0",
+        "--focal",
+        "0.7",
+        "--processes",
+        "1",
+        "--no-traffic",
+    ]
+    assert main(words) == 0
+    render_drives(
+        tmp_path / "b", poses=recorded, names=["01"], size=(12, 36), frames=4, seed=5, camera="image_0", focal=0.7,
+        traffic=False,
+    )  # fmt: skip
+    assert content(tmp_path / "a") == content(tmp_path / "b")

@@ -1,0 +1,437 @@
+"""The reader, on a layout written by hand with known numbers, and on a few real frames where they are."""
+
+import math
+import os
+import shutil
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import torch_denkf.applications.car.kitti.drive as module
+from tests.real_data import KITTI
+from torch_denkf.applications.car import dead_reckoning, read_kitti_drive
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.files import read_calibration, read_poses
+from torch_denkf.applications.car.vision.poses import poses_to_state, state_to_poses
+from torch_denkf.data import cache_entry
+from torch_denkf.data.cache_entry import CachedTensor
+
+cv2.setNumThreads(1)
+
+
+def make(root, *, images=range(6), poses=None, camera="image_2", sequence="00", grey=False, size=(10, 30), times=True):
+    """A drive whose frame k is flat in colour (B, G, R) = (k, 50 + k, 100 + k) and which moves 1 m a frame."""
+    folder = root / "sequences" / sequence
+    (folder / camera).mkdir(parents=True, exist_ok=True)
+    (root / "poses").mkdir(exist_ok=True)
+    for k in images:
+        picture = np.full((*size, 3), (k, 50 + k, 100 + k), np.uint8)
+        cv2.imwrite(str(folder / camera / f"{k:06d}.png"), picture[..., 1] if grey else picture)
+    rows = range(6) if poses is None else poses
+    text = "".join(f"1 0 0 0 0 1 0 0 0 0 1 {k}\n" for k in rows)
+    (root / "poses" / f"{sequence}.txt").write_text(text)
+    calibration = "20 0 14.5 0 0 18 4.5 0 0 0 1 0"
+    (folder / "calib.txt").write_text("".join(f"P{k}: {k + 1}{calibration[1:]}\n" for k in range(4)))
+    if times:
+        (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(rows))))
+    return root
+
+
+def test_a_drive_by_hand(tmp_path):
+    drive = read_kitti_drive(make(tmp_path), "00", size=(10, 30), cache=None)
+    assert drive.batch_size == (6,)
+    assert drive["image"].dtype == torch.uint8
+    assert drive["image"].shape == (6, 3, 10, 30)
+    assert drive["image"][4, :, 3, 3].tolist() == [104, 54, 4]  # RGB
+    assert drive["frame_valid"].all()
+    expected = [[k, 0, 0, 10, 0] for k in range(6)]
+    torch.testing.assert_close(drive["state"], torch.tensor(expected, dtype=torch.float32))
+    torch.testing.assert_close(drive["time"], 0.1 * torch.arange(6, dtype=torch.float64).unsqueeze(-1))
+    assert drive["frame"].flatten().tolist() == list(range(6))
+    torch.testing.assert_close(drive["dt"], torch.full((6, 1), 0.1))
+    # P2 begins with 30: fx 30, fy 18; the size is that of the files.
+    torch.testing.assert_close(drive["calibration"], torch.tensor([30.0, 18.0, 14.5, 4.5]).expand(6, 4))
+    scaled = read_kitti_drive(tmp_path, 0, size=(5, 60), cache=None)
+    # Pixel centres are at whole numbers: the middle of 30 columns, 14.5, becomes that of 60, 29.5.
+    torch.testing.assert_close(scaled["calibration"][0], torch.tensor([60.0, 9.0, 29.5, 2.0]))
+    assert scaled["image"].shape == (6, 3, 5, 60)
+    assert scaled["image"][4, :, 3, 3].tolist() == [104, 54, 4]
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_the_state_of_a_circle(turn):
+    """To the left (turn 1) or right (-1), at constant speed, for three quarters of a turn."""
+    rows, radius, speed, dt = 120, 20.0, 8.0, 0.1
+    angle = speed * dt / radius * np.arange(rows)
+    path = np.stack([radius * np.sin(angle), turn * radius * (1 - np.cos(angle)), turn * angle], -1)
+    state = poses_to_state(state_to_poses(path), dt)
+    np.testing.assert_allclose(state[:, :3], path, atol=1e-12)
+    assert abs(state[-1, 2]) > 1.4 * math.pi  # unwrapped
+    chord = 2 * radius * math.sin(speed * dt / radius / 2) / dt
+    np.testing.assert_allclose(state[:, 3], chord)
+    np.testing.assert_allclose(state[:, 4], turn * speed / radius)
+
+
+def test_the_pose_matrix_is_kittis():
+    """By hand: after a quarter turn to the right, the camera looks along world x, and x is -y of the state."""
+    right = np.array([[0, 0, 1, 5.0], [0, 1, 0, 0.3], [-1, 0, 0, 7.0]])
+    state = poses_to_state(right[None], 0.1)
+    np.testing.assert_allclose(state, [[7, -5, -math.pi / 2, 0, 0]], atol=1e-12)
+    # Columns of R are the camera's axes in the world: right, down, forward.
+    rotation = state_to_poses(np.array([[0.0, 0.0, 0.4]]))[0, :, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(rotation[:, 2], [-math.sin(0.4), 0, math.cos(0.4)])  # forward, and left of it
+
+
+def test_speed_changes_belong_to_the_pair_that_shows_them():
+    """5 m/s, then 12 m/s from the step into frame 7 on: the pair (6, 7) is the first to show it."""
+    speeds = np.array([5.0] * 7 + [12.0] * 5)
+    turns = np.array([0.0] * 9 + [0.3] * 3)
+    dt = 0.103
+    path = dead_reckoning(torch.tensor(np.stack([speeds, turns], -1)), torch.zeros(3, dtype=torch.float64), dt)
+    state = poses_to_state(state_to_poses(path.numpy()), dt)
+    np.testing.assert_allclose(state[:, 3], speeds)
+    np.testing.assert_allclose(state[:, 4], turns, atol=1e-12)
+    moved = np.linalg.norm(np.diff(state[:, :2], axis=0), axis=-1)
+    np.testing.assert_allclose(moved[6], 12 * dt)  # between frames 6 and 7
+    np.testing.assert_allclose(state[7, 3], moved[6] / dt)
+
+
+def test_reverse_is_negative_and_standing_is_nought():
+    path = np.zeros((5, 3))
+    path[:, 2] = 2.0
+    path[:, :2] = np.array([0, 1, 1, 0.5, 0.5])[:, None] * [math.cos(2.0), math.sin(2.0)]
+    state = poses_to_state(state_to_poses(path), 0.5)
+    np.testing.assert_allclose(state[:, 3], [2, 2, 0, -1, 0], atol=1e-12)
+
+
+def test_dead_reckoning_undoes_the_differences():
+    rng = np.random.default_rng(0)
+    velocities = torch.tensor(np.stack([rng.uniform(-3, 15, 200), rng.uniform(-0.5, 0.5, 200)], -1))
+    path = dead_reckoning(velocities, torch.tensor([3.0, -2.0, 1.0]).double(), 0.103)
+    state = torch.from_numpy(poses_to_state(state_to_poses(path.numpy()), 0.103))
+    torch.testing.assert_close(state[1:, 3:], velocities[1:])
+    torch.testing.assert_close(state[0, 3:], velocities[1])  # the first row takes that of the next
+
+
+def test_missing_frames_keep_their_row(tmp_path):
+    drive = read_kitti_drive(make(tmp_path, images=[1, 2, 4]), "00", size=(10, 30), cache=None)
+    assert drive["frame"].flatten().tolist() == [1, 2, 3, 4]  # frames 0 and 5 lie outside of the first and last image
+    assert drive["frame_valid"].flatten().tolist() == [True, True, False, True]
+    assert (drive["image"][2] == 0).all()
+    assert drive["state"][:, 0].tolist() == [1, 2, 3, 4]
+    torch.testing.assert_close(drive["state"][:, 3], torch.full((4,), 10.0))  # the first from the pose before
+    assert drive["time"].flatten().tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4])
+
+
+def test_images_without_a_pose_are_left_out(tmp_path):
+    make(tmp_path, images=range(6), poses=range(4))
+    assert len(read_kitti_drive(tmp_path, "00", cache=None)) == 4
+    make(tmp_path, images=[9, 10], sequence="01")
+    with pytest.raises(
+        ValueError, match=r"poses/01.txt has 6 poses, for frames 0 to 5, but the first image .* is number 9"
+    ):
+        read_kitti_drive(tmp_path, "01", cache=None)
+
+
+def test_damaged_images_are_missing_frames(tmp_path):
+    make(tmp_path, size=(40, 60))
+    folder = tmp_path / "sequences" / "00" / "image_2"
+    rng = np.random.default_rng(0)
+    noisy = rng.integers(0, 255, (40, 60, 3), np.uint8)
+    cv2.imwrite(str(folder / "000002.png"), noisy)
+    data = (folder / "000002.png").read_bytes()
+    (folder / "000002.png").write_bytes(data[: len(data) // 2])
+    (folder / "000003.png").write_bytes(b"")
+    with pytest.warns(UserWarning, match="not a complete PNG image") as caught:
+        drive = read_kitti_drive(tmp_path, "00", cache=None)
+    assert sorted(str(entry.message).split(" is ")[0] for entry in caught) == [
+        str(folder / "000002.png"),
+        str(folder / "000003.png"),
+    ]
+    assert drive["frame_valid"].flatten().tolist() == [True, True, False, False, True, True]
+    assert (drive["image"][2:4] == 0).all()
+    for k in range(6):
+        (folder / f"{k:06d}.png").write_bytes(b"nothing")
+    with (
+        pytest.warns(UserWarning, match="PNG"),
+        pytest.raises(ValueError, match=r"none of the 6 images in .* can be read"),
+    ):
+        read_kitti_drive(tmp_path, "00", cache=None)
+
+
+def test_grey_and_colour(tmp_path):
+    make(tmp_path, camera="image_0", grey=True)
+
+    def channels(**options):
+        return read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None, **options)["image"][4, :, 0, 0].tolist()
+
+    assert channels() == [54, 54, 54]
+    assert channels(colour=None) == [54]
+    assert channels(colour=False) == [54]
+    make(tmp_path, camera="image_2")
+    assert channels() == [104, 54, 4]  # colour is preferred
+    assert channels(colour=None) == [104, 54, 4]
+    grey = 0.299 * 104 + 0.587 * 54 + 0.114 * 4
+    assert channels(colour=False) == [pytest.approx(grey, abs=1)]
+    assert channels(camera="image_0") == [54, 54, 54]
+    make(tmp_path, camera="image_3", sequence="07")
+    make(tmp_path, camera="image_1", sequence="07", grey=True)
+    calibration = read_kitti_drive(tmp_path, 7, size=(10, 30), cache=None)["calibration"]
+    assert calibration[0, 0] == 40  # that of image_3
+
+
+def test_images_of_any_size_are_scaled(tmp_path):
+    make(tmp_path, size=(37, 122))
+    drive = read_kitti_drive(tmp_path, "00", size=(10, 30), cache=None)
+    assert drive["image"][3, :, 5, 5].tolist() == [103, 53, 3]
+
+
+def test_a_drive_has_one_size(tmp_path):
+    """An image of another size would have another calibration; a damaged one has no size."""
+    make(tmp_path)
+    make(tmp_path, images=[4], size=(37, 122))
+    (tmp_path / "sequences/00/image_2/000000.png").write_bytes(b"nothing")
+    message = r"000004.png is 122 pixels wide and 37 high, but .*000001.png is 30 pixels wide and 10 high; .* one size"
+    with pytest.warns(UserWarning, match="000000.png is not a complete PNG"), pytest.raises(ValueError, match=message):
+        read_kitti_drive(tmp_path, "00", size=(10, 30), cache=tmp_path / "cache")
+    assert not list(tmp_path.glob("cache/*"))
+
+
+def test_progress_counts_the_images_that_are_decoded(tmp_path):
+    make(tmp_path, images=[0, 1, 3, 5])
+    seen = []
+    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
+    assert sum(seen) == 4
+    read_kitti_drive(tmp_path, "00", cache=tmp_path / "cache", progress=seen.append)
+    assert sum(seen) == 4
+
+
+def test_times_are_nominal_without_a_file(tmp_path):
+    drive = read_kitti_drive(make(tmp_path, times=False), "00", cache=None)
+    torch.testing.assert_close(drive["dt"], torch.full((6, 1), 0.103))
+    torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 1 / 0.103))
+    (tmp_path / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n0.3\n0.4\n9.0\n")
+    with pytest.warns(UserWarning, match=r"times.txt: 1 gaps, the longest of 8.6 s before line 6"):
+        drive = read_kitti_drive(tmp_path, "00", cache=None)
+    torch.testing.assert_close(drive["dt"][0], torch.tensor([0.1]))  # the median: one jump does not count
+    assert drive["time"][-1] == 9.0
+
+
+def test_the_cache(tmp_path, monkeypatch):
+    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
+    first = read_kitti_drive(root, "00", cache=cache)
+    assert isinstance(first["image"], CachedTensor)
+    entries = list(cache.iterdir())
+    assert len(entries) == 1
+    # From now on the cache alone is read: images are not opened again.
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_decode", None)
+        again = read_kitti_drive(root, "00", cache=cache)
+        assert (again == first).all()
+        monkeypatch.setenv("TORCH_DENKF_CACHE", str(cache))
+        assert (read_kitti_drive(root, "00") == first).all()
+    # Other options are other entries; a changed file is read anew.
+    read_kitti_drive(root, "00", size=(20, 60), cache=cache)
+    assert len(list(cache.iterdir())) == 2
+    make(root, poses=range(0, 12, 2))
+    os.utime(root / "poses/00.txt", ns=(1, 1))
+    changed = read_kitti_drive(root, "00", cache=cache)
+    assert changed["state"][1, 0] == 2
+    # A damaged entry is made anew, and nothing else is left behind.
+    for entry in cache.iterdir():
+        (entry / cache_entry.MANIFEST).write_text("{")
+    assert (read_kitti_drive(root, "00", cache=cache) == changed).all()
+    assert not [entry for entry in cache.iterdir() if entry.name.startswith(".")]
+    assert not [entry for entry in root.rglob("*") if entry.suffix == ".bin"]
+    assert not isinstance(read_kitti_drive(root, "00", cache=None)["image"], CachedTensor)
+
+
+def test_a_cache_that_is_cut_short_is_never_seen(tmp_path, monkeypatch):
+    root, cache = make(tmp_path / "kitti"), tmp_path / "cache"
+
+    def killed(folder, content):
+        (folder / "image.bin").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cache_entry, "seal_entry", killed)
+        with pytest.raises(KeyboardInterrupt):
+            read_kitti_drive(root, "00", cache=cache)
+    assert list(cache.iterdir()) == []
+    assert len(read_kitti_drive(root, "00", cache=cache)) == 6
+
+
+def test_a_cache_that_cannot_be_written_says_what_to_do(tmp_path):
+    root = make(tmp_path / "kitti")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot write the cache at .*file.*pass cache=FOLDER or cache=None"):
+        read_kitti_drive(root, "00", cache=tmp_path / "file")
+
+
+def test_drives_are_listed(tmp_path):
+    make(tmp_path, sequence="03")
+    make(tmp_path, sequence="01")
+    make(tmp_path, sequence="05", images=[])
+    make(tmp_path, sequence="12")
+    (tmp_path / "poses" / "12.txt").unlink()
+    assert list_kitti_drives(tmp_path) == ["01", "03"]
+    with pytest.raises(FileNotFoundError, match="pass the folder that holds 'sequences' and 'poses'"):
+        list_kitti_drives(tmp_path / "poses")
+
+
+def test_errors_name_the_file(tmp_path):
+    make(tmp_path)
+
+    def fails(error, match, sequence="00", **options):
+        with pytest.raises(error, match=match):
+            read_kitti_drive(tmp_path, sequence, cache=None, **options)
+
+    fails(FileNotFoundError, r"no folder .*sequences/07; .*sequences has \['00'\]", "07")
+    fails(FileNotFoundError, r"no folder .*image_1; pass another camera", camera="image_1")
+    fails(
+        ValueError,
+        r"size is \(height, width\) in pixels, whole numbers, and must be positive, got \(0, 5\)",
+        size=(0, 5),
+    )
+    make(tmp_path, sequence="01", images=[])
+    fails(FileNotFoundError, r"no images in .*sequences/01; expected FFFFFF.png in one of", "01")
+    fails(FileNotFoundError, r"no images FFFFFF.png in .*01/image_2", "01", camera="image_2")
+    poses = tmp_path / "poses" / "00.txt"
+    lines = poses.read_text().splitlines()
+    poses.write_text("\n".join([*lines[:2], "1 2 3", *lines[3:]]))
+    fails(ValueError, r"poses/00.txt:3: expected 12 finite numbers \(a 3x4 .*got 3 words: '1 2 3'")
+    poses.write_text("\n".join([*lines[:4], lines[4].replace("4", "nan"), lines[5]]))
+    fails(ValueError, r"poses/00.txt:5: expected 12 finite numbers")
+    poses.write_text("\n".join([*lines[:4], lines[4].replace("4", "x"), lines[5]]))
+    fails(ValueError, r"poses/00.txt:5: expected 12 finite numbers")
+    poses.write_text("\n".join([lines[0], "", *lines[1:]]))
+    fails(ValueError, r"poses/00.txt:2: expected 12 finite numbers")
+    poses.write_text("\n")
+    fails(ValueError, r"poses/00.txt is empty")
+    poses.unlink()
+    fails(FileNotFoundError, r"no poses at .*poses/00.txt; download 'odometry data set")
+    make(tmp_path)
+    times = tmp_path / "sequences/00/times.txt"
+    times.write_text("0\n0.1\n")
+    fails(ValueError, r"times.txt has 2 times, but there are 6 posed frames")
+    times.write_text("0\n" * 6)
+    fails(ValueError, r"times.txt:2: the time 0 s does not increase, nor do 4 others of 6")
+    make(tmp_path)
+    calibration = tmp_path / "sequences/00/calib.txt"
+    calibration.write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 1 2\n")
+    fails(ValueError, r"calib.txt:2: expected 12 finite numbers \(a 3x4 projection")
+    calibration.write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    fails(ValueError, r"calib.txt has no row 'P2:', the projection of image_2")
+    calibration.write_text("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nP1: 1\nP2: 2 0 0 0 0 2 0 0 0 0 1 0\n")
+    fails(ValueError, r"calib.txt:3: 'P2:' is there 2 times")
+    calibration.unlink()
+    fails(FileNotFoundError, r"no calibration at .*calib.txt")
+
+
+@pytest.mark.parametrize(
+    ("file", "row", "text", "match"),
+    [
+        (
+            "poses/00.txt",
+            3,
+            "1 0 0 1000000 0 1 0 0 0 0 1 3",
+            r"00.txt:4: the position is 1e\+06 m from .*, 0.1 s earlier",
+        ),
+        ("poses/00.txt", 0, "1 0 0 0 0 1 0 0 0 0 1 -31", r"00.txt:2: the position is 32 m from that of the row before"),
+        ("poses/00.txt", 3, "1 0 0 0 0 1 0 0 0 0 1 1_3", r"00.txt:4: expected 12 finite numbers"),
+        ("sequences/00/calib.txt", 2, "P2: 7_0 0 0 0 0 9 0 0 0 0 1 0", r"calib.txt:3: expected 12 finite numbers"),
+        ("sequences/00/times.txt", 3, "0_3", r"times.txt:4: expected 1 finite number \(seconds\), got 1 words: '0_3'"),
+        (
+            "sequences/00/times.txt",
+            None,
+            "0\n103\n206\n309\n412\n515\n",
+            r"times is 103 s, .*; write the times in seconds",
+        ),
+    ],
+)
+def test_what_cannot_be_a_drive_is_refused(tmp_path, file, row, text, match):
+    """A leap, numbers that Python alone reads as such, and times in ms."""
+    path = make(tmp_path) / file
+    lines = path.read_text().splitlines()
+    path.write_text(text if row is None else "\n".join([*lines[:row], text, *lines[row + 1 :]]))
+    with pytest.raises(ValueError, match=match):
+        read_kitti_drive(tmp_path, "00", cache=None)
+
+
+def test_a_leap_over_a_gap_is_none(tmp_path):
+    """60 m in 6 s."""
+    root = make(tmp_path, poses=[0, 1, 2, 62, 63, 64])
+    (root / "sequences/00/times.txt").write_text("0\n0.1\n0.2\n6.2\n6.3\n6.4\n")
+    with pytest.warns(UserWarning, match="1 gaps"):
+        drive = read_kitti_drive(tmp_path, "00", cache=None)
+    torch.testing.assert_close(drive["state"][:, 3], torch.full((6,), 10.0))
+
+
+# Real frames ---------------------------------------------------------------------------------------------------------
+
+
+def real(tmp_path, sequence, camera, frames):
+    """A few frames of a real drive, in a folder of their own."""
+    source = KITTI / "sequences" / sequence
+    if not source.is_dir():
+        pytest.skip(f"no KITTI frames at {source}")
+    target = tmp_path / "sequences" / sequence
+    (target / camera).mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    for name in ("calib.txt", "times.txt"):
+        shutil.copy(source / name, target)
+    shutil.copy(KITTI / "poses" / f"{sequence}.txt", tmp_path / "poses")
+    for k in frames:
+        file = source / camera / f"{k:06d}.png"
+        if file.is_file():
+            (target / camera / file.name).symlink_to(file)
+    return tmp_path
+
+
+def test_real_grey_frames_with_a_gap(tmp_path):
+    root = real(tmp_path, "2011_09_26_drive_0039", "image_0", range(5, 25))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        drive = read_kitti_drive(root, "2011_09_26_drive_0039", cache=None)
+    assert drive["image"].shape == (20, 3, 50, 150)
+    assert (~drive["frame_valid"]).flatten().nonzero().flatten().tolist() == [13]  # frame 18
+    assert (drive["image"][:, 0] == drive["image"][:, 2]).all()
+    picture = cv2.imread(str(root / "sequences/2011_09_26_drive_0039/image_0/000007.png"), cv2.IMREAD_GRAYSCALE)
+    expected = cv2.resize(picture, (150, 50), interpolation=cv2.INTER_AREA)
+    assert (drive["image"][2, 0].numpy() == expected).all()
+    # 414 x 125 with fx = 240.5, cx = 203.2
+    expected = [240.512567 * 150 / 414, 240.512567 * 0.4, (203.186433 + 0.5) * 150 / 414 - 0.5, 58.118 * 0.4 - 0.5]
+    torch.testing.assert_close(drive["calibration"][0], torch.tensor(expected))
+
+
+# The mean step is that of all rows; for 09 the reference code's own statistics say 1.0712 m (full_parameters.pkl).
+@pytest.mark.parametrize(("sequence", "mean_step"), [("00", 0.820), ("09", 1.0712)])
+def test_real_poses_have_the_state_of_kloss(sequence, mean_step):
+    file = KITTI / "poses" / f"{sequence}.txt"
+    if not file.is_file():
+        pytest.skip(f"no KITTI poses at {file}")
+    poses = read_poses(file)
+    state = poses_to_state(poses, 0.103)
+    np.testing.assert_array_equal(state[:, 0], poses[:, 2, 3])
+    np.testing.assert_array_equal(state[:, 1], -poses[:, 0, 3])
+    theta = -np.arctan2(-poses[:, 2, 0], poses[:, 2, 2])
+    np.testing.assert_allclose(np.exp(1j * state[:, 2]), np.exp(1j * theta))
+    assert np.abs(np.diff(state[:, 2])).max() < 0.2
+    assert state[:, 3].min() > -0.2  # KITTI's car does not reverse
+    assert 0.103 * state[:, 3].mean() == pytest.approx(mean_step, abs=0.003)
+    # Left is positive: over a second, the path's direction turns as the heading does.
+    ten = state[10:, :2] - state[:-10, :2]
+    bend = np.arctan2(ten[:-10, 0] * ten[10:, 1] - ten[:-10, 1] * ten[10:, 0], (ten[:-10] * ten[10:]).sum(-1))
+    fast = np.linalg.norm(ten[:-10], axis=-1) > 3
+    assert np.corrcoef(bend[fast], (state[15:-5, 2] - state[5:-15, 2])[fast])[0, 1] > 0.95
+
+
+def test_the_calibration_of_each_camera(tmp_path):
+    make(tmp_path)
+    file = tmp_path / "sequences/00/calib.txt"
+    assert [read_calibration(file, f"image_{k}")[0] for k in range(4)] == [10, 20, 30, 40]

@@ -1,0 +1,246 @@
+"""Rendered drives: what is read back is what was generated, and images move as the recorded motion says."""
+
+import dataclasses
+import json
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torch_denkf.applications.car import read_kitti_drive, write_drives
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.kitti.render import random_drive, roadside_scene
+from torch_denkf.applications.car.street.camera import Camera
+from torch_denkf.applications.car.street.renderer import Renderer
+from torch_denkf.applications.car.street.scene import Box
+from torch_denkf.applications.car.vision.poses import KITTI_DT, state_to_poses
+
+cv2.setNumThreads(1)
+
+
+def ground_homography(camera: Camera, pose: np.ndarray, origin=(0.0, 0.0), scale: float = 1.0) -> np.ndarray:
+    """Homography from ground coordinates to pixels.
+
+    Args:
+        camera: the camera.
+        pose: camera-to-world matrix, ``[3, 4]``.
+        origin: (x, z) of ground coordinate (0, 0), in m.
+        scale: m for each unit of the ground coordinates.
+
+    Returns:
+        ``[3, 3]``, from (x, z, 1) to homogeneous pixels, whose third entry is the depth in m.
+    """
+    rotation, position = pose[:, :3], pose[:, 3]
+    plane = np.array([[scale, 0, origin[0]], [0, 0, camera.height], [0, scale, origin[1]]])
+    plane[:, 2] -= position
+    return camera.matrix @ rotation.T @ plane
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    root = tmp_path_factory.mktemp("drives")
+    write_drives(root, ["town", "hill"], frames=60, seed=3)
+    return root
+
+
+def test_reading_back_gives_the_generated_state(town):
+    rng = np.random.default_rng([3, zlib.crc32(b"town")])
+    expected = torch.from_numpy(random_drive(60, rng))
+    drive = read_kitti_drive(town, "town", cache=None)
+    torch.testing.assert_close(drive["state"].double(), expected, atol=1e-4, rtol=0)
+    assert drive["image"].shape == (60, 3, 50, 150)
+    assert drive["frame_valid"].all()
+    torch.testing.assert_close(drive["dt"], torch.full((60, 1), 0.103))
+    torch.testing.assert_close(drive["time"].squeeze(-1), 0.103 * torch.arange(60.0, dtype=torch.float64))
+    camera = Camera.kitti((50, 150))
+    expected = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy])
+    torch.testing.assert_close(drive["calibration"][7], expected)
+    assert list_kitti_drives(town) == ["hill", "town"]
+
+
+def test_the_camera_is_kittis():
+    # calib.txt of KITTI's colour drives at 1242 x 375: 721.5377, 609.5593, 172.854.
+    camera = Camera.kitti((375, 1242))
+    np.testing.assert_allclose([camera.fx, camera.fy, camera.cx, camera.cy], [721.54, 721.54, 609.56, 172.85], atol=0.1)
+
+
+def test_drives_move_like_a_car():
+    for seed in range(40):
+        state = random_drive(300, np.random.default_rng(seed))
+        speed, turn = state[:, 3], state[:, 4]
+        assert speed.min() >= 0
+        assert speed.max() <= 15
+        assert np.abs(np.diff(speed) / KITTI_DT).max() <= 2 + 1e-9
+        assert np.abs(turn).max() <= 0.5
+        assert np.abs(speed * turn).max() < 4.0  # m/s² to the side
+        assert np.abs(np.diff(turn)).max() < 0.1  # smooth: rad/s from frame to frame
+    many = np.concatenate([random_drive(300, np.random.default_rng(seed)) for seed in range(40)])
+    assert 6 < many[:, 3].mean() < 10
+    assert 0 < (many[:, 3] < 0.5).mean() < 0.1  # stops, but few
+    assert (np.abs(many[:, 4]) < 0.1).mean() > 0.6  # mostly straight on
+    assert (np.abs(many[:, 4]) > 0.25).mean() > 0.02  # but real turns as well
+    assert abs(np.sign(many[:, 4]).mean()) < 0.2  # to both sides
+
+
+def bare(seed=0, frames=120):
+    """A drive's state and scene without anything on the ground."""
+    rng = np.random.default_rng(seed)
+    state = random_drive(frames, rng)
+    return state, dataclasses.replace(roadside_scene(state, rng), objects=[], light=np.ones(3))
+
+
+def test_the_homography_is_the_pinhole_projection():
+    camera, rng = Camera.kitti((50, 150)), np.random.default_rng(0)
+    for _ in range(20):
+        state = np.array([[*rng.uniform(-50, 50, 2), rng.uniform(-3, 3)]])
+        pose = state_to_poses(state)[0]
+        points = np.stack([*rng.uniform(-80, 80, (2, 30))])  # x, z of ground points
+        world = np.stack([points[0], np.full(30, camera.height), points[1]])
+        seen = pose[:, :3].T @ (world - pose[:, 3:])
+        flat = ground_homography(camera, pose, (3.0, -4.0), 0.5) @ np.stack(
+            [(points[0] - 3) / 0.5, (points[1] + 4) / 0.5, np.ones(30)]
+        )
+        np.testing.assert_allclose(flat[2], seen[2])
+        np.testing.assert_allclose(flat[0] / flat[2], camera.fx * seen[0] / seen[2] + camera.cx)
+        np.testing.assert_allclose(flat[1] / flat[2], camera.fy * seen[1] / seen[2] + camera.cy)
+        # In the state's terms: a point d ahead and a aside to the left of the car appears left of the centre.
+        x, y, theta = state[0]
+        ahead, left = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+        px, py = np.array([x, y]) + 10 * ahead + 2 * left
+        spot = ground_homography(camera, pose) @ [-py, px, 1]
+        np.testing.assert_allclose(spot[:2] / spot[2], [camera.cx - camera.fx / 5, camera.cy + camera.fy * 0.165])
+
+
+def correlation(a, b, where):
+    """Of the fine structure only: flat parts agree under any motion."""
+    a, b = (image - cv2.blur(image, (19, 7)) for image in (a, b))
+    return np.corrcoef(a[where], b[where])[0, 1]
+
+
+def step(state, factor=1.0, turn=0.0):
+    """Pose before and after a step of the state, with another speed or turn rate."""
+    v, omega = factor * state[3], state[4] + turn
+    middle = -omega * KITTI_DT / 2  # ends at the origin, straight ahead
+    start = [-v * KITTI_DT * np.cos(middle), -v * KITTI_DT * np.sin(middle), 2 * middle]
+    return state_to_poses(np.array([start, [0.0, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_ground_moves_as_the_motion_says(seed):
+    state, scene = bare(seed)
+    camera = Camera.kitti((100, 300))
+    renderer, poses = Renderer(scene, camera), state_to_poses(state)
+    rows = slice(round(camera.cy) + 12, None)  # up to 13 m ahead
+    scores = []
+    for t in range(6, 120, 12):
+        pair = [cv2.cvtColor(renderer.render(poses[k]), cv2.COLOR_BGR2GRAY).astype(np.float32) for k in (t - 1, t)]
+        row = []
+        for factor, turn in ((1.0, 0.0), (0.8, 0.0), (1.2, 0.0), (1.0, -0.15), (1.0, 0.15), (0.0, 0.0), (-1.0, 0.0)):
+            before, after = (ground_homography(camera, pose) for pose in step(state[t], factor, turn))
+            flow = after @ np.linalg.inv(before)
+            moved = cv2.warpPerspective(pair[0], flow, camera.size[::-1])[rows]
+            there = cv2.warpPerspective(np.ones(camera.size, np.float32), flow, camera.size[::-1])[rows] > 0.99
+            there = cv2.erode(there.astype(np.uint8), np.ones((7, 19), np.uint8)) > 0
+            row.append(correlation(moved, pair[1][rows], there))
+        scores.append(row)
+    scores = np.array(scores)
+    # Measured: 0.93 to 0.98 with the true motion; 0.75 to 0.92 with a speed 20 % off, about 0.5 with a turn rate
+    # 0.15 rad/s off, at most 0.76 without motion.
+    assert (scores[:, 0] > 0.92).all()
+    assert (scores[:, 1:] < scores[:, :1] - 0.01).all()
+    assert (scores[:, 3:] < 0.8).all()
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_dense_flow_of_a_rendered_pair_has_the_motions_size(seed):
+    rng = np.random.default_rng(seed)
+    state = random_drive(80, rng)
+    camera = Camera.kitti((125, 414))
+    renderer, poses = Renderer(roadside_scene(state, rng), camera), state_to_poses(state)
+    u, v = np.meshgrid(np.arange(414.0), np.arange(125.0))
+    road = (v > camera.cy + 25) & (np.abs(u - camera.cx) < 0.5 * (v - camera.cy))
+    pixels = np.stack([u[road], v[road], np.ones(road.sum())])
+    ratios = []
+    for t in range(5, 80, 8):
+        before, after = (cv2.cvtColor(renderer.render(poses[k]), cv2.COLOR_BGR2GRAY) for k in (t - 1, t))
+        flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(before, after, None)[road]
+        moved = ground_homography(camera, poses[t]) @ np.linalg.inv(ground_homography(camera, poses[t - 1])) @ pixels
+        expected = (moved[:2] / moved[2] - pixels[:2]).T
+        inside = moved[1] / moved[2] < 122
+        ratios.append((flow * expected)[inside].sum() / (expected**2)[inside].sum())
+    # Measured: 0.86 to 1.03. A flow of the wrong sign, or none, would have -1 or 0.
+    assert 0.9 < np.median(ratios) < 1.05
+    assert min(ratios) > 0.75
+    assert max(ratios) < 1.15
+
+
+def test_the_skyline_turns_with_the_car():
+    _, scene = bare()
+    camera = Camera.kitti((100, 300))
+    renderer = Renderer(scene, camera)
+    angle = 3.0 / camera.fx  # to the left: what is far moves three pixels to the right
+    poses = state_to_poses(np.array([[0, 0, 0], [0, 0, angle]]))
+    first, second = (np.float32(renderer.render(pose)[20:44, 50:250].mean(-1)) for pose in poses)
+    (across, down), _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow((200, 24), cv2.CV_32F))
+    assert abs(across - 3) < 0.2
+    assert abs(down) < 0.2
+
+
+def test_a_box_appears_where_its_corners_project():
+    _, scene = bare()
+    corners = np.array([[2.0, 14.0], [4.0, 14.0], [4.0, 18.0], [2.0, 18.0]])  # x to the right, z ahead
+    red = [np.full((32, 32, 3), (0, 0, 255), np.uint8)]
+    scene = dataclasses.replace(scene, objects=[Box(corners, 1.2, [red] * 4)])
+    camera = Camera.kitti((100, 300))
+    for x, theta in ((0.0, 0.0), (4.0, 0.1), (8.0, -0.1)):
+        pose = state_to_poses(np.array([[x, 0.0, theta]]))[0]
+        picture = Renderer(scene, camera).render(pose).astype(int)
+        seen = (picture[..., 2] - picture[..., 1] > 90).nonzero()
+        points = [[cx, y, cz] for cx, cz in corners for y in (camera.height, camera.height - 1.2)]
+        local = (np.array(points) - pose[:, 3]) @ pose[:, :3]
+        u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+        v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        for found, expected in ((seen[1], u), (seen[0], v)):
+            assert abs(found.min() - expected.min()) < 1.01
+            assert abs(found.max() - expected.max()) < 1.01
+
+
+def test_drives_follow_from_name_and_seed_alone(town, tmp_path):
+    def pictures(root, name):
+        return [file.read_bytes() for file in sorted((root / "sequences" / name / "image_2").iterdir())]
+
+    assert write_drives(tmp_path / "a", "hill", frames=60, seed=3) == ["hill"]
+    assert pictures(tmp_path / "a", "hill") == pictures(town, "hill")
+    assert (tmp_path / "a/poses/hill.txt").read_bytes() == (town / "poses/hill.txt").read_bytes()
+    write_drives(tmp_path / "b", ["hill"], frames=60, seed=4)
+    assert pictures(tmp_path / "b", "hill")[5] != pictures(town, "hill")[5]
+    assert pictures(town, "hill")[5] != pictures(town, "town")[5]
+
+
+def test_drives_that_are_there_are_kept(tmp_path):
+    write_drives(tmp_path, ["a"], frames=3)
+    picture = tmp_path / "sequences/a/image_2/000001.png"
+    before = picture.stat().st_mtime_ns
+    write_drives(tmp_path, ["a"], frames=3)
+    assert picture.stat().st_mtime_ns == before
+    with pytest.raises(FileExistsError, match=r"sequences/a .* with other options .*overwrite=True"):
+        write_drives(tmp_path, ["a"], frames=4)
+    write_drives(tmp_path, ["a"], frames=4, overwrite=True)
+    assert len(read_kitti_drive(tmp_path, "a", cache=None)) == 4
+    assert json.loads((tmp_path / "sequences/a/drive.json").read_text())["frames"] == 4
+    # A recorded drive is never replaced.
+    (tmp_path / "sequences/a/drive.json").unlink()
+    with pytest.raises(FileExistsError, match=r"not rendered.*choose another name or folder"):
+        write_drives(tmp_path, ["a"], frames=3, overwrite=True)
+    assert len(list(tmp_path.glob("sequences/*"))) == 1
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["poses", "sequences"]
+
+
+def test_bad_arguments_are_named(tmp_path):
+    with pytest.raises(ValueError, match="at least 2 frames, got 1"):
+        write_drives(tmp_path, ["a"], frames=1)
+    with pytest.raises(ValueError, match=r"got '\.\./a'"):
+        write_drives(tmp_path, ["../a"])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,84 @@
+"""Oracle: evo reads the files, and its errors of known offsets are these offsets."""
+
+import numpy as np
+import pytest
+import torch
+from evo.core import metrics, sync
+from evo.tools import file_interface
+from scipy.spatial.transform import Rotation
+
+from torch_denkf.applications.car import write_trajectory
+
+READERS = {"kitti": file_interface.read_kitti_poses_file, "tum": file_interface.read_tum_trajectory_file}
+TIMES = 0.103 * torch.arange(60, dtype=torch.float64)
+
+
+def drive():
+    """A path that turns through more than a whole turn, float64 [60, 5]."""
+    theta = torch.linspace(-0.5, 7.0, 60, dtype=torch.float64)
+    step = torch.stack([theta.cos(), theta.sin()], -1)
+    return torch.cat([step.cumsum(0), theta.unsqueeze(-1), torch.ones(60, 2, dtype=torch.float64)], -1)
+
+
+def ape(truth, estimate, relation):
+    error = metrics.APE(relation)
+    if hasattr(truth, "timestamps"):
+        truth, estimate = sync.associate_trajectories(truth, estimate)
+    error.process_data((truth, estimate))
+    return error.error
+
+
+@pytest.mark.parametrize("layout", ["kitti", "tum"])
+def test_evo_finds_no_error_against_itself_and_a_known_offset(tmp_path, layout):
+    truth, moved = drive(), drive()
+    moved[:, :2] += torch.tensor([3.0, -4.0])
+    moved[:, 2] += 0.3
+    files = [
+        write_trajectory(tmp_path / layout / f"{n}.txt", p, TIMES, layout=layout) for n, p in enumerate((truth, moved))
+    ]
+    first, second = (READERS[layout](file) for file in files)
+    assert first.num_poses == 60
+    np.testing.assert_allclose(ape(first, first, metrics.PoseRelation.translation_part), 0, atol=1e-12)
+    np.testing.assert_allclose(ape(first, second, metrics.PoseRelation.translation_part), 5.0, atol=1e-7)
+    np.testing.assert_allclose(ape(first, second, metrics.PoseRelation.rotation_angle_rad), 0.3, atol=1e-7)
+
+
+def test_axes_are_those_of_kittis_camera_and_times_are_written(tmp_path):
+    for layout, reader in READERS.items():
+        read = reader(write_trajectory(tmp_path / layout, drive(), TIMES, layout=layout))
+        np.testing.assert_allclose(read.positions_xyz[:, 2], drive()[:, 0], atol=1e-8)  # forward
+        np.testing.assert_allclose(read.positions_xyz[:, 0], -drive()[:, 1], atol=1e-8)  # right
+        # The camera looks along the path: half a step's turn from the chord that leads to the next pose.
+        chord = np.diff(read.positions_xyz, axis=0)
+        forward = np.stack([pose[:3, 2] for pose in read.poses_se3])[1:]
+        assert (np.sum(chord * forward, -1) > 0.999 * np.linalg.norm(chord, axis=-1)).all()
+    np.testing.assert_allclose(read.timestamps, TIMES, atol=1e-9)
+
+
+def test_any_rotation_survives_both_layouts(tmp_path):
+    rotations = Rotation.random(200, random_state=0).as_matrix()
+    half_turns = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
+    poses = np.zeros((203, 4, 4))
+    poses[:, :3, :3] = np.concatenate([rotations, half_turns])
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(203, 3))
+    poses[:, 3, 3] = 1
+    for layout, reader in READERS.items():
+        for given in (poses, torch.from_numpy(poses[:, :3])):
+            read = reader(write_trajectory(tmp_path / layout, given, np.arange(203.0), layout=layout))
+            np.testing.assert_allclose(np.stack(read.poses_se3), poses, atol=1e-8)
+
+
+def test_errors_say_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match='"kitti" or "tum"'):
+        write_trajectory(tmp_path / "a", drive(), layout="euroc")
+    with pytest.raises(ValueError, match="pass times"):
+        write_trajectory(tmp_path / "a", drive(), layout="tum")
+    with pytest.raises(ValueError, match="60 increasing seconds"):
+        write_trajectory(tmp_path / "a", drive(), -TIMES, layout="tum")
+    with pytest.raises(ValueError, match=r"states \[T, S\] with S >= 3"):
+        write_trajectory(tmp_path / "a", drive()[:, :2])
+    broken = drive()
+    broken[7, 1] = torch.nan
+    with pytest.raises(ValueError, match="row 7 of the trajectory is not finite"):
+        write_trajectory(tmp_path / "a", broken)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,87 @@
+"""Oracles: evo's relative pose error, and numbers by hand."""
+
+import math
+
+import pytest
+import torch
+
+from tests.applications.car.metrics.paths_for_tests import evo_errors, straight, winding
+from torch_denkf.applications.car import kitti_endpoint_error, kitti_pathlength_error
+from torch_denkf.functional import wrap_angle
+
+
+@pytest.mark.parametrize("window", [1, 37, 100])
+def test_endpoint_error_is_that_of_evo(window):
+    truth, estimated = winding(0, rows=200), winding(1, rows=200)
+    error = kitti_endpoint_error(estimated, truth, window=window, min_length=0.0)
+    last, metres, degrees = evo_errors(estimated, truth, window)
+    assert last.equal(torch.arange(window, 200))
+    step = (truth[1:, :2] - truth[:-1, :2]).norm(dim=-1)
+    length = torch.stack([step[i : i + window].sum() for i in range(200 - window)])
+    torch.testing.assert_close(error.window_translation, metres / length)
+    torch.testing.assert_close(error.window_rotation, degrees / length, atol=1e-7, rtol=1e-7)
+    assert metres.mean() > 0.1
+
+
+def test_a_window_of_all_steps_fits_and_one_more_does_not():
+    path, metric = straight(101), kitti_pathlength_error
+    assert metric(path, path).windows == (100,)
+    with pytest.raises(ValueError, match="fits into 100 poses"):
+        metric(path[:-1], path[:-1])
+    with pytest.raises(ValueError, match="at least 1 each, got"):
+        metric(path, path, windows=[0])
+    with pytest.raises(ValueError, match="at least 1 each, got"):
+        metric(path, path, windows=[])
+    with pytest.raises(ValueError, match=r"pass state\[..., :3\]"):
+        metric(torch.zeros(200, 5), torch.zeros(200, 5))
+
+
+def test_pathlength_error_by_hand():
+    truth = straight(201, step=0.5)
+    estimated = truth.clone()
+    estimated[:101, 0] *= 1.2  # 60 m instead of 50 m,
+    estimated[101:, 0] = 60 + 0.4 * torch.arange(1, 101)  # then 40 m instead of 50 m
+    estimated[100, 2] = -0.25
+    estimated[200, 2] = 0.5
+    errors = kitti_pathlength_error(estimated, truth)
+    assert errors.windows == (100, 200)
+    torch.testing.assert_close(errors.window_translation, torch.tensor([0.2, 0.0]).double())
+    expected = torch.tensor([math.degrees(0.25) / 50, math.degrees(0.5) / 100], dtype=torch.float64)
+    torch.testing.assert_close(errors.window_rotation, expected)
+    torch.testing.assert_close(errors.translation.item(), 0.1)
+    torch.testing.assert_close(errors.rotation, expected.mean())
+
+
+def test_what_the_pathlength_error_is_blind_to():
+    truth = straight(101)
+    backwards = truth * torch.tensor([-1.0, 1.0, 1.0])
+    turned = kitti_pathlength_error(backwards, truth)
+    assert (turned.translation, turned.rotation) == (0, 0)
+    torch.testing.assert_close(kitti_endpoint_error(backwards, truth).translation.item(), 2.0)
+    # A whole turn too many is an error of 360 degrees there, and none here.
+    spun = truth + torch.tensor([0.0, 0.0, 2 * math.pi])
+    torch.testing.assert_close(kitti_pathlength_error(spun, truth).rotation.item(), 3.6)
+    assert kitti_endpoint_error(spun, truth).rotation < 1e-9
+
+
+def test_pathlength_error_sums_the_steps_of_each_path():
+    truth, estimated = winding(0, rows=150, batch=(2, 2)), winding(1, rows=150, batch=(2, 2))
+    errors = kitti_pathlength_error(estimated, truth, windows=[10, 149])
+    for i in range(2):
+        for k, window in enumerate((10, 149)):
+            length, length_true = (
+                sum(math.dist(path[t, :2].tolist(), path[t + 1, :2].tolist()) for t in range(window))
+                for path in (estimated[1, i], truth[1, i])
+            )
+            expected = abs(length - length_true) / length_true
+            torch.testing.assert_close(errors.window_translation[1, i, k].item(), expected)
+    standing = torch.cat([straight(1).expand(50, 3), straight(60)])
+    with pytest.raises(ValueError, match="stands still"):
+        kitti_pathlength_error(standing, standing, windows=[20, 100])
+
+
+def test_wrapped_headings_are_the_callers_matter():
+    truth = straight(101)
+    truth[:, 2] = torch.linspace(3.0, 3.3, 101)
+    estimated = torch.cat([truth[:, :2], wrap_angle(truth[:, 2:])], -1)
+    torch.testing.assert_close(kitti_pathlength_error(estimated, truth).rotation.item(), 3.6)

@@ -1,0 +1,126 @@
+"""Oracles: the development kit's loops written out over evo's relative poses, evo's own pairs, numbers by hand."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from evo.core.metrics import RPE
+from evo.core.units import Unit
+
+from tests.applications.car.metrics.paths_for_tests import evo_errors, matrices, straight, winding
+from torch_denkf.applications.car import kitti_devkit_error
+
+LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
+
+
+def written_out(estimated, truth, lengths=LENGTHS, step=10):
+    """Segments by search, errors by evo's matrices: (length, %, deg/m) for each."""
+    poses, poses_true = matrices(estimated), matrices(truth)
+    travelled = [0.0]
+    for before, after in pairwise(poses_true):
+        travelled.append(travelled[-1] + np.linalg.norm(after[:3, 3] - before[:3, 3]))
+    out = []
+    for first in range(0, len(travelled), step):
+        for length in lengths:
+            last = next((k for k in range(first, len(travelled)) if travelled[k] > travelled[first] + length), None)
+            if last is not None:
+                error = RPE.rpe_base(poses_true[first], poses_true[last], poses[first], poses[last])
+                angle = math.acos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
+                out.append((length, 100 * np.linalg.norm(error[:3, 3]) / length, math.degrees(angle) / length))
+    return torch.tensor(out, dtype=torch.float64)
+
+
+def test_the_definition_written_out():
+    truth, estimated = winding(0, rows=460), winding(1, rows=460)
+    error = kitti_devkit_error(estimated, truth)
+    expected = written_out(estimated, truth)
+    assert len(set(expected[:, 0].tolist())) == 4  # of 459 m or so
+    torch.testing.assert_close(error.translation, expected[:, 1].mean())
+    torch.testing.assert_close(error.rotation, expected[:, 2].mean(), atol=1e-7, rtol=1e-7)
+    for k, length in enumerate(LENGTHS):
+        rows = expected[expected[:, 0] == length]
+        assert error.segments[k] == len(rows)
+        torch.testing.assert_close(error.length_translation[k], rows[:, 1].mean(), equal_nan=True)
+        torch.testing.assert_close(error.length_rotation[k], rows[:, 2].mean(), equal_nan=True, atol=1e-7, rtol=1e-7)
+
+
+def test_segments_are_those_of_evo_where_both_search_alike():
+    # evo ends a segment at the frame nearest to its length, the development kit at the first beyond it. Both are one
+    # frame where 100 m are 103.99 steps.
+    truth, estimated = winding(2, rows=950, step=100 / 103.99), winding(3, rows=950)
+    error = kitti_devkit_error(estimated, truth)
+    means, count = [], 0
+    for k, length in enumerate(LENGTHS):
+        last, metres, degrees = evo_errors(estimated, truth, float(length), Unit.meters, tolerance=1e-3)
+        steps = math.ceil(1.0399 * length)
+        assert last[0] == steps
+        tenth = (last - steps) % 10 == 0
+        assert error.segments[k] == tenth.sum()
+        torch.testing.assert_close(error.length_translation[k], 100 * metres[tenth].mean() / length)
+        torch.testing.assert_close(error.length_rotation[k], degrees[tenth].mean() / length, atol=1e-7, rtol=1e-7)
+        means.append(100 * metres[tenth].sum() / length)
+        count += int(tenth.sum())
+    torch.testing.assert_close(error.translation, sum(means) / count)
+
+
+def test_by_hand():
+    truth = straight(251)
+    fast = truth * torch.tensor([1.1, 1.0, 1.0], dtype=torch.float64)
+    estimated = fast.clone()
+    estimated[:, 2] = 0.001 * torch.arange(
+        251, dtype=torch.float64
+    )  # the heading turns, the positions do not: each segment is laid on
+    error = kitti_devkit_error(fast, truth, lengths=(100, 200))
+    # 101 steps for 100 m: 10.1 m of 100 m; 201 for 200 m. Starts at 0 to 140 (of 149), and at 0 to 40 (of 49).
+    assert error.segments.tolist() == [15, 5]
+    torch.testing.assert_close(error.length_translation, torch.tensor([10.1, 10.05], dtype=torch.float64))
+    torch.testing.assert_close(error.translation.item(), (15 * 10.1 + 5 * 10.05) / 20)  # by segments, not by lengths
+    assert error.rotation == 0
+    turned = kitti_devkit_error(estimated, truth, lengths=(100, 200))
+    expected = torch.tensor([math.degrees(0.101) / 100, math.degrees(0.201) / 200], dtype=torch.float64)
+    torch.testing.assert_close(turned.length_rotation, expected)
+    # The start at k is off by 0.001 k: the estimate of length 1.1 x 101 leaves at that angle.
+    law_of_cosines = [math.sqrt(111.1**2 + 101**2 - 2 * 111.1 * 101 * math.cos(0.001 * k)) for k in range(0, 150, 10)]
+    torch.testing.assert_close(turned.length_translation[0].item(), sum(law_of_cosines) / 15)
+
+
+def test_metres_are_those_of_the_truth_and_starts_are_all_tried():
+    truth = straight(400, step=0.5)
+    error = kitti_devkit_error(torch.zeros_like(truth), truth, lengths=(50,), step=1)
+    assert error.segments.tolist() == [299]  # 101 steps each
+    torch.testing.assert_close(error.translation.item(), 101.0)  # 50.5 m of 50 m: the estimate stands
+
+
+def test_batches_are_paths_of_their_own():
+    truth, estimated = winding(0, rows=300, batch=(2, 3)), winding(1, rows=300, batch=(2, 3))
+    truth[1, 2, :, :2] *= 0.6  # shorter: fewer segments
+    error = kitti_devkit_error(estimated, truth)
+    assert error.segments.shape == (2, 3, 8)
+    for i in range(2):
+        for j in range(3):
+            one = kitti_devkit_error(estimated[i, j], truth[i, j])
+            for all_of_them, single in zip(error, one, strict=True):
+                torch.testing.assert_close(all_of_them[i, j], single, equal_nan=True)
+    assert error.segments[1, 2].sum() < error.segments[1, 1].sum()
+
+
+def test_float32_keeps_the_segments():
+    truth, estimated = winding(0, rows=460), winding(1, rows=460)
+    double, single = kitti_devkit_error(estimated, truth), kitti_devkit_error(estimated.float(), truth.float())
+    assert single.translation.dtype == torch.float32
+    assert single.segments.equal(double.segments)
+    torch.testing.assert_close(single.translation.double(), double.translation, rtol=1e-4, atol=0)
+
+
+def test_errors_say_what_to_do():
+    path = straight(90)
+    with pytest.raises(ValueError, match=r"the shortest path is 89\.0 m long; leave such paths out"):
+        kitti_devkit_error(path, path)
+    assert kitti_devkit_error(path, path, lengths=(88.5,)).segments.tolist() == [1]
+    for options in ({"step": 0}, {"lengths": ()}, {"lengths": (0, 100)}):
+        with pytest.raises(ValueError, match="must be positive"):
+            kitti_devkit_error(path, path, **options)
+    with pytest.raises(ValueError, match=r"pass state\[..., :3\]"):
+        kitti_devkit_error(path[:, :2], path[:, :2])

@@ -1,0 +1,335 @@
+"""Readings that span a gap. Oracles: the filter without gaps, a Kalman filter on the cloned state, plane geometry."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+
+from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, with_history
+from torch_denkf.filters import EKF, DEnKF
+from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
+
+DT, Q, R, START = 0.5, (0.3, 0.05), (0.2, 0.02), (0.0, 0.0, 0.0, 0.6, 0.1)
+
+
+class Walk(torch.nn.Module):
+    """Changes of the velocities: N(0, Q)."""
+
+    def forward(self, velocity):
+        return torch.randn_like(velocity) * velocity.new_tensor(Q).sqrt()
+
+
+class Straight(torch.nn.Module):
+    """Changes of the speed alone: N(0, Q)."""
+
+    def forward(self, velocity):
+        return torch.randn_like(velocity) * velocity.new_tensor([Q[0] ** 0.5, 0.0])
+
+
+def pair_filter(size, scheme="perturbed", reach=None, change=None, lags=2, start=START, **options):
+    keys = {"forecast_key": ("forecast", "clone"), "observed_key": ("forecast", "observed"), "observation_key": "y"}
+    return DEnKF(
+        UnicycleTransition(change or Walk(), DT),
+        None,
+        PairObservation(reach),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        TensorDictSequential(
+            EnsembleAnalysis(scheme, belief_prefix="analysis", **keys),
+            UnicycleMotion(DT, history_key=("belief", "history"), **options),
+        ),
+        initial=with_history(AroundState(start, ensemble_size=size), lags=lags),
+    )
+
+
+def frames_of(y, steps):
+    is_init = torch.zeros(len(y), 1, dtype=torch.bool)
+    is_init[0] = True
+    steps = torch.tensor(steps).unsqueeze(-1)
+    state = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.1]).expand(len(y), 5)
+    return TensorDict({"y": y, "steps": steps, "observed": steps > 0, "is_init": is_init, "state": state}, [len(y)])
+
+
+def test_neighbours_are_filtered_as_without_a_history(float64):
+    plain = DEnKF(
+        UnicycleTransition(Walk(), DT),
+        None,
+        Select([3, 4]),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        TensorDictSequential(
+            EnsembleAnalysis("perturbed", observation_key="y", belief_prefix="analysis"), UnicycleMotion(DT)
+        ),
+        initial=AroundState(START, ensemble_size=16),
+    )
+    frames = frames_of(torch.randn(9, 2) + torch.tensor([4.0, 0.1]), [0, 1, 1, 0, 1, 1, 0, 0, 1])
+    results = []
+    for filter in (plain, pair_filter(16)):
+        torch.manual_seed(2)
+        results.append(filter.sequence(frames.copy())["belief", "ensemble"])
+    torch.testing.assert_close(*results, rtol=0, atol=1e-12)
+
+
+def cloned_kalman(y, steps):
+    """Velocity and way (one dimension each, no turning in y's sense): exact mean and variance of [v, way since start].
+
+    The state is [v_t, v_t-1, v_t-2, way]; the way is a sum of the same velocities, so that all of it is linear.
+    """
+    moments = []
+    for dim in range(2):
+        mean = torch.tensor([4.0, 4.0, 4.0, 0.0]) if dim == 0 else torch.tensor([0.1, 0.1, 0.1, 0.0])
+        cov = torch.zeros(4, 4)
+        cov[:3, :3] = START[3 + dim] ** 2
+        shift = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [DT, 0, 0, 1]])
+        noise = torch.tensor([1.0, 0.0, 0.0, DT])
+        for value, count in zip(y[1:, dim], steps[1:], strict=True):
+            mean, cov = shift @ mean, shift @ cov @ shift.T + Q[dim] * noise[:, None] * noise
+            if count:
+                h = torch.tensor([float(lag < count) for lag in range(3)] + [0.0])
+                gain = cov @ h / (h @ cov @ h + R[dim])
+                mean, cov = mean + gain * (value - h @ mean), cov - gain[:, None] * (h @ cov)
+        moments.append((mean, cov))
+    return moments
+
+
+def test_a_reading_over_a_gap_corrects_velocity_and_way_like_a_kalman_filter_with_clones(float64):
+    # Two frames are missing after the start, so that the whole way since then lies in the reading.
+    size, steps = 40_000, [0, 0, 0, 3]
+    y = torch.tensor([[0.0, 0.0]] * 3 + [[16.0, 1.2]])
+    torch.manual_seed(0)
+    belief = pair_filter(size).sequence(frames_of(y, steps))["belief", "ensemble"][-1]
+    (mean_v, cov_v), (mean_w, cov_w) = cloned_kalman(y, steps)
+    # The analysis is linear, the way of the members is not (they turn): compare what stays linear.
+    found = torch.stack([belief[:, 3], belief[:, 4], belief[:, 2]], -1)
+    mean = torch.stack([mean_v[0], mean_w[0], mean_w[3]])
+    var = torch.stack([cov_v[0, 0], cov_w[0, 0], cov_w[3, 3]])
+    error = (found.mean(0) - mean).abs() / (var / size).sqrt()
+    assert (error < 4).all(), error  # standard errors; three of them
+    torch.testing.assert_close(found.var(0), var, rtol=4 * (2 / size) ** 0.5, atol=0)
+    # The reading says 16 over three steps where 12 was forecast: the way is corrected, and not the last step alone.
+    way = belief[:, :2].norm(dim=-1).mean()
+    assert abs(float(way) - float(mean_v[3])) < 0.05 * float(mean_v[3])
+
+
+def test_an_exact_reading_over_a_gap_leaves_no_doubt_about_the_way(float64):
+    filter = pair_filter(64, "etkf")
+    frames = frames_of(torch.tensor([[0.0, 0.0], [0.0, 0.0], [10.0, 0.9]]), [0, 0, 2])
+    frames["y"][-1] = torch.tensor([10.0, 0.9])
+    exact = DEnKF(
+        filter["transition"],
+        None,
+        filter["observation"],
+        ConstantNoise([1e-6, 1e-6], in_key="y"),
+        filter["analysis"],
+        initial=filter.initial,
+    )
+    torch.manual_seed(1)
+    out = exact.sequence(frames)["belief", "ensemble"][-1]
+    turned = torch.full((64,), 0.9 * DT)
+    torch.testing.assert_close(out[:, 2], turned, rtol=0, atol=1e-4)
+
+
+def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
+    before = torch.tensor([1.0, 2.0, 0.3, 9.0, 0.2]).expand(2, 5)
+    history = torch.tensor([[9.0, 0.2], [8.0, -0.1]]).expand(2, 2, 2)
+    analysis = torch.tensor([0.0, 0.0, 0.0, 5.0, 0.4, 6.0, 0.5, 7.0, 0.6]).expand(2, 9)
+    for steps, path in ((3, [(7.0, 0.6), (6.0, 0.5), (5.0, 0.4)]), (2, [(8.0, -0.1), (6.0, 0.5), (5.0, 0.4)])):
+        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
+        out = UnicycleMotion(DT, history_key=("belief", "history"))(td.set("steps", torch.tensor([steps])))
+        # By complex numbers: back along the two past steps, forwards along the corrected ones.
+        place, heading = complex(1.0, 2.0), 0.3
+        for v, w in ((9.0, 0.2), (8.0, -0.1)):
+            place -= v * DT * complex(torch.polar(torch.tensor(1.0), torch.tensor(heading - w * DT / 2)))
+            heading -= w * DT
+        for v, w in path:
+            place += v * DT * complex(torch.polar(torch.tensor(1.0), torch.tensor(heading + w * DT / 2)))
+            heading += w * DT
+        expected = torch.tensor([place.real, place.imag, heading, 5.0, 0.4])
+        torch.testing.assert_close(out["belief", "ensemble"][0], expected, rtol=0, atol=1e-12)
+        assert out["belief", "history"][0].tolist() == [[5.0, 0.4], list(path[1])]
+
+
+def test_what_is_out_of_reach_is_not_read(float64):
+    frames = frames_of(torch.full((4, 2), 9.0), [0, 0, 0, 3])
+    torch.manual_seed(0)
+    far = pair_filter(16, reach=[10.0, torch.inf]).sequence(frames.copy())
+    torch.manual_seed(0)
+    blind = pair_filter(16).sequence(frames.copy().set("observed", torch.zeros(4, 1, dtype=torch.bool)))
+    assert not far["forecast", "observed"][-1].any()  # 3 x 4 m/s
+    assert far["belief", "ensemble"].equal(blind["belief", "ensemble"])
+
+
+def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
+    """Otherwise a filter whose speed has run away stays blind, and keeps it."""
+    frames = frames_of(torch.full((12, 2), 4.0) * torch.tensor([1.0, 0.0]), [0, *[1] * 11])
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 60.0, 0.0]).expand(12, 5)
+    torch.manual_seed(0)
+    out = pair_filter(32, reach=[10.0, torch.inf]).sequence(frames)
+    assert out["forecast", "observed"][1:].all()
+    assert abs(float(out["belief", "mean"][-1, 3]) - 4.0) < 2.0  # far within the 10 m/s of the reach
+
+
+def test_steps_equal_the_sequence(float64):
+    filter = pair_filter(8, "etkf", change=torch.nn.Linear(2, 2))
+    frames = frames_of(torch.randn(10, 2) + torch.tensor([4.0, 0.1]), [0, 1, 0, 2, 1, 0, 0, 3, 1, 0])
+    filter.draw_noise(frames)
+    expected = filter.sequence(frames.copy())
+    row, rows = filter.initialise(frames[0].copy()), []
+    for t in range(1, 10):
+        row = filter.step(frames[t].copy().update(row.select(*filter.carry_keys)))
+        rows.append(row["belief", "ensemble"])
+    torch.testing.assert_close(torch.stack(rows), expected["belief", "ensemble"][1:], rtol=0, atol=1e-12)
+    assert filter.carry_keys == [("belief", "ensemble"), ("belief", "history")]
+
+
+def test_gradients_reach_the_past(float64):
+    before, history, analysis = (torch.randn(*shape, requires_grad=True) for shape in ((2, 5), (2, 2, 2), (2, 9)))
+
+    def moved(before, history, analysis):
+        td = TensorDict({"belief": {"ensemble": before, "history": history}, "analysis": {"ensemble": analysis}})
+        td = UnicycleMotion(0.1, history_key=("belief", "history"))(td.set("steps", torch.tensor([3])))
+        return td["belief", "ensemble"]
+
+    assert torch.autograd.gradcheck(moved, (before, history, analysis))
+
+
+def test_a_smoothed_path_is_that_of_a_kalman_filter_of_velocity_and_way(float64):
+    """Its way is corrected by all innovations since; so is the filter's path, if the history is as long as the drive.
+
+    Without smoothing the way is the sum of filtered velocities, which lag behind: 4 m/s jumps to 6 and stays there.
+    """
+    size, steps = 40_000, [0, *[1] * 5]
+    y = torch.tensor([[6.0, 0.0]]).repeat(6, 1)
+    frames = frames_of(y, steps)
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.0]).expand(6, 5)
+    still = (0.0, 0.0, 0.0, 0.0, 0.0)  # nothing is corrected before the start
+    found = {}
+    for smooth in (False, True):
+        filter = pair_filter(size, change=Straight(), lags=5, start=still, smooth=smooth)
+        torch.manual_seed(0)
+        found[smooth] = filter.sequence(frames.copy())["belief", "ensemble"][-1]
+    mean, cov = torch.tensor([4.0, 0.0]), torch.zeros(2, 2)  # of speed and way
+    shift, noise = torch.tensor([[1.0, 0.0], [DT, 1.0]]), torch.tensor([1.0, DT])
+    for value in y[1:, 0]:
+        mean, cov = shift @ mean, shift @ cov @ shift.T + Q[0] * noise[:, None] * noise
+        gain = cov[:, 0] / (cov[0, 0] + R[0])
+        mean, cov = mean + gain * (value - mean[0]), cov - gain[:, None] * cov[0]
+    way = found[True][:, 0]
+    error = float((cov[1, 1] / size).sqrt())
+    assert abs(float(way.mean() - mean[1])) < 4 * error
+    torch.testing.assert_close(way.var(), cov[1, 1], rtol=4 * (2 / size) ** 0.5, atol=0)
+    assert float(mean[1] - found[False][:, 0].mean()) > 20 * error  # 0.13 m of 14.5 m
+    torch.testing.assert_close(found[True][:, 3:], found[False][:, 3:], rtol=0, atol=1e-12)  # velocities are the same
+
+
+def test_smoothing_needs_a_history():
+    with pytest.raises(ValueError, match="pass its history_key"):
+        UnicycleMotion(DT, smooth=True)
+
+
+def test_a_curve_is_what_the_sensor_makes_of_the_whole_way(float64):
+    forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
+    td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
+    out = PairObservation([20.0, torch.inf], curve=lambda way: way**2)(td)["forecast"]
+    torch.testing.assert_close(out["observation"], torch.tensor([[19.0**2, 0.3**2]]))
+    assert out["observed"]  # it is the way, not what is read, that must be within reach
+
+
+def test_history_needs_a_lag():
+    with pytest.raises(ValueError, match="at least 1; got 0"):
+        with_history(AroundState([1.0] * 5), 0)
+
+
+def test_a_history_begins_with_the_present(float64):
+    start = with_history(AroundState([1.0] * 5, ensemble_size=7), 2)
+    out = start(TensorDict({"state": torch.zeros(3, 5)}, [3]))["belief"]
+    assert isinstance(start, SubModel)
+    for lag in range(2):
+        assert out["history"][:, :, lag].equal(out["ensemble"][..., 3:])
+
+
+def test_velocities_go_on_changing_by_a_share_of_their_last_change(float64):
+    transition = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
+    with torch.no_grad():
+        transition.raw_trend.copy_(torch.tensor([0.0, -torch.log(torch.tensor(3.0))]))  # a half and a quarter
+    state = torch.tensor([[0.0, 0.0, 0.0, 6.0, 0.4], [0.0, 0.0, 0.0, 7.0, 0.1]])
+    history = torch.tensor([[[6.0, 0.4], [8.0, 0.0]], [[7.0, 0.1], [7.0, 0.1]]])
+    out = transition(TensorDict({"belief": {"ensemble": state, "history": history}}))["forecast", "ensemble"]
+    torch.testing.assert_close(out[:, 3:], torch.tensor([[5.0, 0.5], [7.0, 0.1]]), rtol=0, atol=1e-12)
+    torch.testing.assert_close(out[0, 0], 5.0 * DT * torch.tensor(0.5 * DT / 2).cos(), rtol=0, atol=1e-12)
+
+
+def test_with_a_trend_a_braking_car_is_followed_without_lag(float64):
+    """Readings without noise of a speed that falls by 0.5 m/s a step, weighed as if they were noisy."""
+    errors = []
+    for trend in (None, ("belief", "history")):
+        filter = pair_filter(64, "etkf")
+        transition = UnicycleTransition(Walk(), DT, history_key=trend)
+        if trend:
+            with torch.no_grad():
+                transition.raw_trend.fill_(5.0)  # nearly all of it
+        filter = DEnKF(
+            transition, None, filter["observation"], filter["noise"], filter["analysis"], initial=filter.initial
+        )
+        speed = 20.0 - 0.5 * torch.arange(30.0)
+        frames = frames_of(torch.stack([speed, torch.zeros(30)], -1), [0] + [1] * 29)
+        frames["state"] = torch.stack([torch.tensor([0.0, 0.0, 0.0, float(v), 0.0]) for v in speed])
+        torch.manual_seed(0)
+        belief = filter.sequence(frames)["belief", "mean"][:, 3]
+        errors.append(float((belief - speed)[10:].mean().detach()))
+    forecast = Q[0] / 2 + (Q[0] ** 2 / 4 + Q[0] * R[0]) ** 0.5  # the steady variance
+    gain = forecast / (forecast + R[0])
+    assert errors[0] == pytest.approx(0.5 * (1 - gain) / gain, abs=0.04)  # 0.23; 64 members, 20 steps
+    assert abs(errors[1]) < 0.04
+
+
+def test_an_ekf_with_clones_is_the_kalman_filter_with_clones(float64):
+    """Without turning all is linear: the EKF on the cloned state must be exact, the trend included."""
+    steps = [0, 1, 0, 2, 1, 0, 0, 3, 1]
+    y = torch.randn(9, 2) + torch.tensor(steps).unsqueeze(-1) * torch.tensor([4.0, 0.0])
+    y[:, 1] = 0.0
+    motion = UnicycleTransition(torch.zeros_like, DT, history_key=("belief", "history"))
+    share = float(motion.raw_trend[0].sigmoid())
+    noise = ConstantNoise([Q[0] ** 0.5, 1e-9], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    ekf = EKF(
+        ClonedTransition(motion),
+        None,
+        PairObservation(history_key=None),
+        ConstantNoise(torch.tensor(R).sqrt(), in_key="y"),
+        process_noise=UnicycleNoise(noise, DT),
+        initial=ClonedPrior(GaussianAround([0.0, 0.0, 0.0, 0.6, 0.0]), 2),
+        observation_key="y",
+        observed_key=("forecast", "observed"),
+    )
+    frames = frames_of(y, steps)
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 4.0, 0.0]).expand(9, 5)
+    out = ekf.sequence(frames)["belief"]
+    mean, cov = torch.tensor([4.0, 4.0, 4.0, 0.0]), torch.zeros(4, 4)
+    cov[:3, :3] = 0.36
+    shift = torch.tensor([[1 + share, -share, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [DT * (1 + share), -DT * share, 0, 1]])
+    enters = torch.tensor([1.0, 0.0, 0.0, DT])
+    for t in range(1, 9):
+        mean, cov = shift @ mean, shift @ cov @ shift.T + Q[0] * enters[:, None] * enters
+        if steps[t]:
+            h = torch.tensor([float(lag < steps[t]) for lag in range(3)] + [0.0])
+            gain = cov @ h / (h @ cov @ h + R[0])
+            mean, cov = mean + gain * (y[t, 0] - h @ mean), cov - gain[:, None] * (h @ cov)
+        dims = [3, 5, 7, 0]
+        torch.testing.assert_close(out["mean"][t, dims], mean, rtol=0, atol=1e-8)
+        torch.testing.assert_close(out["cov"][t][dims][:, dims], cov, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_a_rejected_reading_counts_as_not_observed(float64, masked):
+    frames = frames_of(torch.randn(6, 2) + torch.tensor([4.0, 0.1]), [0, 1, 1, 1, 1, 1])
+    bad, hidden = frames.clone(), frames.clone()
+    bad["y"][3] = torch.nan
+    hidden["observed"][3] = False
+    if not masked:
+        del bad["observed"]
+    filter, outs = pair_filter(16), []
+    filter.reject = True
+    for data in (bad, hidden):
+        torch.manual_seed(3)
+        outs.append(filter.sequence(data))
+    assert outs[0]["info", "rejected"].flatten().tolist() == [0, 0, 0, 2, 0, 0]
+    torch.testing.assert_close(outs[0]["belief", "ensemble"], outs[1]["belief", "ensemble"], rtol=0, atol=0)

@@ -1,0 +1,93 @@
+"""A camera that fails: what is black counts as missing if asked to; dead reckoning holds the last reading."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.applications.car.odometry.test_tracking import calibration_of, frames_of
+from torch_denkf.applications.car import track
+from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
+from torch_denkf.applications.car.odometry.failures import CameraFailure, fail_frames
+from torch_denkf.applications.car.vision.epipolar import two_view_motion
+from torch_denkf.applications.car.vision.motion import image_motion
+from torch_denkf.transforms import OccludingBox
+
+
+def test_black_frames_are_missing_frames(checkpoint, drive):
+    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    lost = list(track(car, fail_frames(images, [CameraFailure("missing", 5, 6)]), calibration))
+    black = [*fail_frames(images, [CameraFailure("black", 5, 6)])]
+    black[5][0, 0] = 255  # a hot pixel
+    known = list(track(car, black, calibration, black_level=8))
+    assert [belief.observed for belief in known] == [n not in (0, 5, 6) for n in range(16)]
+    for one, other in zip(lost, known, strict=True):
+        assert torch.equal(one.ensemble, other.ensemble)
+    unknown = list(track(car, black, calibration))
+    assert all(belief.observed for belief in unknown[1:])
+    with pytest.raises(ValueError, match="grey value from 0 to 255; got 300"):
+        track(car, black, calibration, black_level=300)
+
+
+def test_readings_are_velocities(checkpoint, drive):
+    """Of a pair over a gap the mean over its steps, and in real time where frames are not as far apart as trained."""
+    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    plain, slow = (list(track(car, images, calibration, fps=fps)) for fps in (1 / 0.103, 1 / 0.12))
+    assert plain[0].reading is None
+    for one, other in zip(plain[1:], slow[1:], strict=True):
+        assert one.reading.tolist() == pytest.approx((other.reading * 0.12 / 0.103).tolist(), rel=1e-4)
+    images[5] = None
+    gap = list(track(car, images, calibration))
+    assert gap[5].reading is None
+    with torch.no_grad():  # the sensor's mean of the pair over the gap, whatever its noise
+        pair = [drive["image"][n][0].numpy() for n in (4, 6)]
+        flow, road = (torch.from_numpy(part).half().float() for part in image_motion(*pair, calibration))
+        frame = {"flow": flow, "road": road, "two_view": torch.from_numpy(two_view_motion(*pair, calibration))}
+        whole = car.sensor(TensorDict(frame))["sensor", "ensemble"].mean(0)
+    spread = torch.stack([belief.reading for belief in plain[1:]]).std(0)
+    assert ((gap[6].reading - whole / 2).abs() < spread + 0.5).all()
+
+
+def test_kinds_of_failures():
+    frames = [np.full((10, 30, 3), 50 + n, np.uint8) for n in range(4)]
+    failures = [CameraFailure("missing", 1, 1), CameraFailure("black", 2, 2), CameraFailure("box", 2, 3)]
+    first, missing, black, covered = fail_frames(frames, failures)
+    assert np.array_equal(first, frames[0])
+    assert missing is None
+    assert not black.any()
+    picture = torch.from_numpy(frames[3]).permute(2, 0, 1)
+    expected = OccludingBox()(TensorDict({"pixels": picture.clone()}))["pixels"].permute(1, 2, 0).numpy()
+    assert np.array_equal(covered, expected)
+    assert frames[3].min() == 53, "the caller's image stays"
+    assert [failure.announced for failure in failures] == [True, False, False]
+    with pytest.raises(ValueError, match="'missing', 'black' and 'box'"):
+        next(fail_frames(frames, [CameraFailure("rain", 0, 1)]))
+
+
+def test_dead_reckoning_integrates_what_was_read(checkpoint, drive):
+    car = load_car_filter(checkpoint)
+    failures = [CameraFailure("black", 6, 7)]
+    tracked = track_failing_drive(car, drive, failures, seed=3)
+    beliefs = list(track(car, fail_frames(frames_of(drive), failures), calibration_of(drive), black_level=8, seed=3))
+    assert torch.equal(tracked["belief", "mean"], torch.stack([belief.mean for belief in beliefs]))
+    x = y = theta = 0.0
+    held = beliefs[1].reading
+    for belief, place in zip(beliefs[1:], tracked["dead_reckoning"][1:], strict=True):
+        held = held if belief.reading is None else belief.reading
+        v, rate = held.tolist()
+        x += v * 0.103 * math.cos(theta + rate * 0.103 / 2)
+        y += v * 0.103 * math.sin(theta + rate * 0.103 / 2)
+        theta += rate * 0.103
+        assert place.tolist() == pytest.approx([x, y, theta], abs=2e-3)
+    truth = tracked["state"]
+    assert truth[0, :3].tolist() == [0.0, 0.0, 0.0]
+    steps = drive["state"][1:, :2] - drive["state"][:-1, :2]
+    scores = drive_scores(tracked)
+    assert scores["way_m"] == pytest.approx(float(steps.norm(dim=-1).sum()), rel=1e-5)
+    assert scores["reckoned_end_m"] == pytest.approx(math.dist((x, y), truth[-1, :2].tolist()), abs=5e-3)
+    inside = (tracked["belief", "mean"] - truth).abs() <= 1.6449 * tracked["belief", "var"].sqrt()
+    assert scores["held_v"] == pytest.approx(float(inside[1:, 3].float().mean()), abs=1e-6)
+    assert len(usual_failures(240)) == 3

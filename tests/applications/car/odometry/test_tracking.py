@@ -1,0 +1,219 @@
+"""Tracking frame by frame equals filtering the whole drive; cameras that do not fit are noticed."""
+
+import warnings
+import weakref
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torch_denkf.applications.car import bridge_gaps, read_frames, read_kitti_drive, track, with_motion
+from torch_denkf.applications.car.kitti.render import render_drives
+from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.car.odometry.filter import car_filter
+from torch_denkf.applications.car.odometry.tracking import _Clock
+from torch_denkf.applications.car.vision.motion import image_motion
+from torch_denkf.applications.car.vision.shapes import ROAD_SHIFTS
+
+
+def frames_of(drive):
+    return [
+        image[0].numpy() if valid else None for image, valid in zip(drive["image"], drive["frame_valid"], strict=True)
+    ]
+
+
+def calibration_of(drive):
+    return drive["calibration"][0].tolist()
+
+
+def recorded(car):
+    """The filter, and a list that gets the noise of each of its steps."""
+    noises, plain = [], car.draw_noise
+
+    def draw(frame, **kwargs):
+        out = plain(frame, **kwargs)
+        noises.append(out["noise"].clone())
+        return out
+
+    object.__setattr__(car, "draw_noise", draw)
+    return noises
+
+
+@pytest.mark.parametrize("lost", [[], [5, 6, 11]])
+def test_tracking_equals_filtering_the_whole_drive(lost, checkpoint, drive):
+    car = load_car_filter(checkpoint)
+    drive["frame_valid"][lost] = False
+    noises, state = recorded(car), torch.get_rng_state()
+    beliefs = list(track(car, frames_of(drive), calibration_of(drive), seed=7))
+    assert torch.equal(state, torch.get_rng_state()), "the global generator is the caller's"
+    assert [belief.frame for belief in beliefs] == list(range(16))
+    assert [belief.observed for belief in beliefs] == [n > 0 and n not in lost for n in range(16)]
+
+    # The same readings, noise and start, as one sequence. The noises: first reading, start, then a step each.
+    motion = with_motion(bridge_gaps(drive), cache=None, two_view=True)
+    steps, read = motion["steps"], ("flow", "road", "two_view")
+    sequence = TensorDict({key: motion[key].float() for key in read}, [16])
+    sequence["observed"], sequence["steps"] = steps > 0, steps
+    sequence["noise"] = torch.stack([noises[1], *noises[2:]])
+    first = TensorDict({**{key: sequence[key][1] for key in read}, "noise": {"self": noises[0]["sensor"]}})
+    sequence["start"] = torch.zeros(16, 5)
+    sequence["start"][:, 3:] = car.sensor(first)["sensor", "ensemble"].mean(0).detach()
+    with torch.no_grad():
+        expected = car.sequence(sequence)["belief"]
+    for key in ("mean", "var", "ensemble"):
+        actual = torch.stack([getattr(belief, key) for belief in beliefs])
+        torch.testing.assert_close(actual, expected[key], rtol=1e-4, atol=1e-4)
+    assert beliefs[-1].mean[0] > 1.0, "it moves"
+
+
+def test_a_faster_camera_is_read_every_third_frame(checkpoint, drive):
+    car, calibration = load_car_filter(checkpoint), calibration_of(drive)
+    images = frames_of(drive)
+    slow = list(track(car, images[:8], calibration, fps=10))
+    fast = list(track(car, (images[n // 3] for n in range(22)), calibration, fps=30))
+    assert [belief.frame for belief in fast] == [0, 3, 6, 9, 12, 15, 18, 21]
+    for one, other in zip(slow, fast, strict=True):
+        assert one.time == pytest.approx(other.time)
+        assert torch.equal(one.mean, other.mean)
+    # The path is geometry; velocities follow the clock: frames 0.1 s apart, a filter of 0.103 s.
+    exact = list(track(car, images[:8], calibration))
+    torch.testing.assert_close(slow[-1].mean[:3], exact[-1].mean[:3])
+    torch.testing.assert_close(slow[-1].mean[3:], 1.03 * exact[-1].mean[3:])
+    torch.testing.assert_close(slow[-1].var[3:], 1.03**2 * exact[-1].var[3:])
+
+
+def test_times_with_a_gap_count_as_missing_frames(checkpoint, drive):
+    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    kept = [n for n in range(16) if n not in (5, 6)]
+    given = list(track(car, [images[n] for n in kept], calibration, times=[5.0 + 0.103 * n for n in kept]))
+    marked = list(track(car, [image if n in kept else None for n, image in enumerate(images)], calibration))
+    assert given[0].time == 5.0
+    assert torch.equal(given[-1].mean, marked[-1].mean)
+    far = [0.103 * n + (20 if n > 8 else 0) for n in range(16)]
+    with pytest.raises(ValueError, match="steps without a frame before frame 9; track what comes after the gap apart"):
+        list(track(car, images, calibration, times=far))
+
+
+def test_clock():
+    clock = _Clock(dt=0.103, period=0.1)
+    assert [clock(t) for t in (0.0, 0.098, 0.21, 0.29, 0.5)] == [0, 1, 2, 3, 5]
+    with pytest.raises(
+        ValueError, match=r"frames are 0\.5 s apart, but the filter moves in steps of 0\.103 s; pass at"
+    ):
+        _Clock(dt=0.103, period=0.5)
+
+
+def test_colour_and_large_images_are_read_as_grey_and_small_ones(checkpoint, drive):
+    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    grey = list(track(car, images[:5], calibration))
+    colour = list(track(car, (np.dstack([image] * 3) for image in images[:5]), calibration))
+    assert torch.equal(grey[-1].mean, colour[-1].mean)
+    fx, fy, cx, cy = calibration
+    large = (image.repeat(4, 0).repeat(4, 1) for image in images[:5])
+    reduced = list(track(car, large, (4 * fx, 4 * fy, 4 * cx + 1.5, 4 * cy + 1.5)))
+    torch.testing.assert_close(reduced[-1].mean, grey[-1].mean, rtol=1e-3, atol=1e-3)
+
+
+def test_memory_does_not_grow(checkpoint, drive):
+    car, images, alive, most = load_car_filter(checkpoint), frames_of(drive), [], 0
+
+    def camera():
+        for image in images:
+            copy = image.copy()
+            alive.append(weakref.ref(copy))
+            yield copy
+            del copy
+
+    for _ in track(car, camera(), calibration_of(drive)):
+        most = max(most, sum(image() is not None for image in alive))
+    assert most <= 3
+
+
+def test_bad_input_says_what_to_do(checkpoint, drive):
+    car, images, good = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    for calibration in (good[:3], [0.0, *good[1:]], [float("nan"), *good[1:]]):
+        with pytest.raises(ValueError, match=r"calibration is \(fx, fy, cx, cy\)"):
+            track(car, images, calibration)
+    with pytest.raises(ValueError, match=r"height is that of the camera over the road in m, 0\.3 to 5; got 165"):
+        track(car, images, good, height=165)
+    with pytest.raises(ValueError, match="pitch"):
+        track(car, images, good, pitch=2.0)
+    with pytest.raises(ValueError, match="times or fps, not both"):
+        track(car, images, good, times=[0.0], fps=10)
+    with pytest.raises(ValueError, match="fps is the number"):
+        track(car, images, good, fps=0)
+    with pytest.raises(ValueError, match=r"times must increase; that of frame 2 is 0\.1 s, after 0\.2 s"):
+        list(track(car, images, good, times=[0.0, 0.2, 0.1]))
+    with pytest.raises(ValueError, match="frame 3 has none"):
+        list(track(car, images, good, times=[0.0, 0.1, 0.2]))
+    with pytest.raises(ValueError, match="no two frames at most 3 steps apart"):
+        list(track(car, [images[0], None], good))
+    with pytest.raises(ValueError, match=r"principal point \(607, 185\) does not belong to images of 75 x 25 pixels"):
+        list(track(car, images, (718.0, 718.0, 607.0, 185.0)))
+    with pytest.raises(ValueError, match=r"frame 1 is \[24, 75\], the first one \[25, 75\]"):
+        list(track(car, [images[0], images[1][:24]], good))
+    with pytest.raises(ValueError, match=r"frame 0 is float32 \[25, 75\]; pass uint8"):
+        list(track(car, [images[0].astype(np.float32)], good))
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A drive with traffic, 45 frames of 50 x 150."""
+    folder = tmp_path_factory.mktemp("moving")
+    render_drives(folder, names=["m"], frames=45, camera="image_0")
+    return read_kitti_drive(folder, "m", colour=False, cache=None)
+
+
+def messages(drive, factor=1.0, **options):
+    calibration = calibration_of(drive)
+    calibration[:2] = [factor * value for value in calibration[:2]]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        list(track(car_filter(ensemble_size=4), frames_of(drive), calibration, **options))
+    return [str(warning.message) for warning in caught if warning.category is UserWarning]
+
+
+def test_a_camera_that_does_not_fit_is_noticed(moving):
+    assert messages(moving) == []
+    (message,) = messages(moving, 1.5)
+    assert "show 29 degrees to the sides" in message
+    assert "the focal lengths are too long for these images" in message
+    (message,) = messages(moving, pitch=0.1)
+    assert "the camera looks" in message
+    suggested = float(message.split("Pass pitch=")[1].split(",")[0])
+    assert abs(suggested) < 0.03, "the camera is level"
+    assert messages(moving, pitch=suggested) == []
+    strange = moving.clone()
+    strange["image"] = torch.randint(0, 256, strange["image"].shape, dtype=torch.uint8)
+    (message,) = messages(strange)
+    assert "the road does not look like a plane under this camera" in message
+    (message,) = messages(moving, height=4.5)
+    assert "m between two frames, where the sensor's range ends" in message
+
+
+def test_height_scales_the_path_and_cannot_be_seen(moving):
+    """Nothing contradicts a wrong height: twice as high a camera sees the same images on twice as long a way."""
+    assert messages(moving, height=2.5) == []
+    motions = []
+    for height in (1.65, 2.475):
+        images = [image[0].numpy() for image in moving["image"][20:31]]
+        roads = [image_motion(*pair, calibration_of(moving), height=height)[1] for pair in pairwise(images)]
+        motions.append(np.median([ROAD_SHIFTS[road.max(0).argmax()] for road in roads]))
+    assert motions[1] == pytest.approx(1.5 * motions[0], rel=0.15)
+
+
+def test_a_damaged_frame_of_a_video_is_missing(tmp_path):
+    """It does not end the video."""
+    file = tmp_path / "run.mkv"
+    writer = cv2.VideoWriter(str(file), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
+    for number in range(8):
+        writer.write(np.random.default_rng(number).integers(0, 255, (240, 320, 3), np.uint8))
+    writer.release()
+    data = bytearray(file.read_bytes())
+    starts = [k for k in range(len(data)) if data[k : k + 3] == b"\xff\xd8\xff"]
+    data[starts[5] : starts[5] + 2000] = bytes(2000)
+    file.write_bytes(data)
+    assert [frame is None for frame in read_frames(file)] == [k == 5 for k in range(8)]

@@ -1,0 +1,109 @@
+"""Oracle: a spot painted where the pinhole projection of a direction falls, found again by its centre of mass."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torch_denkf.applications.car.vision.camera import CanonicalCamera
+
+cv2.setNumThreads(1)
+
+
+def scaled(native, intrinsics, size):
+    """(fx, fy, cx, cy) after a resize: pixels are areas, whose corner at (-0.5, -0.5) stays."""
+    down, across = size[0] / native[0], size[1] / native[1]
+    fx, fy, cx, cy = intrinsics
+    return fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+
+
+ODOMETRY, RAW_0926 = (718.856, 718.856, 607.1928, 185.2157), (721.5377, 721.5377, 609.5593, 172.854)
+CAMERAS = {
+    "odometry 125 x 414": ((125, 414), scaled((376, 1241), ODOMETRY, (125, 414))),
+    "odometry 50 x 150": ((50, 150), scaled((376, 1241), ODOMETRY, (50, 150))),
+    "0926 125 x 414": ((125, 414), scaled((375, 1242), RAW_0926, (125, 414))),
+    "0926 full": ((375, 1242), RAW_0926),
+}
+DIRECTIONS = [(0.0, 0.0), (0.4, 0.1), (-0.5, -0.12), (0.7, 0.17), (-0.75, 0.2)]
+
+
+def spot(size, column, row, width):
+    """A Gaussian bump of ``width`` pixels, uint8."""
+    v, u = np.mgrid[: size[0], : size[1]]
+    return np.round(250 * np.exp(-((u - column) ** 2 + (v - row) ** 2) / (2 * width**2))).astype(np.uint8)
+
+
+def centre(image):
+    weight = image.astype(float) / image.sum(dtype=float)
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    return (weight * columns).sum(), (weight * rows).sum()
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_direction_is_seen_where_the_canonical_camera_projects_it(name, direction):
+    size, (fx, fy, cx, cy) = CAMERAS[name]
+    camera = CanonicalCamera.near((fx, fy, cx, cy))
+    image = spot(size, cx + fx * direction[0], cy + fy * direction[1], width=3 * fx / 240)
+    seen = camera.view(image, (fx, fy, cx, cy))
+    assert seen.shape == (camera.height, camera.width)
+    # Warping interpolates between 1/32 of a pixel at best, grey levels are rounded, and a spot of the small camera is
+    # one pixel wide: a tenth of a canonical pixel is more than all of these, 1/5 of what a wrong half pixel would do.
+    expected = [
+        (camera.width - 1) / 2 + camera.focal * direction[0],
+        (camera.height - 1) / 2 + camera.focal * direction[1],
+    ]
+    np.testing.assert_allclose(centre(seen), expected, rtol=0, atol=0.1)
+    np.testing.assert_allclose(camera.pixels(*map(np.float64, direction)), expected, rtol=0, atol=1e-4)
+
+
+def test_cameras_agree_in_tangents():
+    """The same world through cameras of other intrinsics and resolutions: the same place, whatever the focal length."""
+    places = []
+    for size, (fx, fy, cx, cy) in CAMERAS.values():
+        camera = CanonicalCamera.near((fx, fy, cx, cy))
+        column, row = centre(camera.view(spot(size, cx + 0.3 * fx, cy + 0.1 * fy, 3 * fx / 240), (fx, fy, cx, cy)))
+        places.append(
+            [(column - (camera.width - 1) / 2) / camera.focal, (row - (camera.height - 1) / 2) / camera.focal]
+        )
+    np.testing.assert_allclose(places, [[0.3, 0.1]] * 4, rtol=0, atol=0.1 / 120)
+
+
+@pytest.mark.parametrize(
+    ("fx", "focal", "height", "width"),
+    # 2 * 0.27 * focal + 1 rows and 2 * 0.86 * focal + 1 columns, by hand.
+    [(87.2, 120.0, 66, 207), (200.0, 192.0, 105, 331), (721.5, 240.0, 131, 414)],
+)
+def test_resolution_near_a_real_camera(fx, focal, height, width):
+    camera = CanonicalCamera.near((fx, 1.0, 2.0, 3.0))
+    assert (camera.focal, camera.height, camera.width) == (pytest.approx(focal), height, width)
+
+
+def test_what_was_not_seen_repeats_the_border():
+    """KITTI's 0.83 to the left (607.2 / 718.9 = 0.845) is less than the canonical camera's 0.86."""
+    size, calibration = CAMERAS["odometry 125 x 414"]
+    image = np.tile(np.arange(size[1]), (size[0], 1)) // 2
+    image[:, :3] = 99
+    camera = CanonicalCamera.near(calibration)
+    seen = camera.view(image.astype(np.uint8), calibration)
+    first = round((camera.width - 1) / 2 - 0.845 * camera.focal)
+    assert first >= 3
+    assert (seen[:, : first + 1] == 99).all()
+    assert (seen[:, first + 6] < 20).all()
+
+
+def test_a_large_image_is_averaged_and_not_sampled():
+    rng = np.random.default_rng(0)
+    large = rng.integers(0, 256, (376, 1241)).astype(np.uint8)  # white noise: its means over 3 x 3 pixels vary a third
+    camera = CanonicalCamera(240.0)
+    calibration = (720.0, 720.0, 620.0, 187.5)
+    inside = camera.view(large, calibration)[10:-10, 20:-20].astype(float)
+    assert 15 < inside.std() < 30  # 256 / sqrt(12) = 74 for single pixels, 25 for means of nine
+    # A bright spot stays on its ray.
+    spot = np.zeros((376, 1241), np.uint8)
+    spot[280:289, 800:809] = 255
+    seen = camera.view(spot, calibration).astype(float)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    x = (float((seen * columns).sum() / seen.sum()) - (camera.width - 1) / 2) / camera.focal
+    y = (float((seen * rows).sum() / seen.sum()) - (camera.height - 1) / 2) / camera.focal
+    assert x == pytest.approx((804 - 620.0) / 720.0, abs=0.1 / 240)
+    assert y == pytest.approx((284 - 187.5) / 720.0, abs=0.1 / 240)

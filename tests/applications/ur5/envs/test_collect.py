@@ -1,0 +1,324 @@
+"""Demos are the expert's episodes; kills, processes and damage leave a collection byte for byte as it would be."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from tests.envs.opengl import needs_opengl
+from torch_denkf.applications.ur5 import UR5ExperienceReplay, UR5TableEnv
+from torch_denkf.applications.ur5.commands.collect_ur5 import main
+from torch_denkf.applications.ur5.data.files import COLLECTION, MANIFEST, read_demo, read_manifest
+from torch_denkf.applications.ur5.envs import episodes
+from torch_denkf.applications.ur5.envs.collect import LOCK, collect_ur5_demos
+from torch_denkf.applications.ur5.envs.expert import UR5Expert
+
+BLIND = {"frames": None, "seed": 3}
+DEMOS = 6
+
+
+def content(root):
+    return {file.name: file.read_bytes() for file in root.iterdir() if file.name != LOCK}
+
+
+def demos_of(root):
+    return [read_demo(root, entry) for entry in read_manifest(root).values()]
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """Six demos of one run in this process, without pictures."""
+    root = tmp_path_factory.mktemp("unbroken")
+    counts = []
+    assert collect_ur5_demos(root, DEMOS, **BLIND, progress=counts.append) == DEMOS
+    assert counts == [0, *[1] * DEMOS]
+    assert sorted(content(root)) == [COLLECTION, *(f"demo-{k:06d}.npz" for k in range(DEMOS)), MANIFEST]
+    return root
+
+
+@pytest.fixture
+def copy(unbroken, tmp_path):
+    return shutil.copytree(unbroken, tmp_path / "copy")
+
+
+def test_demos_are_the_experts_episodes(unbroken):
+    demos = demos_of(unbroken)
+    assert [demo.task for demo in demos] == ["pick", "push", "put_down"] * 2
+    assert len({demo.seed for demo in demos}) == DEMOS
+    for demo in demos:  # by an environment of its own, which has not seen the others
+        env = UR5TableEnv(demo.task, from_pixels=False)
+        env.set_seed(demo.seed)
+        rollout = env.rollout(350, UR5Expert(env))
+        assert rollout["next", "success"][-1]
+        for key in ("state", "action"):
+            assert (rollout[key].numpy() == getattr(demo, key)).all()
+        assert (rollout["success"].squeeze(-1).numpy() == demo.success).all()
+        assert demo.pixels.shape == (0, 3, 224, 224)
+
+
+@pytest.mark.parametrize("domain", ["sim", "real_like"])
+def test_demos_do_not_follow_from_those_before_them(domain):
+    """Seed 0, demo 4: with the fingers left where demo 1's episode ended, 600 of its states came out otherwise."""
+    options = episodes.Options((8, 8), None, domain, ("pick", "push", "put_down"), 0, 350, 0.0)
+    for number in (1, 2):
+        episodes._episode(options, number, 0)
+    later = [vars(episodes._episode(options, number, 0)) for number in (4, 5)]
+    for number, demo in zip((4, 5), later, strict=True):
+        episodes._close()
+        alone = vars(episodes._episode(options, number, 0))
+        for key, value in demo.items():
+            assert np.array_equal(value, alone[key]), key
+    episodes._close()
+
+
+@pytest.mark.parametrize("domain", ["sim", "real_like"])
+def test_pictures_are_of_their_steps(tmp_path, domain):
+    needs_opengl()
+    options = {"size": (16, 20), "domain": domain, "tasks": ["push"], "noise": 0.005, "seed": 1}
+    collect_ur5_demos(tmp_path, 2, frames=4, max_steps=30, **options)
+    for demo in demos_of(tmp_path):
+        assert demo.domain == domain
+        assert len(set(demo.steps.tolist())) == 4
+        assert demo.pixels.shape == (4, 3, 16, 20)
+        env = UR5TableEnv("push", domain, size=(16, 20), pixels_dtype=torch.uint8, render_at=demo.steps.tolist())
+        env.set_seed(demo.seed)
+        row = env.reset()
+        pictures = []
+        for step in range(30):
+            assert (row["state"].numpy() == demo.state[step]).all()
+            if row["observed"]:
+                pictures.append(row["pixels"].numpy())
+            noise = demo.action[step] - row["expert", "action"].numpy()
+            assert noise[6] == 0
+            assert 0 < np.abs(noise[:6]).max() < 0.03  # six standard deviations
+            row = env.step(row.set("action", torch.from_numpy(demo.action[step])))["next"]
+        assert (np.stack(pictures) == demo.pixels).all()
+        env.close()
+    seen = [tuple(demo.steps) for demo in demos_of(tmp_path)]
+    assert seen[0] != seen[1]
+    every = tmp_path / "every"
+    collect_ur5_demos(every, 1, frames=0, max_steps=5, **options)
+    (demo,) = demos_of(every)
+    assert demo.steps.tolist() == [0, 1, 2, 3, 4]
+    assert (demo.state == demos_of(tmp_path)[0].state[:5]).all()
+    data = UR5ExperienceReplay(tmp_path, split="all", frames_only=True, cache=None)
+    assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
+
+
+def test_a_killed_run_goes_on_with_other_processes(unbroken, tmp_path):
+    """SIGKILL in the middle of a run with two workers, then one process: the same bytes as one process alone."""
+    root = tmp_path / "killed"
+    command = [
+        sys.executable,
+        "-m",
+        "torch_denkf.applications.ur5.commands.collect_ur5",
+        "--out",
+        str(root),
+        "--demos",
+        "40",
+    ]
+    command += ["--no-pixels", "--seed", "3", "--processes", "2"]
+    with subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}) as run:
+        deadline = time.monotonic() + 120
+        while len(read_manifest(root)) < 3:
+            assert run.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        with pytest.raises(OSError, match="another process is collecting into it"):
+            collect_ur5_demos(root, DEMOS, **BLIND)
+        children = [int(pid) for pid in _read(f"/proc/{run.pid}/task/{run.pid}/children").split()]
+        run.send_signal(signal.SIGKILL)
+    made = read_manifest(root)
+    assert 3 <= len(made) < 40
+    # Workers do not outlive their parent: they would go on writing, and wait for work for ever.
+    deadline = time.monotonic() + 20
+    assert len(children) >= 2
+    while any("spawn_main" in _read(f"/proc/{pid}/cmdline") for pid in children):  # a zombie has no command line
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+    (root / ".demo-000001.npz-01234567").write_bytes(b"half")
+    with (root / MANIFEST).open("a") as file:
+        file.write('{"demo": 39, "file": "demo-0000')  # killed while writing the line
+    stamps = {entry.file: (root / entry.file).stat().st_mtime_ns for entry in made.values()}
+    collect_ur5_demos(root, DEMOS, **BLIND)
+    for name, stamp in stamps.items():
+        assert (root / name).stat().st_mtime_ns == stamp  # not made again
+    resumed, expected = content(root), content(unbroken)
+    for name in expected:
+        if name != MANIFEST:
+            assert resumed[name] == expected[name], name
+    lines = resumed[MANIFEST].decode().splitlines()
+    assert lines[:DEMOS] == expected[MANIFEST].decode().splitlines()
+    assert not [name for name in resumed if name.startswith(".")]
+
+
+def _read(file):
+    try:
+        with open(file) as stream:
+            return stream.read()
+    except OSError:
+        return ""
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "missing"])
+def test_damaged_files_are_found_and_made_again(unbroken, copy, capsys, damage):
+    file = copy / "demo-000002.npz"
+    data = bytearray(file.read_bytes())
+    if damage == "missing":
+        file.unlink()
+    elif damage == "cut":
+        file.write_bytes(data[:-10])
+    else:
+        data[100] ^= 1
+        file.write_bytes(data)
+    assert main(["--out", str(copy), "--verify"]) == 1
+    out, err = capsys.readouterr()
+    assert out == f"6 demos in {copy}: 1 are missing, damaged or not listed\n"
+    assert err.startswith(str(file))
+    assert len(err.splitlines()) == 1
+    with pytest.warns(UserWarning, match=f"{file}.*made again"):
+        assert collect_ur5_demos(copy, DEMOS, **BLIND) == 1
+    assert content(copy) == content(unbroken)
+    assert main(["--out", str(copy), "--verify"]) == 0
+    assert capsys.readouterr().out == f"6 demos in {copy}: all checksums are right\n"
+
+
+def test_a_file_without_a_line_is_not_trusted(unbroken, copy):
+    """A run killed between the file and its line, or a file put there by hand."""
+    lines = (copy / MANIFEST).read_text().splitlines(keepends=True)
+    (copy / MANIFEST).write_text("".join(lines[:4] + lines[5:]))
+    (copy / "demo-000004.npz").write_bytes(b"something else")
+    assert collect_ur5_demos(copy, DEMOS, **BLIND) == 1
+    assert content(copy) == content(unbroken)
+
+
+def test_more_and_fewer_demos(unbroken, tmp_path):
+    collect_ur5_demos(tmp_path, 2, **BLIND)
+    assert len(read_manifest(tmp_path)) == 2
+    assert collect_ur5_demos(tmp_path, DEMOS, **BLIND) == DEMOS - 2
+    assert content(tmp_path) == content(unbroken)
+    assert collect_ur5_demos(tmp_path, 1, **BLIND) == 0
+    assert content(tmp_path) == content(unbroken)
+
+
+def test_failures_are_left_out_and_counted(tmp_path, monkeypatch, unbroken):
+    episode = episodes._episode
+
+    def fails(options, number, attempt):
+        return None if number == 1 and attempt < 2 else episode(options, number, attempt)
+
+    monkeypatch.setattr(episodes, "_episode", fails)
+    collect_ur5_demos(tmp_path, 2, **BLIND)
+    entries = read_manifest(tmp_path)
+    assert [entry.failures for entry in entries.values()] == [0, 2]
+    mine, other = demos_of(tmp_path), demos_of(unbroken)
+    assert mine[0].seed == other[0].seed
+    assert mine[1].seed != other[1].seed
+    monkeypatch.setattr(episodes, "_episode", lambda *args: None)
+    with pytest.raises(
+        RuntimeError, match=r"failed in all of 20 episodes drawn for demo 2, 'put_down' in domain 'sim'"
+    ):
+        collect_ur5_demos(tmp_path, 3, **BLIND)
+    assert len(read_manifest(tmp_path)) == 2
+
+
+def test_an_episode_without_success_is_no_demo(monkeypatch):
+    options = episodes.Options((8, 8), None, "sim", ("pick",), 0, 20, 0.0)
+    assert episodes._episode(options, 0, 0) is not None
+    step = UR5TableEnv._step
+
+    def away(self, tensordict):
+        out = step(self, tensordict)
+        return out.set("success", torch.zeros(1, dtype=torch.bool))
+
+    monkeypatch.setattr(UR5TableEnv, "_step", away)
+    assert episodes._episode(options, 0, 0) is None
+    episodes._close()
+
+
+def test_the_callers_generator_is_left_alone(tmp_path):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    collect_ur5_demos(tmp_path, 1, **BLIND, noise=0.01)
+    assert torch.rand(3).equal(expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"seed": 4}, "seed 3 instead of 4"),
+        ({"max_steps": 41, "noise": 0.1}, "max_steps 350 instead of 41, noise 0.0 instead of 0.1"),
+        ({"frames": 2}, "frames None instead of 2"),
+        ({"tasks": ["push"]}, r"tasks \['pick', 'push', 'put_down'\] instead of \['push'\]"),
+    ],
+)
+def test_another_collection_is_refused(unbroken, change, text):
+    before = content(unbroken)
+    with pytest.raises(ValueError, match=f"{unbroken} holds another collection, with {text}"):
+        collect_ur5_demos(unbroken, DEMOS, **{**BLIND, **change})
+    assert content(unbroken) == before
+
+
+def test_a_folder_without_options_or_with_damaged_ones(copy):
+    (copy / COLLECTION).write_text("{")
+    with pytest.raises(ValueError, match=f"{COLLECTION} is damaged"):
+        collect_ur5_demos(copy, DEMOS, **BLIND)
+    (copy / COLLECTION).unlink()
+    with pytest.raises(ValueError, match=f"has demos but no {COLLECTION}"):
+        collect_ur5_demos(copy, DEMOS, **BLIND)
+
+
+def test_options_out_of_range(tmp_path):
+    for change, text in [
+        ({"tasks": []}, "tasks are some of"),
+        ({"tasks": ["pick", "stack"]}, "tasks are some of pick, push, put_down"),
+        ({"domain": "mars"}, "unknown domain 'mars'"),
+        ({"size": (0, 4)}, "size is"),
+        ({"seed": -1}, "seed must be a whole number, at least 0; got -1"),
+        ({"noise": -0.1}, "noise must be finite and at least 0; got -0.1"),
+        ({"max_steps": 0}, "max_steps must be"),
+        ({"processes": 0}, "processes must be"),
+    ]:
+        with pytest.raises(ValueError, match=text):
+            collect_ur5_demos(tmp_path / "no", 1, **{**BLIND, **change})
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_command(tmp_path, capsys, unbroken):
+    out = tmp_path / "demos"
+    words = ["--out", str(out), "--no-pixels", "--seed", "3", "--processes", "1", "--demos", "2"]
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"2 demos in {out}: 2 made, 0 were there; 0 failed episodes left out\n"
+    expected = content(unbroken)
+    assert all(data == expected[name] for name, data in content(out).items() if name != MANIFEST)
+    assert json.loads((out / COLLECTION).read_text())["size"] == [224, 224]
+    assert main([*words, "--seed", "4"]) == 2
+    assert re.match(r"error: .*seed 3 instead of 4", capsys.readouterr().err)
+    (tmp_path / "file").touch()
+    assert main(["--out", str(tmp_path / "file"), "--no-pixels"]) == 2
+    assert "cannot use" in capsys.readouterr().err
+    assert main(["--out", str(tmp_path / "none"), "--verify"]) == 2
+    assert "no demos in" in capsys.readouterr().err
+
+
+def test_without_opengl_no_folder_is_spoilt(tmp_path, capsys, monkeypatch):
+    from torch_denkf.applications.ur5.simulation import render
+
+    def none():
+        raise ImportError("no library")
+
+    monkeypatch.setattr(render, "_context_class", none)
+    words = ["--out", str(tmp_path), "--demos", "1", "--size", "16", "--max-steps", "5", "--processes", "1"]
+    assert main(words) == 2
+    assert "apt-get install libegl1" in capsys.readouterr().err
+    assert main([*words, "--no-pixels"]) == 0

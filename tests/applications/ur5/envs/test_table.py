@@ -1,0 +1,185 @@
+"""Oracles: the simulator's own data, the law of the expert's plan, and that a seed is an episode."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+
+pytest.importorskip("mujoco", reason="mujoco is not installed: pip install 'mujoco>=3.17,<4'")
+
+from torch_denkf.applications.ur5 import UR5TableEnv
+from torch_denkf.applications.ur5.envs.expert import UR5Expert
+from torch_denkf.envs import LinearGaussianEnv
+
+TASKS = ("pick", "push", "put_down")
+
+
+def blind(task="pick", domain="sim", **kwargs):
+    return UR5TableEnv(task, domain, from_pixels=False, **kwargs)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_specs(task):
+    check_env_specs(blind(task, max_steps=5, seed=0))
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_expert_succeeds_and_the_judge_is_right(task, seed):
+    env = blind(task, seed=seed)
+    rollout = env.rollout(400, UR5Expert(env))
+    assert rollout.shape == (350,)
+    done = rollout["next", "success"].squeeze(-1)
+    assert done[-1]
+    assert not rollout["success"][0]
+    torch.testing.assert_close(rollout["next", "reward"].squeeze(-1), done.float())
+    # The same judgement from what the environment emits, with the thresholds of its documentation.
+    thing, goal = rollout["next", "expert", "object"], rollout["next", "expert", "goal"]
+    height = env._episode.half_size[2]
+    if task == "pick":
+        clear = thing[:, 2] - height
+        assert done[clear > 0.081].all()
+        assert not done[clear < 0.079].any()
+        hand = rollout["next", "state"][done, 7:]
+        assert (hand - thing[done]).norm(dim=-1).max() < 0.03  # it hangs in the gripper
+    else:
+        away = (thing - goal)[:, :2].norm(dim=-1)
+        assert not done[away > 0.031].any()
+        assert away[-1] < 0.03
+        assert thing[-1, 2].item() == pytest.approx(height, abs=0.002)  # it stands on the table
+    if task == "push":
+        assert thing[:, 2].max() < height + 0.01  # it was not carried
+    if task == "put_down":
+        assert thing[0, 2] > height + 0.05
+        assert (rollout["next", "state"][-1, 7:] - thing[-1]).norm() > 0.07
+
+
+def test_state_is_the_simulators():
+    env = blind(seed=1)
+    state = env.rollout(120, UR5Expert())["next", "state"][-1].numpy()
+    data = env._scene.data
+    joints = [
+        data.joint(n).qpos[0] for n in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    ]
+    np.testing.assert_allclose(state[:6], joints, atol=1e-6)
+    # The finger tips are 2 x 42.5 mm apart at 0.8 rad; the pads' faces lie at the fingers' origins.
+    gap = data.body("finger_left").xpos - data.body("finger_right").xpos
+    np.testing.assert_allclose(np.linalg.norm(gap), state[6] / 0.8 * 0.085, atol=2e-6)
+    np.testing.assert_allclose(state[7:], data.site("pinch").xpos - data.site("table_centre").xpos, atol=1e-6)
+
+
+def test_the_arm_goes_where_it_is_sent():
+    env = blind(seed=2)
+    rollout = env.rollout(350, UR5Expert(env))
+    action, state = rollout["action"], rollout["next", "state"]
+    torch.testing.assert_close(action, rollout["expert", "action"])
+    # Servos lag a moving target by less than two degrees, and stand within a fifth of one at the end.
+    assert (action - state[:, :7])[:, :6].abs().max() < 0.035
+    assert (action - state[:, :7])[-1, :6].abs().max() < 0.0035
+    assert state[:, 6].diff().abs().max() < 0.1  # the gripper's ramp
+    assert rollout["state"].std(0).min() > 0.01  # nothing is constant
+
+
+def test_speeds_are_limited():
+    env = blind(seed=0)
+    td = env.reset()
+    start = td["state"][:7].clone()
+    far = start + torch.tensor([1.0, 0, 0, 0, 0, 0, -2.0])
+    for step in range(1, 4):
+        env.step(td.set("action", far))
+        sent = torch.from_numpy(env._scene.target).float() - start
+        assert sent[0].item() == pytest.approx(min(1.0, step * torch.pi * 0.08), abs=1e-4)
+        assert sent[6].item() == pytest.approx(-min(start[6].item(), step * 0.12), abs=1e-4)
+
+
+def test_seeds_are_episodes():
+    def run(task="pick", seed=None, episodes=1, **kwargs):
+        env = blind(task, max_steps=25, **kwargs)
+        if seed is not None:
+            env.set_seed(seed)
+        return torch.stack([env.rollout(25, UR5Expert(env)) for _ in range(episodes)])
+
+    for task in TASKS:
+        one, other = run(task, 3, episodes=2), run(task, 3, episodes=2)
+        assert (one == other).all()  # every key, bit for bit
+        assert (one["state"][0] != one["state"][1]).any()  # the next episode is another
+        assert (run(task, 4)["state"][0, 0] != one["state"][0, 0]).any()
+    constructed = blind(seed=3, max_steps=25)
+    assert (constructed.rollout(25, UR5Expert()) == run(seed=3)[0]).all()
+    state = torch.get_rng_state()
+    blind(seed=5).reset()
+    assert torch.get_rng_state().equal(state), "its own generator"
+
+
+@pytest.mark.parametrize("task", ["pick", "push", "put_down"])
+def test_an_episode_leaves_nothing_to_the_next(task):
+    env = blind(task)
+    env.set_seed(1)
+    env.rollout(350, UR5Expert(env))
+    for seed in (2, 3):  # to the end: differences in the last bit take their time
+        fresh = blind(task)
+        env.set_seed(seed)
+        fresh.set_seed(seed)
+        assert (env.rollout(350, UR5Expert(env)) == fresh.rollout(350, UR5Expert(fresh))).all()
+
+
+def test_variety():
+    env = blind(seed=0)
+    resets = torch.stack([env.reset() for _ in range(40)])
+    thing, home = resets["expert", "object"], resets["state"]
+    assert (thing[:, 0].abs() < 0.19).all()
+    assert (thing[:, 1].abs() < 0.26).all()
+    assert (thing[:, :2].std(0) > torch.tensor([0.05, 0.1])).all()
+    assert (home.std(0) > 0.03).all()  # every joint, wrist 2 included
+    assert (home[:, 9] > 0.19).all()
+
+
+def test_random_actions_stay_near():
+    state = blind(seed=0).rollout(60)["next", "state"]
+    assert (state[-1, :6] - state[0, :6]).abs().max() < 1.0
+    assert state[:, :6].diff(dim=0).abs().max() < 0.1
+
+
+def test_truncation():
+    env = blind(max_steps=4, seed=0)
+    rollout = env.rollout(10, break_when_any_done=False)
+    assert rollout["next", "truncated"].flatten().tolist() == [False, False, False, True] * 2 + [False] * 2
+    assert not rollout["next", "terminated"].any()
+
+
+def test_expert_noise():
+    planned = torch.zeros(4000, 7)
+    read = TensorDict({"expert": {"action": planned}}, [4000])
+    assert UR5Expert()(read.clone())["action"].equal(planned)
+    action = UR5Expert(noise=0.02, generator=torch.Generator().manual_seed(0))(read.clone())["action"]
+    # 24,000 draws: the standard error of their standard deviation is 0.5 %.
+    assert action[:, :6].std().item() == pytest.approx(0.02, rel=0.025)
+    assert (action[:, 6] == 0).all()
+    again = UR5Expert(noise=0.02, generator=torch.Generator().manual_seed(0))(read.clone())["action"]
+    assert again.equal(action)
+
+
+def test_joints_of_the_real_like_arm_stand_off():
+    runs = {}
+    for domain in ("sim", "real_like"):
+        env = blind("pick", domain, seed=0)
+        runs[domain] = env.rollout(350, UR5Expert(env))
+    assert runs["sim"]["expert", "action"].equal(runs["real_like"]["expert", "action"])  # the same episode
+    # At rest: the constant offsets, give or take the 4 N m of dry friction that a servo of 4000 N m/rad leaves.
+    rest = (runs["real_like"]["next", "state"][-1] - runs["sim"]["next", "state"][-1])[:6]
+    offset = torch.tensor([0.012, -0.008, 0.010, -0.012, 0.010, 0.015])
+    torch.testing.assert_close(rest, offset, atol=0.0025, rtol=0)
+
+
+def test_errors_say_what_to_do():
+    with pytest.raises(ValueError, match=r"unknown task 'place'; there are pick, push, put_down"):
+        blind("place")
+    with pytest.raises(ValueError, match=r"unknown domain 'real'; there are sim, real_like"):
+        blind(domain="real")
+    with pytest.raises(ValueError, match=r"torch.float32 or torch.uint8, not torch.float64"):
+        blind(pixels_dtype=torch.float64)
+    with pytest.raises(KeyError, match=r"LinearGaussianEnv does not emit .*UR5TableEnv does"):
+        UR5Expert(LinearGaussianEnv(torch.eye(2), torch.eye(2), [0.1, 0.1], [0.1, 0.1]))
+    with pytest.raises(ValueError, match="standard deviation in rad, got -1"):
+        UR5Expert(noise=-1)

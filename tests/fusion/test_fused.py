@@ -1,0 +1,592 @@
+"""Several sensors in one filter: one Kalman filter of all readings in their order is the oracle."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torch import nn
+from torch.testing import assert_close
+
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
+from tests.filters.gaussian_for_tests import directional_check
+from torch_denkf.filters import EKF, DEnKF, Filter
+from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.functional import wrap_angles
+from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
+from torch_denkf.fusion.parts import JoinedReading
+from torch_denkf.modules import (
+    CholeskyNoise,
+    ConstantNoise,
+    DiagonalNoise,
+    EKFAnalysis,
+    EKFTransition,
+    EnsembleAnalysis,
+    GaussianPrior,
+    LearnedObservation,
+    LearnedTransition,
+    LinearObservation,
+    LinearTransition,
+    MappedNoise,
+    MomentPrior,
+    Select,
+    StochasticMLP,
+    UKFAnalysis,
+    UKFTransition,
+    VectorSensor,
+)
+from torch_denkf.monitoring import BlackIsMissing
+from torch_denkf.smoothers import FixedLag
+
+B, T, DELAY = 3, 11, 3
+BELIEF = [("belief", "mean"), ("belief", "cov")]
+KINDS = ("Kalman", "EKF", "UKF")
+
+
+def known_noise():
+    unit = ConstantNoise([1.0, 1.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    return MappedNoise(unit, torch.linalg.cholesky(linear_system()[1]))
+
+
+def sensors(**second):
+    """The two components of the linear system's reading, as two sensors."""
+    _, _, H, R = linear_system()
+    return {
+        "first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
+        "second": FusedSensor(LinearObservation(H[1:]), R[1:].sqrt(), **second),
+    }
+
+
+def fused(kind, *, joint=False, lag=None, members=None, noisy=True, analysis=None, **second):
+    F, Q, _, _ = linear_system()
+    options = {"joint": joint, "lag": lag, "analysis": analysis}
+    if kind == "ensemble":
+        motion = NoisyLinear(F, torch.linalg.cholesky(Q) if noisy else None)
+        return FusedFilter(motion, sensors(**second), initial=FixedEnsemble(members), **options)
+    motion = LinearTransition(F, Q)
+    if kind != "Kalman":
+        motion = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](NoisyLinear(F), known_noise())
+    initial = MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.tensor([1.0, 2.0])))
+    return FusedFilter(motion, sensors(**second), initial=initial, **options)
+
+
+def readings():
+    """Readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
+    torch.manual_seed(0)
+    y = torch.randn(B, T, 2)
+    frames = TensorDict({"first": y[..., :1], "second": y[..., 1:]}, [B, T])
+    for name in ("first", "second"):
+        frames[f"{name}_observed"] = torch.rand(B, T, 1) < 0.7
+        frames[f"{name}_observed"][:, 0] = False
+    frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
+    frames["is_init"][:, 0] = True
+    return frames
+
+
+def as_kalman(frames):
+    """The frames for one Kalman filter of both sensors."""
+    out = frames.select("is_init")
+    out["observation"] = torch.cat([frames["first"], frames["second"]], -1)
+    out["observed"] = torch.cat([frames["first_observed"], frames["second_observed"]], -1)
+    return out
+
+
+def arriving(frames, late):
+    """The second sensor's readings when they arrive: at t comes that of t - late[t]."""
+    index = torch.arange(T) - late
+    out = frames.copy()
+    for key in ("second", "second_observed"):
+        out[key] = frames[key][:, index.clamp(min=0)]
+    out["second_observed"] = out["second_observed"] & (index >= 0).unsqueeze(-1)
+    out["late"] = late.reshape(1, T, 1).expand(B, T, 1)
+    return out
+
+
+def arrived(frames, late, now):
+    """The readings in their order, as far as they have arrived at ``now``."""
+    out = frames[:, : now + 1].copy()
+    times = torch.arange(T) - late
+    known = torch.isin(torch.arange(now + 1), times[: now + 1])
+    out["second_observed"] = out["second_observed"] & known.unsqueeze(-1)
+    return out
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_in_turn_and_joint_are_one_kalman_filter(float64, kind, joint):
+    frames = readings()
+    expected = linear_kalman().sequence(as_kalman(frames))
+    out = fused(kind, joint=joint).sequence(frames.copy())
+    for key in (*BELIEF, ("info", "log_likelihood"), ("info", "nis")):
+        assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+
+
+def test_in_turn_and_joint_are_the_same_ensemble_in_mean_and_covariance(float64):
+    frames, (F, _, H, R) = readings(), linear_system()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    outs = [
+        fused("ensemble", joint=joint, members=members, noisy=False).sequence(frames.copy()) for joint in (False, True)
+    ]
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
+    assert_close(outs[0]["belief", "var"], outs[1]["belief", "var"], rtol=0, atol=1e-10)
+    whole = DEnKF(
+        transition=NoisyLinear(F),
+        sensor=None,
+        observation=LinearObservation(H),
+        noise=ConstantNoise(R.sqrt(), in_key="observation"),
+        analysis=EnsembleAnalysis("etkf", observation_key="observation"),
+        initial=FixedEnsemble(members),
+    ).sequence(as_kalman(frames))
+    assert_close(outs[1]["belief", "ensemble"], whole["belief", "ensemble"], rtol=0, atol=1e-12)
+
+
+PATTERNS = {
+    "three steps late": torch.full((T,), DELAY),
+    "out of order": torch.tensor([0, 2] * T)[:T],  # that of t=2 before that of t=1, and so on
+}
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_late_readings_give_what_they_give_in_order(float64, kind, joint, pattern):
+    frames, late = readings(), PATTERNS[pattern]
+    key = {} if pattern == "three steps late" else {"late": "late"}
+    out = fused(kind, joint=joint, delay=DELAY, **key).sequence(arriving(frames, late))
+    for now in range(T):
+        expected = linear_kalman().sequence(as_kalman(arrived(frames, late, now)))
+        for name in BELIEF:
+            assert_close(out[name][:, now], expected[name][:, -1], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, pattern):
+    frames, late = readings(), PATTERNS[pattern]
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False}
+    key = {} if pattern == "three steps late" else {"late": "late"}
+    out = fused("ensemble", joint=joint, delay=DELAY, **key, **given).sequence(arriving(frames, late))
+    for now in range(T):
+        expected = fused("ensemble", **given).sequence(arrived(frames, late, now))
+        for name in ("mean", "var"):
+            assert_close(out["belief", name][:, now], expected["belief", name][:, -1], rtol=0, atol=1e-10)
+
+
+def test_late_readings_of_a_noisy_ensemble_within_the_error_of_its_members(float64):
+    """With process noise, members are only a sample of its covariance with the past: 1 / sqrt(E)."""
+    frames, late = readings(), PATTERNS["three steps late"]
+    errors = []
+    for count in (500, 8000):
+        torch.manual_seed(2)
+        members = torch.tensor([1.0, -1.0]) + torch.tensor([1.0, 2.0]).sqrt() * torch.randn(count, 2)
+        out = fused("ensemble", delay=DELAY, members=members).sequence(arriving(frames, late))
+        expected = fused("Kalman", delay=DELAY).sequence(arriving(frames, late))
+        errors.append((out["belief", "mean"] - expected["belief", "mean"]).square().mean().sqrt())
+    assert errors[1] < 0.02
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    frames["is_init"][:, 6] = True
+    frames["second_observed"][:] = True
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    out = fused(kind, delay=DELAY, **given).sequence(frames.copy())
+    alone = fused(kind, delay=DELAY, **given).sequence(frames[:, 6:].copy())
+    assert_close(out["belief", "mean"][:, 6:], alone["belief", "mean"], rtol=0, atol=0)
+    assert (alone["info", "second", "nis"][:, :DELAY] == 0).all()
+    assert (alone["info", "second", "nis"][:, DELAY:] > 0).all()
+
+
+def moved_and_read(steps, late, reading, *, mean, cov, noise):
+    """A prior after so many steps, with one reading of the second sensor that was taken ``late`` steps before."""
+    F, Q, H, R = linear_system()
+    for step in range(steps + 1):
+        mean, cov = (F @ mean, F @ cov @ F.mT + noise * Q) if step else (mean, cov)
+        if step == steps - late:
+            gain = cov @ H[1:].mT / (H[1:] @ cov @ H[1:].mT + R[1])
+            mean, cov = mean + gain @ (reading - H[1:] @ mean), cov - gain @ H[1:] @ cov
+    return mean, cov
+
+
+@pytest.mark.parametrize("update_at_reset", [False, True])
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
+    """Of every step of the episode; not of one before, not of one to come, not of one beyond the lag."""
+    members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
+    if kind == "Kalman":
+        motion, initial = LinearTransition(F, Q), MomentPrior(torch.tensor([1.0, -1.0]), torch.diag(torch.rand(2)))
+        prior = {"mean": initial.mean, "cov": initial.cov, "noise": 1.0}
+    else:
+        motion, initial = NoisyLinear(F), FixedEnsemble(members)
+        prior = {"mean": members.mean(0), "cov": members.mT.cov(), "noise": 0.0}
+    delay = 3
+    own = sensors(delay=delay, late="late")
+    filter = FusedFilter(motion, own, initial=initial, update_at_reset=update_at_reset)
+    used = []
+    for steps in range(not update_at_reset, 6):
+        for late in range(-1, delay + 2):
+            frames = TensorDict({"first": torch.zeros(steps + 1, 1)}, [steps + 1])
+            frames["second"] = torch.full_like(frames["first"], 4.0)
+            frames["first_observed"] = torch.zeros(steps + 1, 1, dtype=torch.bool)
+            frames["second_observed"] = frames["first_observed"].index_fill(0, torch.tensor([steps]), True)
+            frames["late"] = torch.full((steps + 1, 1), late)
+            belief = filter.sequence(frames)[-1]
+            counts = 0 <= late <= min(steps, delay)
+            mean, cov = moved_and_read(steps, late if counts else -1, torch.tensor([4.0]), **prior)
+            assert_close(belief["belief", "mean"], mean, rtol=0, atol=1e-10)
+            assert_close(belief["belief", "var"], cov.diagonal(), rtol=0, atol=1e-10)
+            assert (belief["info", "second", "nis"] > 0).item() == counts
+            assert belief["smoothed", "age"].item() == min(steps, delay)
+            used.append(counts)
+    assert sum(used) == (18 if update_at_reset else 17)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_state_a_lag_ago_is_that_of_the_smoother(float64, kind):
+    frames = readings()
+    expected = FixedLag(linear_kalman(), 4).sequence(as_kalman(frames))
+    out = fused(kind, lag=4, joint=True).sequence(frames.copy())
+    for name in ("mean", "cov", "var", "age"):
+        assert_close(out["smoothed", name], expected["smoothed", name], rtol=0, atol=1e-10)
+
+
+SPREAD = {
+    "Kalman": partial(EKFAnalysis, inflation=1.3),
+    "UKF": partial(UKFAnalysis, inflation=1.3),
+    "ensemble": partial(EnsembleAnalysis, "etkf", inflation=1.3),
+}
+
+
+def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
+    """A Kalman filter by hand, one sensor after the other, each followed by inflation: beliefs and forecasts."""
+    F, Q, H, R = linear_system()
+    means, covs = [mean.expand(B, 2)], [cov.expand(B, 2, 2)]
+    moved = []
+    for row in frames.unbind(1)[1:]:
+        mean, cov = means[-1] @ F.mT, F @ covs[-1] @ F.mT + noise * Q
+        moved.append((mean, cov))
+        for index, name in enumerate(("first", "second")):
+            h, seen = H[index], row[f"{name}_observed"]
+            gain = (cov @ h) / (h @ cov @ h.unsqueeze(-1) + R[index])
+            new = mean + gain * (row[name] - mean @ h.unsqueeze(-1))
+            shrunk = cov - gain.unsqueeze(-1) * (h @ cov).unsqueeze(-2)
+            mean = torch.where(seen, new, mean)
+            cov = torch.where(seen.unsqueeze(-1), factor**2 * shrunk, cov)
+        means.append(mean)
+        covs.append(cov)
+    return means, covs, moved
+
+
+def test_inflation_is_that_of_readings_in_their_order_when_they_are_filtered_again(float64):
+    frames, late = readings(), PATTERNS["out of order"]
+    lately = {"late": ("second", "second_observed")}
+    out = Refiltering(fused("Kalman", analysis=SPREAD["Kalman"]), lately, DELAY).sequence(arriving(frames, late))
+    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
+    for now in range(T):
+        means, covs, _ = inflated(arrived(frames, late, now), 1.3, **start)
+        assert_close(out["belief", "mean"][:, now], means[-1], rtol=0, atol=1e-10)
+        assert_close(out["belief", "cov"][:, now], covs[-1], rtol=0, atol=1e-10)
+
+
+def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):
+    """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
+    frames, lag, F = readings(), 3, linear_system()[0]
+    out = FixedLag(fused("Kalman", analysis=SPREAD["Kalman"]), lag).sequence(frames.copy())
+    start = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
+    means, covs, moved = inflated(frames, 1.3, **start)
+    mean, cov = means[-1], covs[-1]
+    for step in range(T - 2, T - 2 - lag, -1):
+        gain = covs[step] @ F.mT @ torch.linalg.inv(moved[step][1])
+        mean = means[step] + (gain @ (mean - moved[step][0]).unsqueeze(-1)).squeeze(-1)
+        cov = covs[step] + gain @ (cov - moved[step][1]) @ gain.mT
+    assert_close(out["belief", "cov"][:, -1], covs[-1], rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "mean"][:, -1], mean, rtol=0, atol=1e-10)
+    assert_close(out["smoothed", "cov"][:, -1], cov, rtol=0, atol=1e-10)
+
+
+def test_an_ensemble_with_a_lag_inflates_its_present_alone(float64):
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    frames, given = readings(), {"members": members, "noisy": False, "analysis": SPREAD["ensemble"]}
+    out = fused("ensemble", lag=3, **given).sequence(frames.copy())
+    means, covs, _ = inflated(frames, 1.3, noise=0.0, mean=members.mean(0), cov=members.mT.cov())
+    assert_close(out["belief", "mean"], torch.stack(means, 1), rtol=0, atol=1e-10)
+    variances = torch.stack(covs, 1).diagonal(dim1=-2, dim2=-1)
+    assert_close(out["belief", "var"], variances, rtol=1e-9, atol=1e-10)
+    expected = FixedLag(fused("ensemble", **given), 3).sequence(frames.copy())
+    assert_close(out["smoothed", "ensemble"], expected["smoothed", "ensemble"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_inflation_that_would_spread_the_past_is_refused(joint):
+    members = torch.randn(7, 2)
+    for kind, analysis in SPREAD.items():
+        with pytest.raises(ValueError, match=r"inflation or relaxation of .* let Refiltering make them again"):
+            fused(kind, members=members, joint=joint, analysis=analysis, delay=DELAY)
+        if kind != "ensemble":
+            with pytest.raises(ValueError, match=r"inflation or relaxation of .* put FixedLag\(filter, lag\) around"):
+                fused(kind, joint=joint, analysis=analysis, lag=DELAY)
+    relaxed = partial(EnsembleAnalysis, "etkf", relaxation=0.5)
+    with pytest.raises(ValueError, match="inflation or relaxation"):
+        fused("ensemble", members=members, joint=joint, analysis=relaxed, delay=DELAY)
+    own = sensors(delay=DELAY)
+    own["first"] = replace(own["first"], analysis=SPREAD["ensemble"])  # in time, and not inflated for the late one
+    with pytest.raises(ValueError, match="inflation or relaxation of 'first'"):
+        FusedFilter(NoisyLinear(linear_system()[0]), own, initial=FixedEnsemble(members))
+
+
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+def test_an_update_at_reset_sees_the_first_frame_and_no_late_one(float64, kind):
+    frames = readings()
+    for name in ("first", "second"):
+        frames[f"{name}_observed"][:] = True
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    plain = fused(kind, **given)
+    late, order = arriving(frames, PATTERNS["three steps late"]), frames.copy()
+    order["second_observed"] = order["second_observed"].clone()
+    order["second_observed"][:, -DELAY:] = False
+    plain.update_at_reset = True
+    expected = plain.sequence(order)
+    F, Q, _, _ = linear_system()
+    motion = LinearTransition(F, Q) if kind == "Kalman" else NoisyLinear(F)
+    filter = FusedFilter(motion, sensors(delay=DELAY), initial=plain.initial, update_at_reset=True)
+    out = filter.sequence(late)
+    assert_close(out["belief", "mean"][:, -1], expected["belief", "mean"][:, -1], rtol=0, atol=1e-10)
+    first = filter.initialise(late[:, 0].select(*filter.structure.needed, *filter.structure.optional, strict=False))
+    assert_close(first["belief", "mean"], out["belief", "mean"][:, 0])
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
+@pytest.mark.parametrize("delay", [0, DELAY])
+def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kind, joint, delay):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    filter = fused(kind, joint=joint, delay=delay, **given)
+    filter.reject = True
+    broken = frames.copy()
+    broken["second"] = frames["second"].clone()
+    broken["second_observed"][:, 4:6] = True
+    broken["second"][:, 4:6] = torch.nan
+    hidden = frames.copy()
+    hidden["second_observed"] = frames["second_observed"].clone()
+    hidden["second_observed"][:, 4:6] = False
+    outs = [filter.sequence(value.copy()) for value in (broken, hidden)]
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=0)
+    assert (outs[0][REJECTED][:, 4:6] == 1).all()
+    assert outs[0][REJECTED].sum() == 2 * B
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_readings_can_be_left_out(float64, joint):
+    frames = readings()[:, 1]
+    frames.exclude("is_init", inplace=True)
+    filter = fused("Kalman", joint=joint, delay=DELAY)
+    row = filter.initialise(frames)
+    for key in ("first_observed", "second_observed"):
+        row[key][:] = True
+    hidden = row.copy()
+    hidden["second_observed"] = torch.zeros(B, 1, dtype=torch.bool)
+    expected = filter.step(hidden.copy())
+    without = row.clone().exclude("second")
+    if joint:
+        with pytest.raises(ValueError, match="hide them with their masks"):
+            filter.step(without, without=["second"])
+    else:
+        assert_close(filter.step(without, without=["second"])["belief", "mean"], expected["belief", "mean"])
+    predicted = filter.predict(row.clone().exclude("first", "second"))
+    for key in ("first_observed", "second_observed"):
+        hidden[key] = torch.zeros(B, 1, dtype=torch.bool)
+    assert_close(predicted["belief", "mean"], filter.step(hidden)["belief", "mean"])
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_the_gradient_reaches_everything_through_late_readings(float64, gaussian, joint):
+    torch.manual_seed(0)
+    mlp = {"layer": "none", "activation": nn.Tanh}
+    camera = VectorSensor(4, 2, ensemble_size=6, num_cells=(8,), layer="none", in_key="lamps")
+    parts = {
+        "camera": FusedSensor(
+            LearnedObservation(StochasticMLP(2, 2, (6,), **mlp)),
+            DiagonalNoise(2, r=0.5, num_cells=(4,)),
+            sensor=camera,
+            delay=2,
+        ),
+        "wheel": FusedSensor(Select([1]), ConstantNoise([0.3], trainable=True)),
+    }
+    motion = LearnedTransition(StochasticMLP(2, 2, (6,), output_gain=0.5, **mlp))
+    if gaussian:
+        initial, q = MomentPrior(torch.zeros(2), torch.eye(2)), CholeskyNoise(2, r=0.4)
+        filter = FusedFilter(motion, parts, initial=initial, process_noise=q, joint=joint)
+    else:
+        filter = FusedFilter(motion, parts, initial=FixedEnsemble(torch.randn(6, 2)), joint=joint)
+    with torch.no_grad():
+        for parameter in filter.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    frames = TensorDict({"lamps": torch.randn(2, 6, 4), "wheel": torch.randn(2, 6, 1)}, [2, 6])
+    directional_check(
+        lambda: sum(filter.sequence(frames.copy())["belief", key].square().sum() for key in ("mean", "var")),
+        filter.parameters(),
+    )
+
+
+@pytest.mark.parametrize("kind", ["ensemble", "Kalman"])
+def test_rows_of_a_batch_do_not_know_each_other(float64, kind):
+    frames = readings()
+    members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
+    given = {"members": members, "noisy": False} if kind == "ensemble" else {}
+    filter = fused(kind, delay=DELAY, **given)
+    whole = filter.sequence(frames.copy())
+    for row in range(B):
+        alone = filter.sequence(frames[row].copy())
+        assert_close(alone["belief", "mean"], whole["belief", "mean"][row], rtol=0, atol=1e-12)
+
+
+def test_a_fused_filter_is_what_one_would_compose_by_hand(float64):
+    torch.manual_seed(0)
+    F, _, _, _ = linear_system()
+
+    def lamps(**keys):
+        torch.manual_seed(3)
+        return VectorSensor(4, 2, ensemble_size=8, num_cells=(8,), in_key="lamps", **keys)
+
+    start = FixedEnsemble(torch.randn(8, 2))
+    by_hand = Filter(
+        {
+            "camera_sensor": lamps(),
+            "camera_noise": ConstantNoise([0.3, 0.4]),
+            "wheel_noise": ConstantNoise([0.2], in_key="wheel", out_key="wheel_noise"),
+            "transition": NoisyLinear(F),
+            "camera_observation": Select([0, 1]),
+            "camera": EnsembleAnalysis("sensor", belief_prefix="middle", observed_key="camera_observed"),
+            "wheel_observation": Select([1], in_key=("middle", "ensemble"), out_key="wheel_predicted"),
+            "wheel": EnsembleAnalysis(
+                "etkf",
+                forecast_key=("middle", "ensemble"),
+                predicted_key="wheel_predicted",
+                observation_key="wheel",
+                noise_variance_key="wheel_noise",
+                observed_key="wheel_observed",
+            ),
+        },
+        initial=start,
+    )
+    built = FusedFilter(
+        NoisyLinear(F),
+        {
+            "camera": FusedSensor(
+                Select([0, 1]),
+                [0.3, 0.4],
+                sensor=lamps(),
+                analysis=lambda **keys: EnsembleAnalysis("sensor", **keys),
+            ),
+            "wheel": FusedSensor(Select([1]), [0.2]),
+        },
+        initial=start,
+    )
+    frames = TensorDict({"lamps": torch.randn(B, T, 4), "wheel": torch.randn(B, T, 1)}, [B, T])
+    frames["camera_observed"] = torch.rand(B, T, 1) < 0.5
+    frames = by_hand.draw_noise(frames)
+    expected = by_hand.sequence(frames.copy())
+    out = built.sequence(frames.copy())
+    assert out["belief", "ensemble"].equal(expected["belief", "ensemble"])
+    assert out["info", "wheel", "nis"].equal(expected["info", "wheel", "nis"])
+
+
+def test_angles_side_by_side(float64):
+    """A heading near pi, read a full turn away: both ways to update take the shorter way round."""
+    turns = {
+        "compass": FusedSensor(Select([0]), [0.3], angles=[0]),
+        "pair": FusedSensor(Select([1, 0]), [0.5, 0.4], angles=[1]),
+    }
+    F = torch.eye(2)
+    frames = TensorDict({"compass": torch.full((3, 1), -3.1), "pair": torch.tensor([[0.2, -3.0]] * 3)}, [3])
+    means = []
+    for joint in (False, True):
+        initial = MomentPrior(torch.tensor([3.1, 0.0]), torch.eye(2))
+        kf = FusedFilter(LinearTransition(F, 0.1 * F), turns, initial=initial, joint=joint)
+        means.append(kf.sequence(frames.copy())["belief", "mean"])
+    assert_close(means[0], means[1], rtol=0, atol=1e-10)
+    assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
+
+
+def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
+    samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
+    numbers = torch.tensor([[1.0], [2.0], [6.0]])
+    td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
+    found = JoinedReading(["a", "b"], ["qa", "qb"], [(), (0,)], observation_key="c", noise_key="qc")(td)["c"]
+    assert_close(found[0], torch.tensor(3.0))
+    assert_close(wrap_angles(found[1:] - torch.pi - 0.1, [0]), torch.zeros(1), rtol=0, atol=1e-12)
+
+
+def test_covariances_of_readings_side_by_side(float64):
+    F, Q, H, _ = linear_system()
+    cov = torch.tensor([[0.5, 0.2], [0.2, 0.3]])
+
+    class Constant(ConstantNoise):
+        def compute(self, like, *, batch_size):
+            return cov.expand(*batch_size, 2, 2)
+
+    both = {
+        "pair": FusedSensor(LinearObservation(H), Constant([1.0, 1.0])),
+        "one": FusedSensor(Select([1]), [0.7]),
+    }
+    frames = TensorDict({"pair": torch.randn(4, 2), "one": torch.randn(4, 1)}, [4])
+    outs = []
+    for joint in (False, True):
+        initial = MomentPrior(torch.zeros(2), torch.eye(2))
+        outs.append(FusedFilter(LinearTransition(F, Q), both, initial=initial, joint=joint).sequence(frames.copy()))
+    assert_close(outs[0]["belief", "cov"], outs[1]["belief", "cov"], rtol=0, atol=1e-10)
+    assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
+
+
+def test_what_is_refused():
+    F, Q, H, R = linear_system(torch.float32)
+    moments, members = MomentPrior(torch.zeros(2), torch.eye(2)), GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)
+    one = {"a": FusedSensor(LinearObservation(H), R.sqrt())}
+    with pytest.raises(ValueError, match="at least one sensor"):
+        FusedFilter(LinearTransition(F, Q), {}, initial=moments)
+    with pytest.raises(TypeError, match="sensors is a dict"):
+        FusedFilter(LinearTransition(F, Q), [one["a"]], initial=moments)
+    late = FusedFilter(
+        LinearTransition(F, Q), {"a": FusedSensor(LinearObservation(H), R.sqrt(), delay=1)}, initial=moments
+    )
+    with pytest.raises(TypeError, match=r"a_observed.* must be boolean"):
+        late.sequence(TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3]))
+    with pytest.raises(ValueError, match="writes an ensemble"):
+        FusedFilter(LinearTransition(F, Q), one, initial=members)
+    with pytest.raises(ValueError, match="process noise already"):
+        FusedFilter(LinearTransition(F, Q), one, initial=moments, process_noise=0.1)
+    with pytest.raises(ValueError, match="need process_noise"):
+        FusedFilter(NoisyLinear(F), one, initial=moments)
+    with pytest.raises(ValueError, match="beyond lag=2"):
+        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, delay=3)}, initial=members, lag=2)
+    with pytest.raises(ValueError, match="how late"):
+        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late="age")}, initial=members)
+    with pytest.raises(TypeError, match="carries a past already"):
+        FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
+    own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
+    with pytest.raises(ValueError, match="analysis of their own"):
+        FusedFilter(NoisyLinear(F), own, initial=members, joint=True)
+
+
+@pytest.mark.parametrize(
+    ("marker", "observed"), [(BlackIsMissing(), "seen"), (BlackIsMissing(observed_key="other"), "mine")]
+)
+def test_a_mask_that_the_sensor_would_not_read_is_refused(marker, observed):
+    """The mask of the data goes through the one that the sensor makes, and neither is dropped."""
+    camera = TensorDictSequential(marker, VectorSensor(3, 1, ensemble_size=4, in_key="pixels"))
+    with pytest.raises(ValueError, match=f"observed= names '{observed}', which it would not read"):
+        FusedFilter(
+            NoisyLinear(torch.eye(1), 0.1 * torch.eye(1)),
+            {"camera": FusedSensor(Select([0]), [1.0], sensor=camera, observed=observed)},
+            initial=GaussianPrior([0.0], [1.0], ensemble_size=4),
+        )

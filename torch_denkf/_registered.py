@@ -1,0 +1,39 @@
+"""What the folders of ``torch_denkf.applications`` register: builders of filters, weights, commands of the terminal.
+
+An application has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in ``weights/NAME/``.
+Nothing else of the library knows an application.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+from pkgutil import iter_modules, resolve_name
+
+APPLICATIONS = Path(__file__).parent / "applications"
+
+
+def _all() -> Iterator[ModuleType]:
+    for application in iter_modules([str(APPLICATIONS)]):
+        yield import_module(f"torch_denkf.applications.{application.name}.registered")
+
+
+def builders() -> dict[str, Callable[..., Any]]:
+    """Functions that build filters from plain numbers, by the name that a folder's ``config.json`` says."""
+    return {name: resolve_name(place) for each in _all() for name, place in each.BUILDERS.items()}
+
+
+def commands() -> dict[str, tuple[str, str]]:
+    """Modules whose ``main`` runs a command of the terminal, and what it does, by the command's name."""
+    return {name: command for each in _all() for name, command in each.COMMANDS.items()}
+
+
+def weights() -> dict[str, Path]:
+    """Folders of trained filters, by name."""
+    return {file.parent.name: file.parent for file in sorted(APPLICATIONS.glob("*/weights/*/config.json"))}

@@ -1,0 +1,1 @@
+"""One folder a robot, with all that only this robot needs."""

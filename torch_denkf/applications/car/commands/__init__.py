@@ -1,0 +1,1 @@
+"""The car's commands of the terminal."""

@@ -1,0 +1,23 @@
+"""The car filter that a command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch_denkf.applications.car.odometry.filter import CarFilter
+from torch_denkf.pretrained import from_pretrained
+
+__all__ = ["load_car"]
+
+
+def load_car(name_or_folder: str | Path) -> CarFilter:
+    """The filter of that name or in that folder.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is not a car's, or a file is damaged.
+    """
+    car = from_pretrained(name_or_folder)
+    if not isinstance(car, CarFilter):
+        raise ValueError(f"{name_or_folder} is a {type(car).__name__}; pass car-odometry, or a folder of `denkf train`")
+    return car

@@ -1,0 +1,181 @@
+"""``denkf odometry``: the path of a car, from the images of its camera.
+
+::
+
+    denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --out runs/drive
+    denkf odometry KITTI/sequences/09/image_0 --calibration KITTI/sequences/09/calib.txt \
+        --times KITTI/sequences/09/times.txt --checkpoint runs/car --out runs/09
+
+Leaves ``path.csv`` (pose, velocities, and standard deviations of all), ``path_kitti.txt`` and ``path_tum.txt`` (which
+evo reads), and pictures where matplotlib is installed. See :func:`torch_denkf.applications.car.track`, which does the
+work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import warnings
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+from torch_denkf._progress import progress_bar
+from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
+from torch_denkf.cli._command import Command, alone_in, filled, path, say, whole
+
+__all__ = ["main"]
+
+#: Share of the usual time between frames by which one may be off; containers round to milliseconds.
+_UNEVEN = 0.2
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("frames", type=path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
+    add(
+        "--calibration",
+        required=True,
+        type=path,
+        metavar="FILE",
+        help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
+    )
+    add(
+        "--checkpoint",
+        type=filled,
+        default="car-odometry",
+        help="that of the library, or a folder that denkf train left",
+    )
+    add("--out", required=True, type=path, help="folder for path.csv, trajectory files and pictures")
+    add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
+    add("--fps", type=float, help="frames in a second; by default that of a video, or the times of its frames")
+    add("--times", type=path, metavar="FILE", help="a time in s for each frame, a row each")
+    add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
+    add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
+    add("--seed", type=whole(0), default=0, help="of the filter's noise")
+    add("--black-level", type=int, help="frames none of whose pixels is brighter, of 255, count as missing")
+    add("--no-pictures", action="store_true", help="leave the pictures out")
+    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
+
+
+def _run(args: argparse.Namespace) -> None:
+    if args.fps is not None and args.times is not None:
+        raise ValueError("pass --fps or --times, not both")
+    given = {"frames": args.frames, "calibration": args.calibration, "times": args.times}
+    missing = [f"{name} {path}" for name, path in given.items() if path is not None and not path.exists()]
+    if missing:
+        raise FileNotFoundError(f"there is no such file or folder: {', '.join(missing)}")
+    import cv2
+    import torch
+
+    from torch_denkf.applications.car.commands._car import load_car
+    from torch_denkf.applications.car.odometry.images import read_camera, read_frames
+    from torch_denkf.applications.car.odometry.tracking import track
+
+    torch.set_num_threads(args.threads)
+    cv2.setNumThreads(args.threads)
+    source = read_frames(args.frames)
+    folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
+    calibration = read_camera(args.calibration, args.camera or folder)
+    times, fps = _times(args.times, source), source.fps if args.fps is None else args.fps
+    if times is None and args.fps is None:
+        times = _uneven(source)
+    if times is None and fps is None:
+        raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
+    beliefs = track(
+        load_car(args.checkpoint),
+        _counted(source),
+        calibration,
+        times=times,
+        fps=None if times is not None else fps,
+        height=args.height,
+        pitch=args.pitch,
+        black_level=args.black_level,
+        seed=args.seed,
+    )
+    with alone_in(args.out):
+        _leave(beliefs, args.out, pictures=not args.no_pictures)
+
+
+def _leave(beliefs, out: Path, *, pictures: bool) -> None:
+    """Writes the path, as it comes, and what follows from it."""
+    import torch
+
+    from torch_denkf.applications.car.kitti.trajectories import write_trajectory
+    from torch_denkf.applications.car.odometry.paths import write_path
+
+    means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading
+    for belief in write_path(beliefs, out / "path.csv"):
+        means.append(belief.mean)
+        seconds.append(belief.time)
+        blind += not belief.observed
+        doubt = float(belief.var[:2].sum().sqrt())
+    states = torch.stack(means)
+    write_trajectory(out / "path_kitti.txt", states, layout="kitti")
+    write_trajectory(out / "path_tum.txt", states, torch.tensor(seconds, dtype=torch.float64), layout="tum")
+    way = float(states[1:, :2].sub(states[:-1, :2]).norm(dim=-1).sum())
+    say(
+        f"{way:.1f} m in {seconds[-1] - seconds[0]:.1f} s, {len(states)} steps, {blind} without a reading; "
+        f"at the end x {float(states[-1, 0]):.1f} m, y {float(states[-1, 1]):.1f} m, heading "
+        f"{math.degrees(float(states[-1, 2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
+    )
+    files = ["path.csv", "path_kitti.txt", "path_tum.txt"]
+    if pictures:
+        try:
+            from torch_denkf.applications.car.commands.plot import draw
+
+            files += [file.name for file in draw(out / "path.csv", out)]
+        except ImportError as error:
+            say(f"no pictures: {error}")
+    say(f"{out}: {', '.join(files)}")
+
+
+def _times(file: Path | None, source) -> Sequence[float] | None:
+    """The frames' times; of a file with a row for each number, those of the numbers that are there."""
+    if file is None:
+        return None
+    from torch_denkf.applications.car.odometry.images import read_times
+
+    times = read_times(file)
+    if source.count is None or len(times) == source.count:
+        return times
+    if len(times) >= source.first + source.count:
+        return times[source.first : source.first + source.count]
+    raise ValueError(f"{file} has {len(times)} times, but {source.path} has {source.count} frames")
+
+
+def _uneven(source) -> Sequence[float] | None:
+    """The times that a video says its frames were taken at, where they are not evenly spaced."""
+    stamps = source.stamps()
+    if stamps is None:
+        return None
+    gaps = [after - before for before, after in pairwise(stamps)]
+    usual = median(gaps)
+    off = sum(abs(gap - usual) > _UNEVEN * usual for gap in gaps)
+    if off:
+        warnings.warn(
+            f"{source.path}: {off} of {len(gaps)} frames come earlier or later than {usual:.3g} s after the one before "
+            f"(at most {max(gaps):.3g} s); the times in the file are used. Pass --fps to take them as even.",
+            stacklevel=2,
+        )
+    return stamps if off or source.fps is None else None
+
+
+def _counted(source):
+    with progress_bar("odometry", source.count, unit=" frames") as bar:
+        for frame in source:
+            yield frame
+            bar.update()
+
+
+main = Command(
+    "odometry",
+    "The path of a car, with its uncertainty, from the images of one camera whose calibration and height are known.",
+    "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive",
+    _arguments,
+    _run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

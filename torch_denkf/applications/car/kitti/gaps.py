@@ -1,0 +1,85 @@
+"""Gaps in a drive: where frames are missing, a frame can be compared with the last one that is there."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torch_denkf._checks import check_count
+from torch_denkf.applications.car.kitti.clock import GAP
+
+__all__ = ["bridge_gaps", "steps_between"]
+
+
+def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
+    """Pairs each frame with the last one before it that is there, so that a gap hides no motion.
+
+    Without it a missing frame blinds two pairs of neighbours. What comes after,
+    :func:`torch_denkf.applications.car.kitti.frames.frames_at`, :func:`torch_denkf.applications.car.with_motion` and
+    :class:`torch_denkf.applications.car.KITTIReplayEnv`, then takes differences and optical flow over those pairs; a
+    filter that knows what they mean has a :class:`torch_denkf.applications.car.PairObservation`.
+
+    Args:
+        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.
+        longest: steps between the frames of a pair, at most; 1 pairs neighbours only.
+
+    Returns:
+        A shallow copy of the drive with ``"steps"`` ``[N, 1]``, int64: how many steps before this frame its pair
+        begins; 0 where the frame is missing, or none is there before it within reach.
+
+    Raises:
+        TypeError: if ``longest`` is no whole number.
+        ValueError: if it is not positive.
+
+    No pair reaches over a gap in the drive's times, which shows in its ``"dt"``.
+
+    Examples:
+        >>> drive = TensorDict({"frame_valid": torch.tensor([1, 1, 0, 0, 1, 1, 0, 0, 0, 1]).bool().unsqueeze(-1)}, [10])
+        >>> bridge_gaps(drive)["steps"].flatten().tolist()
+        [0, 1, 0, 0, 3, 1, 0, 0, 0, 0]
+    """
+    check_count("longest", longest, cure="It counts the steps between the frames of a pair")
+    steps = steps_between(drive["frame_valid"].squeeze(-1), longest)
+    after = after_gap(drive)
+    if after is not None:
+        begun = after.cumsum(0)  # the stretch of each row; a pair lies in one
+        row = torch.arange(len(begun), device=begun.device)
+        steps = torch.where(begun[row - steps] == begun, steps, 0)
+    return drive.copy().set("steps", steps.unsqueeze(-1))
+
+
+def after_gap(drive: TensorDictBase) -> Tensor | None:
+    """Rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    dt = drive.get("dt", None)
+    if dt is None or not dt.numel():
+        return None
+    after = (dt > GAP * dt.median()).squeeze(-1)
+    return after if bool(after.any()) else None
+
+
+def steps_between(valid: Tensor, longest: int) -> Tensor:
+    """Steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
+
+    Args:
+        valid: whether a frame is there, bool ``[*B, N]``, time last.
+        longest: as in :func:`bridge_gaps`.
+    """
+    row = torch.arange(valid.shape[-1], device=valid.device)
+    never = -longest - 1
+    last = torch.where(valid, row, never).cummax(-1).values  # the last frame that is there, this one included
+    steps = row - torch.cat([torch.full_like(last[..., :1], never), last[..., :-1]], -1)
+    return torch.where(valid & (steps <= longest), steps, 0)
+
+
+def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
+    """How many steps before each frame its pair begins, ``[*B, 1]``; 0 for none.
+
+    Without :func:`bridge_gaps` a pair is of neighbours.
+    """
+    if "steps" in drive:
+        return drive["steps"][index]
+    before = drive["frame_valid"][(index - 1).clamp_min(0)]
+    pairs = drive["frame_valid"][index] & before & (index > 0).unsqueeze(-1)
+    after = after_gap(drive)
+    return (pairs if after is None else pairs & ~after[index].unsqueeze(-1)).long()

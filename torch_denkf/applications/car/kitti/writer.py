@@ -1,0 +1,237 @@
+"""Writes rendered drives: in stretches, in several processes, and so that a drive that is there is complete."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import shutil
+import time
+import uuid
+import zlib
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from torch_denkf._files import clear_errors, sync
+from torch_denkf._lock import remove_locked, take_lock
+from torch_denkf._workers import follow_parent
+from torch_denkf.applications.car.kitti.files import write_poses
+from torch_denkf.applications.car.street.camera import Camera
+from torch_denkf.applications.car.street.renderer import Renderer
+from torch_denkf.applications.car.street.roadside import roadside_scene
+from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
+
+FORMAT = 3  # raise it when drives of the same options come out differently
+MARKER = "drive.json"
+STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
+REPORTED = 40  # frames after which the only process says how far it is
+GRAIN = 1.5  # grey values: standard deviation of the images' noise
+LOCK = ".writing"  # in a half drive: its process holds the lock
+ABANDONED = 600.0  # s without a new image, after which a half drive without a lock is a killed run's
+
+
+@dataclass
+class Job:
+    """One drive to write.
+
+    Attributes:
+        root: folder that gets ``sequences`` and ``poses``.
+        name: of the drive.
+        poses: camera-to-world matrices, ``[N, 3, 4]``.
+        camera: what it is seen with.
+        folder: of the images; ``image_0`` and ``image_1`` are grey.
+        traffic: whether cars move.
+        options: what the drive follows from, for its marker; ``seed`` is one of them.
+        beside: the folder it is written to before it is complete.
+    """
+
+    root: Path
+    name: str
+    poses: np.ndarray
+    camera: Camera
+    folder: str
+    traffic: bool
+    options: dict
+    beside: Path = field(init=False)
+
+    def __post_init__(self):
+        self.beside = self.root / f".{self.name}-{uuid.uuid4().hex[:8]}"
+
+    @property
+    def target(self) -> Path:
+        """Where the drive will be."""
+        return self.root / "sequences" / self.name
+
+    def is_there(self, overwrite: bool) -> bool:
+        """Whether the drive is there already.
+
+        Raises:
+            FileExistsError: if another one is, which may not be replaced.
+        """
+        if not self.target.exists():
+            return False
+        marker = self.target / MARKER
+        ours = json.loads(marker.read_text()) if marker.is_file() else None
+        if ours == self.options:
+            return True
+        if ours is None or not overwrite:
+            if ours is None:
+                raise FileExistsError(f"{self.target} is there and was not rendered; choose another name or folder")
+            other = ", ".join(f"{key} {ours.get(key)!r}" for key in self.options if ours.get(key) != self.options[key])
+            raise FileExistsError(
+                f"{self.target} is there and was rendered with other options ({other}); choose another name, or "
+                "overwrite=True (--overwrite) to replace it"
+            )
+        return False
+
+    def renderer(self) -> Renderer:
+        """The drive's scene, from its name and seed."""
+        rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 1])
+        ground = self.poses[:, 1, 3] + self.camera.height
+        scene = roadside_scene(poses_to_state(self.poses, KITTI_DT), rng, ground=ground, traffic_on=self.traffic)
+        return Renderer(scene, self.camera)
+
+    def draw(self, renderer: Renderer, start: int, stop: int) -> None:
+        """Write the images of frames ``start`` to ``stop``."""
+        folder = self.beside / self.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        grey = self.folder in ("image_0", "image_1")
+        for number in range(start, stop):
+            picture = renderer.render(self.poses[number], number)
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if grey else picture
+            rng = np.random.default_rng([self.options["seed"], zlib.crc32(self.name.encode()), 2, number])
+            grain = rng.standard_normal(picture.shape, dtype=np.float32) * np.float32(GRAIN)
+            picture = np.clip(picture + grain + np.float32(0.5), 0, 255).astype(np.uint8)
+            file = folder / f"{number:06d}.png"
+            _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            with clear_errors(self.target / self.folder / file.name, beside=self.beside):
+                file.write_bytes(data.tobytes())
+
+    def finish(self) -> None:
+        """Write the text files and rename: a drive that is there is complete.
+
+        After a power failure an image may be missing all the same: its reader says so. To wait for thousands of
+        images to be on the disk would take as long as to draw them.
+        """
+        with clear_errors(self.target, beside=self.beside):
+            self._finish()
+
+    def _finish(self) -> None:
+        camera, beside = self.camera, self.beside
+        row = f"{camera.fx:.9e} 0 {camera.cx:.9e} 0 0 {camera.fy:.9e} {camera.cy:.9e} 0 0 0 1 0"
+        (beside / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
+        (beside / "times.txt").write_text("".join(f"{KITTI_DT * k:.6e}\n" for k in range(len(self.poses))))
+        (beside / MARKER).write_text(json.dumps(self.options))
+        for name in ("calib.txt", "times.txt", MARKER):
+            sync(beside / name)
+        write_poses(self.root / "poses" / f"{self.name}.txt", self.poses)
+        if self.target.exists():
+            shutil.rmtree(self.target)
+        beside.rename(self.target)
+        (self.target / LOCK).unlink(missing_ok=True)
+        sync(self.target.parent)
+
+
+def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None = None) -> None:
+    """Draw and write drives; what comes out does not depend on the number of processes.
+
+    Args:
+        jobs: the drives, all of one root.
+        processes: how many draw at a time; 1 draws in this process.
+        progress: called with the number of images that were written since the last call.
+
+    Raises:
+        OSError: if the folder cannot be written to.
+    """
+    if not jobs:
+        return
+    root, held = jobs[0].root, []
+    try:
+        for folder in (root / "sequences", root / "poses"):
+            folder.mkdir(parents=True, exist_ok=True)
+        for job in jobs:
+            _sweep(root, job.name)
+            job.beside.mkdir()
+            with contextlib.suppress(OSError):  # a file system without locks
+                held.append(take_lock(job.beside / LOCK))
+    except OSError as error:
+        raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
+    stretch = min(STRETCH, REPORTED) if processes == 1 else STRETCH
+    tasks = [
+        (job, start, min(start + stretch, len(job.poses)))
+        for job in jobs
+        for start in range(0, len(job.poses), stretch)
+    ]
+    missing = {job.name: len(job.poses) for job in jobs}
+
+    def done(job: Job, start: int, stop: int) -> None:
+        missing[job.name] -= stop - start
+        if not missing[job.name]:
+            job.finish()
+        if progress is not None:
+            progress(stop - start)
+
+    try:
+        if processes == 1:
+            for task in tasks:
+                _draw(*task)
+                done(*task)
+            return
+        # Not forked: a fork of a process with threads (PyTorch's, OpenCV's) can hang.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(processes, len(tasks)), context, initializer=_start_worker) as pool:
+            waiting = {pool.submit(_draw, *task): task for task in tasks}
+            try:
+                for future in as_completed(waiting):
+                    future.result()
+                    done(*waiting[future])
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    finally:
+        _last.clear()
+        for job in jobs:
+            remove_locked(job.beside, LOCK)
+        for lock in held:
+            if lock is not None:
+                os.close(lock)
+
+
+_last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
+
+
+def _start_worker() -> None:
+    cv2.setNumThreads(1)
+    follow_parent()
+
+
+def _draw(job: Job, start: int, stop: int) -> None:
+    if job.beside not in _last:
+        _last.clear()
+        _last[job.beside] = job.renderer()
+    job.draw(_last[job.beside], start, stop)
+
+
+def _sweep(root: Path, name: str) -> None:
+    """Remove what killed runs left of a drive."""
+    for folder in root.glob(f".{name}-????????"):
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # an empty one: its process was killed at the first or at the last moment
+            continue
+        lock = folder / LOCK
+        if lock.exists():
+            with contextlib.suppress(OSError):
+                held = take_lock(lock, create=False)
+                if held is not None:  # its process is gone
+                    remove_locked(folder, LOCK)
+                    os.close(held)
+            continue
+        newest = max(path.stat().st_mtime for path in (folder, *folder.glob("image_?")))
+        if time.time() - newest > ABANDONED:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Errors of planar paths, as the KITTI benchmark and its users measure them."""

@@ -1,0 +1,109 @@
+"""The error of KITTI's leaderboard: drift per metre over 100 to 800 metres of the road."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_denkf.applications.car.metrics._paths import check_paths, relative_pose_error, step_lengths
+
+__all__ = ["DevkitError", "kitti_devkit_error"]
+
+
+class DevkitError(NamedTuple):
+    """What :func:`kitti_devkit_error` returns; ``*B`` are the batch dims of the paths, L the number of lengths.
+
+    Attributes:
+        translation: t_rel, mean over all segments of all lengths, in %, ``[*B]``.
+        rotation: r_rel, likewise, in deg/m, ``[*B]``.
+        length_translation: mean over the segments of each length, in %, ``[*B, L]``; NaN where none fits.
+        length_rotation: likewise, in deg/m, ``[*B, L]``.
+        segments: how many segments of each length there are, ``[*B, L]``, int64.
+    """
+
+    translation: Tensor
+    rotation: Tensor
+    length_translation: Tensor
+    length_rotation: Tensor
+    segments: Tensor
+
+
+def kitti_devkit_error(
+    estimated: Tensor,
+    truth: Tensor,
+    *,
+    lengths: Sequence[float] = (100, 200, 300, 400, 500, 600, 700, 800),
+    step: int = 10,
+) -> DevkitError:
+    """Relative pose error of all segments of 100, 200, ..., 800 **metres**, for each metre.
+
+    As KITTI's development kit does: a segment begins at every tenth frame and ends with the first frame that lies more
+    than its length further along the true path; the estimate is laid on the truth at its start; its error is divided by
+    the nominal length. The mean is over segments, so long drives and short lengths have more weight. Unlike the
+    development kit's it is planar: it leaves out height, roll and pitch, and is a little smaller than the
+    leaderboard's figure for the same filter.
+
+    Args:
+        estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``.
+        truth: the true poses, of the same shape.
+        lengths: of the segments, in m; where the path is too short, those that fit count.
+        step: frames between the starts of segments.
+
+    Returns:
+        A :class:`DevkitError`.
+
+    Raises:
+        ValueError: if the shapes are not ``[*B, T, 3]`` or differ, if a length or ``step`` is not positive, or if no
+            segment of any length fits in a path.
+
+    Source:
+        Geiger, Lenz & Urtasun 2012, CVPR; the odometry development kit, ``evaluate_odometry.cpp``.
+
+    Examples:
+        A tenth too fast on a straight line; each segment of 100 steps more than 100 m has one step more.
+
+        >>> x = torch.arange(151.0)
+        >>> truth = torch.stack([x, 0 * x, 0 * x], -1)
+        >>> error = kitti_devkit_error(truth * 1.1, truth)
+        >>> round(error.translation.item(), 3), error.segments.tolist()
+        (10.1, [5, 0, 0, 0, 0, 0, 0, 0])
+    """
+    check_paths(estimated, truth)
+    if step < 1 or not lengths or min(lengths) <= 0:
+        raise ValueError(f"step and lengths must be positive, got step={step} and lengths={list(lengths)}")
+    rows = truth.shape[-2]
+    # Sums over thousands of steps: float32 would move the ends of segments.
+    travelled = torch.nn.functional.pad(step_lengths(truth.double()).cumsum(-1), (1, 0))
+    first = torch.arange(0, rows, step, device=truth.device)
+    metres = torch.tensor(lengths, dtype=travelled.dtype, device=truth.device)
+    target = travelled[..., first, None] + metres  # [*B, F, L]
+    last = torch.searchsorted(travelled, target.flatten(-2), right=True).reshape(target.shape)
+    fits = last < rows
+    segments = fits.sum(-2)
+    if bool((segments.sum(-1) == 0).any()):
+        shortest = travelled[..., -1].min().item()
+        raise ValueError(
+            f"a path has no segment of {list(lengths)} m; the shortest path is {shortest:.1f} m long; "
+            "leave such paths out, or pass smaller lengths"
+        )
+    start, start_true = (path[..., first, None, :].expand(*last.shape, 3) for path in (estimated, truth))
+    end, end_true = (_rows(path, last.clamp_max(rows - 1)) for path in (estimated, truth))
+    distance, angle = relative_pose_error(start, end, start_true, end_true)
+    nominal = torch.where(fits, metres, torch.nan).to(distance.dtype)
+    translation, rotation = 100 * distance / nominal, torch.rad2deg(angle) / nominal
+    return DevkitError(
+        translation.flatten(-2).nanmean(-1),
+        rotation.flatten(-2).nanmean(-1),
+        translation.nanmean(-2),
+        rotation.nanmean(-2),
+        segments,
+    )
+
+
+def _rows(path: Tensor, index: Tensor) -> Tensor:
+    """Rows ``[*B, F, L]`` of a path ``[*B, T, 3]``, each path its own."""
+    flat = index.flatten(-2).unsqueeze(-1).expand(*index.shape[:-2], -1, 3)
+    return path.gather(-2, flat).reshape(*index.shape, 3)

@@ -1,0 +1,225 @@
+r"""Readings that span several steps: where frames are missing, a sensor can compare a frame with the last that arrived.
+
+What it reads then is the way over the whole gap. A filter that is to learn from it must remember its own velocities of
+the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either beside the state (:func:`with_history`,
+for :class:`torch_denkf.applications.car.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for
+filters whose covariance or weights carry the pose along).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf._checks import check_count, check_values
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
+from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._tensors import register_constant
+from torch_denkf.modules.carried import Beside
+
+__all__ = ["ClonedPrior", "ClonedTransition", "PairObservation", "with_history"]
+
+
+def with_history(
+    initial: TensorDictModuleBase,
+    lags: int,
+    *,
+    ensemble_key: NestedKey = ("belief", "ensemble"),
+    history_key: NestedKey = ("belief", "history"),
+) -> Beside:
+    """An initial belief with a past: each member has had its present velocities all along.
+
+    Args:
+        initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
+        lags: past steps to carry, L: one less than the longest span of a reading.
+        ensemble_key: what ``initial`` writes.
+        history_key: velocities (v m/s, theta_dot rad/s) of the last L steps, the latest first, ``[*B, E, L, 2]``.
+
+    Raises:
+        ValueError: if ``lags`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import AroundState
+        >>> start = with_history(AroundState([0.0, 0.0, 0.0, 0.3, 0.02], ensemble_size=8), lags=2)
+        >>> start(TensorDict({"state": torch.zeros(5)}))["belief", "history"].shape
+        torch.Size([8, 2, 2])
+    """
+    check_count("lags", lags)
+    return Beside(initial, [history_key], partial(_same_velocities, unravel_key(ensemble_key), lags), nested=True)
+
+
+def _same_velocities(ensemble_key: NestedKey, lags: int, belief: Entries, _: torch.Size) -> list[torch.Tensor]:
+    return [belief[ensemble_key][..., 3:].unsqueeze(-2).repeat_interleave(lags, -2)]
+
+
+class PairObservation(SubModel):
+    r"""What a sensor reads from a pair of frames that are n steps apart: the velocities of all n, added up.
+
+    .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
+
+    Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
+    between them. The members carry their velocities of the past steps, and the analysis corrects those, too
+    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap anew. Use with
+    ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
+    belief_prefix="analysis")`` and an initial belief :func:`with_history`.
+
+    Args:
+        reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
+            of zero: where the forecast's mean says more over a gap, the frame counts as not observed.
+        curve: h, what the sensor reads at a true sum ``[*, 2]``, for one that hedges; by default the sum itself.
+        in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
+        history_key: see :func:`with_history`; ``None`` where the past is part of the state, see
+            :class:`ClonedTransition`.
+        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
+            the key is not there. :func:`torch_denkf.applications.car.bridge_gaps` counts them.
+        observed_key: optional mask ``[*B, 1]``.
+        out_key: predicted observations ``[*B, E, 2]``.
+        clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
+        out_observed_key: the mask of what can be read, ``[*B, 1]``.
+
+    Source:
+        Roumeliotis & Burdick 2002, "Stochastic cloning: a generalized framework for processing relative state
+        measurements"; here by an ensemble.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> forecast, history = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.1]]), torch.tensor([[[9.0, 0.2]]])
+        >>> td = TensorDict({"forecast": {"ensemble": forecast}, "belief": {"history": history}, "steps": [2]})
+        >>> PairObservation()(td)["forecast", "observation"]
+        tensor([[19.0000,  0.3000]])
+    """
+
+    def __init__(
+        self,
+        reach: Sequence[float] | torch.Tensor | None = None,
+        *,
+        curve: nn.Module | None = None,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        history_key: NestedKey | None = ("belief", "history"),
+        steps_key: NestedKey = "steps",
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = ("forecast", "observation"),
+        clone_key: NestedKey = ("forecast", "clone"),
+        out_observed_key: NestedKey = ("forecast", "observed"),
+    ):
+        out_keys = [out_key, clone_key, out_observed_key]
+        in_keys = [in_key] if history_key is None else [in_key, history_key]
+        super().__init__(
+            nn.Identity() if curve is None else curve, in_keys, out_keys, optional_keys=[steps_key, observed_key]
+        )
+        reach = [torch.inf, torch.inf] if reach is None else reach
+        register_constant(self, "reach", reach)
+        check_values("reach", self.reach, above=0, infinite=True)
+        self.observation_dim, self.observed_key = 2, unravel_key(observed_key)
+
+    def compute(self, forecast, *rest):
+        """The predicted observations, the ensemble that the analysis is to update, and the mask."""
+        *history, steps, observed = rest
+        history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
+        past = within_pair(steps, history)
+        way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
+        # Neighbours are always read: a filter that believes itself too fast would otherwise stay blind.
+        within_reach = (way.mean(-2).abs() <= self.reach).all(-1, keepdim=True)
+        readable = within_reach | ~past.flatten(-2).any(-1)
+        for value in (steps, observed):
+            if value is not None:
+                readable = readable & (value > 0)
+        return self.module(way), torch.cat([forecast[..., :5], history.flatten(-2)], -1), readable
+
+
+class ClonedPrior(SubModel):
+    """An initial belief whose state also holds the velocities of past steps, all equal to the present ones.
+
+    Args:
+        initial: writes an ensemble ``[*B, E, 5]``, or a mean ``[*B, 5]`` and a covariance ``[*B, 5, 5]``, of
+            [x, y, theta, v, theta_dot].
+        lags: past steps to carry, L: one less than the longest span of a reading.
+
+    Raises:
+        ValueError: if ``lags`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import AroundState
+        >>> start = ClonedPrior(AroundState([0.0, 0.0, 0.0, 0.3, 0.02], ensemble_size=8), lags=2)
+        >>> start(TensorDict({"state": torch.zeros(5)}))["belief", "ensemble"].shape
+        torch.Size([8, 9])
+    """
+
+    def __init__(self, initial: TensorDictModuleBase, lags: int):
+        check_module("initial", initial)
+        check_count("lags", lags)
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, initial.out_keys, optional_keys=optional)
+        self.input_dim, self.state_dim = 5, 5 + 2 * lags
+        if getattr(initial, "ensemble_size", None) is not None:
+            self.ensemble_size = initial.ensemble_size
+        eye = torch.eye(5, dtype=torch.get_default_dtype())
+        self.register_buffer("copies", torch.cat([eye, *[eye[3:]] * lags]))
+
+    def parts(self):
+        """The initial belief."""
+        return {"initial": self.module}
+
+    def on_entries(self, entries, call):
+        """The belief."""
+        written = run_module(self.module, entries, call.part("initial"))
+        for key, value in written.items():
+            name, copies = key[-1] if isinstance(key, tuple) else key, self.copies.to(value.dtype)
+            if name == "cov":
+                written[key] = copies @ value @ copies.mT
+            elif value.shape[-1] == 5:  # ensemble, mean, variances; weights have no state dimension
+                written[key] = value @ copies.mT
+        return written
+
+
+class ClonedTransition(SubModel):
+    """A transition whose state also holds the velocities of past steps, the latest first: they move on by one.
+
+    Args:
+        transition: forecasts ensembles ``[*B, E, 5]``, see :class:`torch_denkf.applications.car.UnicycleTransition`;
+            its keys are kept.
+        history_key: where ``transition`` reads the velocities of the past steps, if it does, the present ones first.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.applications.car.modules.unicycle import UnicycleTransition
+        >>> cloned = ClonedTransition(UnicycleTransition(torch.zeros_like, dt=0.1))
+        >>> state = torch.tensor([[0.0, 0.0, 0.0, 10.0, 0.0, 9.0, 0.0, 8.0, 0.0]])
+        >>> cloned(TensorDict({("belief", "ensemble"): state}))["forecast", "ensemble"].tolist()
+        [[1.0, 0.0, 0.0, 10.0, 0.0, 10.0, 0.0, 9.0, 0.0]]
+    """
+
+    def __init__(self, transition: SubModel, *, history_key: NestedKey = ("belief", "history")):
+        check_module("transition", transition)
+        self_made = unravel_key(history_key)
+        needed, optional = reads(transition)
+        in_keys = [key for key in needed if key != self_made]
+        super().__init__(transition, in_keys, transition.out_keys, optional_keys=optional)
+        self.history_key = self_made
+
+    def parts(self):
+        """The transition."""
+        return {"transition": self.module}
+
+    def on_entries(self, entries, call):
+        """The forecast ensemble."""
+        key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        state = self.required(entries, key)
+        work = {**entries, key: state[..., :5], self.history_key: state[..., 3:].unflatten(-1, (-1, 2))}
+        written = run_module(self.module, work, call.part("transition"))
+        return {**written, out_key: torch.cat([written[out_key], state[..., 3:-2]], -1)}
+
+
+def within_pair(steps: torch.Tensor | None, history: torch.Tensor) -> torch.Tensor:
+    """Which past steps lie between the two frames of a pair: ``[*B, 1, L, 1]``."""
+    lags = torch.arange(1, history.shape[-2] + 1, device=history.device)
+    steps = torch.ones(1, dtype=torch.int64, device=history.device) if steps is None else steps
+    return (lags < steps)[..., None, :, None]

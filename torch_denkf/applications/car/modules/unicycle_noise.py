@@ -1,0 +1,62 @@
+"""Noise of a vehicle's velocities, which moves its pose in the same step."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch.nn import functional as F
+
+from torch_denkf.applications.car.modules.unicycle import check_dt, keys_of_dt
+from torch_denkf.applications.car.unicycle import unicycle_jacobians
+from torch_denkf.modules.process_noise import NoiseThrough
+
+__all__ = ["UnicycleNoise"]
+
+
+class UnicycleNoise(NoiseThrough):
+    r"""Noise of the velocities of a vehicle, which moves its pose in the same step.
+
+    :class:`~torch_denkf.applications.car.UnicycleTransition` moves the pose with the *new* velocities, and an
+    ensemble's noise is in those. A covariance that is added to the velocities *after* the motion would leave the pose
+    of that step uncorrelated with them, and an innovation of the velocities would not correct it. Here :math:`Q = G Q_v
+    G^T` with :math:`G = \partial (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
+
+    Args:
+        noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and
+            (rad/s)^2; its keys are kept. In a filter it may read ``("belief", "mean")``.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``, as of the transition.
+        mean_key: mean at t-1, ``[*B, S]``, starting with [x, y, theta, v, theta_dot]; further dimensions, such as
+            clones, get no noise.
+        forecast_mean_key: mean of the forecast, ``[*B, S]``; the filter puts it there.
+
+    Raises:
+        ValueError: if the noise does not have two dimensions.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> noise = UnicycleNoise(CholeskyNoise(2, r=[0.5, 0.1], in_features=5), dt=0.1)
+        >>> mean = torch.tensor([0.0, 0.0, 0.0, 10.0, 0.0])
+        >>> td = TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}})
+        >>> noise(td)["forecast", "noise"][0, 3]  # covariance of x and v: dt times the variance of v
+        tensor(0.0250, grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        noise: TensorDictModuleBase,
+        dt: float | NestedKey,
+        *,
+        mean_key: NestedKey = ("belief", "mean"),
+        forecast_mean_key: NestedKey = ("forecast", "mean"),
+    ):
+        check_dt(dt)
+        super().__init__(noise, [mean_key, forecast_mean_key, *keys_of_dt(dt)])
+        self.mean_key, self.forecast_mean_key, self.dt = unravel_key(mean_key), unravel_key(forecast_mean_key), dt
+
+    def _matrix(self, entries):
+        before, forecast = self.required(entries, self.mean_key), self.required(entries, self.forecast_mean_key)
+        dt = self.required(entries, self.dt) if keys_of_dt(self.dt) else self.dt
+        _, moved = unicycle_jacobians(before[..., :3], forecast[..., 3:5], dt)
+        own = torch.eye(2, dtype=moved.dtype, device=moved.device).expand(*moved.shape[:-2], 2, 2)
+        return F.pad(torch.cat([moved, own], -2), (0, 0, 0, forecast.shape[-1] - 5))

@@ -1,0 +1,66 @@
+"""The street behind what hides it: pictures and flow, continued from around a hole."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+
+from torch_denkf.applications.car.vision.camera import CanonicalCamera
+from torch_denkf.applications.car.vision.expansion import focus_of_expansion
+from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE
+
+__all__ = ["continue_flow", "continue_picture"]
+
+_RIM = 8  # pixels around what is hidden, whose flow it spoils
+_PICTURE_RIM = 2  # pixels whose grey values are mixed with those of what hides them
+_NEAR = 0.02  # rad around the focus: the flow along a ray says nothing of the distance there
+_NEAREST = 2.0  # of the flow along a ray over the distance from the focus: nothing comes nearer in one step
+_REACH = 3  # pixels that the continuation looks at
+
+
+def continue_picture(image: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """A canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
+    return cv2.inpaint(image, grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
+
+
+def continue_flow(
+    flow: np.ndarray, coarse: np.ndarray, hidden: np.ndarray, camera: CanonicalCamera
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Optical flow behind what hides the street, as its surroundings and the camera's motion say.
+
+    The flow of a point p is that of the turn, plus :math:`\rho(p) (p - e)` with the focus of expansion e and an inverse
+    distance :math:`\rho`. Turn and focus are fitted to what is seen. The inverse distance is continued from around the
+    hole; near the focus, where flow is small, this is exact whatever it is.
+
+    Args:
+        flow: as :func:`torch_denkf.applications.car.vision.flow.dense_flow` gives it, ``[H, W, 2]``.
+        coarse: the same with its mismatch, see :func:`torch_denkf.applications.car.vision.flow.coarse_flow`:
+            ``FLOW_SHAPE``.
+        hidden: where the street is hidden, ``[H, W]``, bool.
+        camera: canonical, of the pictures.
+
+    Returns:
+        The flow ``[H, W, 2]``, and the coarse flow's mismatch, continued likewise, ``[25, 79]``.
+    """
+    hole = grown(hidden, _RIM)
+    _, height, width = FLOW_SHAPE
+    cells = (cv2.resize(hole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
+    seen = coarse.copy()
+    seen[2][cells > 0] = 1  # a mismatch of 1 takes a cell out of the fit
+    fit = focus_of_expansion(torch.from_numpy(seen).unsqueeze(0))
+    left, up, around = fit.turn[0].numpy()
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    x, y = ((value - (side - 1) / 2) / camera.focal for value, side in ((columns, camera.width), (rows, camera.height)))
+    turned = np.dstack([left * (1 + x * x) + up * x * y - around * y, left * x * y + up * (1 + y * y) + around * x])
+    ray = np.dstack([x, y]) - fit.focus[0].numpy()
+    square = np.maximum((ray**2).sum(-1), _NEAR**2)
+    nearness = ((ray * (flow - turned)).sum(-1) / square).clip(0, _NEAREST).astype(np.float32)
+    nearness = cv2.inpaint(nearness, hole, _REACH, cv2.INPAINT_NS)
+    whole = np.where(hole[..., None] > 0, turned + nearness[..., None] * ray, flow).astype(np.float32)
+    return whole, cv2.inpaint(np.ascontiguousarray(coarse[2]), cells, _REACH, cv2.INPAINT_NS)
+
+
+def grown(hidden: np.ndarray, rim: int) -> np.ndarray:
+    """What is hidden ``[H, W]``, bool, with a rim of so many pixels, as uint8."""
+    return cv2.dilate(hidden.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8))

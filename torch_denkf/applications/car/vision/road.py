@@ -1,0 +1,93 @@
+"""How far the road moved: two images, laid flat on the ground, correlated along the direction of travel.
+
+Dense optical flow shrinks on the near road, where motion is large and texture is poor; yet there the ground plane ties
+pixels to metres. Each image is projected on the plane under the car, for several pitches of the camera, and the older
+one is slid forwards under the newer. The pitch and the distance at which both agree best give the motion, with no
+learned part; normalised correlation drops brightness and contrast. A network reads the whole table of correlations.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT, CanonicalCamera
+from torch_denkf.applications.car.vision.shapes import CELL, ROAD_PITCHES, ROAD_SHAPE, ROAD_SHIFTS
+
+__all__ = ["road_correlation"]
+
+_LENGTH, _HALF_WIDTH, _LANES = 7.0, 3.0, 32  # m, m, columns: the stretch of road that is compared
+_NEAREST = 4.0  # m: nearer, a cell is many pixels
+
+
+def road_correlation(
+    previous: np.ndarray,
+    current: np.ndarray,
+    camera: CanonicalCamera,
+    turn: tuple[float, float],
+    height: float = KITTI_HEIGHT,
+) -> np.ndarray:
+    """Correlation of the road in two images, for each pitch and each distance travelled.
+
+    Args:
+        previous: canonical image ``[H, W]``, uint8.
+        current: canonical image ``[H, W]``, uint8.
+        camera: of both.
+        turn: how far the camera turned to the left and up between them, in rad; see
+            :func:`torch_denkf.applications.car.vision.flow.median_turn`.
+        height: of the camera over the road, in m.
+
+    Returns:
+        ``ROAD_SHAPE`` = (pitches, distances), float32 in [-1, 1].
+    """
+    previous, current = (cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in (previous, current))
+    left, up = turn
+    first, count = round(ROAD_SHIFTS[0] / CELL), len(ROAD_SHIFTS)
+    table = np.empty(ROAD_SHAPE, np.float32)
+    for row, pitch in enumerate(ROAD_PITCHES):
+        nearest = _nearest(camera, float(pitch), height) - ROAD_SHIFTS[0]
+        cells = round(_LENGTH / CELL)
+        ahead = nearest + np.arange(cells) * CELL
+        # Both views are turned half way, so that the motion between them is straight ahead.
+        now = _plan(current, camera, pitch, height, ahead, -left / 2, 0.0)
+        before = nearest + (first + np.arange(cells + count - 1)) * CELL
+        then = _plan(previous, camera, pitch, height, before, left / 2, up)
+        table[row] = _slide(now, then, (1 / ahead).astype(np.float32))
+    return table
+
+
+@lru_cache(maxsize=256)
+def _nearest(camera: CanonicalCamera, pitch: float, height: float) -> float:
+    """Where the road enters the image, in m ahead."""
+    bottom = (camera.height - 4) / 2 / camera.focal
+    return max(height / np.tan(np.arctan(bottom) - pitch), _NEAREST)
+
+
+def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
+    """The road seen from above, ``[len(ahead), lanes]``, by a camera turned by ``left`` and, a little, ``up``."""
+    lanes = np.linspace(-_HALF_WIDTH, _HALF_WIDTH, _LANES)
+    right = lanes * np.cos(left) - ahead[:, None] * np.sin(left)
+    forward = lanes * np.sin(left) + ahead[:, None] * np.cos(left)
+    depth = forward * np.cos(pitch) - height * np.sin(pitch)
+    down = height * np.cos(pitch) + forward * np.sin(pitch)
+    columns, rows = camera.pixels(right / depth, down / depth - up)
+    plan = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
+    # Shading that varies slowly would match at any distance.
+    return plan - cv2.GaussianBlur(plan, (0, 0), sigmaX=3.2, sigmaY=10)
+
+
+def _slide(now: np.ndarray, then: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted normalised correlation of ``now`` with every window of its length in ``then``."""
+    cells = len(now)
+    weight = weight / weight.sum() / now.shape[1]
+    now = now - (weight @ now).sum()
+    own = (weight @ now**2).sum()
+    windows = np.lib.stride_tricks.sliding_window_view(then, cells, axis=0)  # [shifts, lanes, cells]
+    product = np.tensordot(windows, (weight[:, None] * now).T, axes=2)
+    total, squares = then.sum(1), (then**2).sum(1)
+    mean = np.lib.stride_tricks.sliding_window_view(total, cells) @ weight
+    variance = np.lib.stride_tricks.sliding_window_view(squares, cells) @ weight - mean**2
+    # One hundredth of a squared grey level: images without any texture correlate to zero, not to noise.
+    return product / np.sqrt(own * np.maximum(variance, 0) + 1e-2)

@@ -1,0 +1,6 @@
+"""Everything that only dm_control's reacher with noisy encoders needs: environment and trained filter."""
+
+import lazy_loader
+
+# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+"""The UR5 table's commands of the terminal."""

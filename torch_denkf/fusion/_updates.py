@@ -1,0 +1,137 @@
+"""The modules behind the forecast of a filter of several sensors: weights, and an update each or one for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from tensordict import unravel_key
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
+from torch_denkf.fusion.sensor import FusedSensor, Wired
+from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
+from torch_denkf.smoothers.past import LaggedAnalysis
+
+__all__ = ["Updates"]
+
+
+class Updates:
+    """Makes the modules behind the forecast.
+
+    Args:
+        gaussian: whether the belief is a mean and a covariance.
+        lag: L.
+        size: S.
+        analysis: makes an update.
+    """
+
+    def __init__(self, gaussian: bool, lag: int, size: int, analysis: Callable[..., TensorDictModuleBase]):
+        self.gaussian, self.lag, self.size, self.analysis = gaussian, lag, size, analysis
+
+    def in_turn(self, prefix, last, sensors, wired):
+        """An update for each sensor."""
+        modules, names = {}, list(sensors)
+        for name, sensor in sensors.items():
+            to = last if name == names[-1] else f"after_{name}"
+            model = self._model(prefix, name, sensor, wired[name])
+            keys = {"reading": wired[name].reading, "noise": wired[name].noise, "observed": wired[name].observed}
+            if model.state_dim is not None:
+                keys["observed"] = model.out_keys[1]
+            modules.update(self._update(name, model, prefix, to, sensor.angles, sensor.analysis, **keys))
+            prefix = to
+        return modules
+
+    def joint(self, prefix, last, sensors, wired):
+        """One update for all sensors."""
+        own = [name for name, sensor in sensors.items() if sensor.analysis is not None]
+        if own:
+            raise ValueError(f"A joint update is one for all sensors, and {own} have an analysis of their own.")
+        models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
+        keys = {
+            "reading": ("sensor", "joint"),
+            "noise": ("sensor", "joint_noise"),
+            "observed": ("forecast", "observed"),
+        }
+        sizes = [_observation_dim(sensor) for sensor in sensors.values()]
+        join = JoinedReading(
+            [wired[name].reading for name in sensors],
+            [wired[name].noise for name in sensors],
+            [sensor.angles for sensor in sensors.values()],
+            observation_key=keys["reading"],
+            noise_key=keys["noise"],
+            observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
+        )
+        model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
+        angles = _joint_angles(sensors)
+        return {"readings": join, **self._update("analysis", model, prefix, last, angles, None, **keys)}
+
+    def weighted(self, prefix, sensors, wired, weights):
+        """The sensors' weights, and their noise after them."""
+        models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
+        modules = {
+            "weights": SensorWeights(
+                weights,
+                models,
+                {name: wired[name].reading for name in sensors},
+                {name: wired[name].noise for name in sensors},
+                {name: wired[name].features for name in sensors if wired[name].features is not None},
+                {name: sensor.angles for name, sensor in sensors.items()},
+                state_key=(prefix, "ensemble"),
+                moments=prefix if self.gaussian else None,
+            )
+        }
+        for name, sensor in sensors.items():
+            key, size = ("sensor", name, "weighted_noise"), _observation_dim(sensor)
+            modules[f"{name}_weighted"] = WeightedNoise(wired[name].noise, ("weight", name), key, observation_dim=size)
+            wired[name] = replace(wired[name], noise=key)
+        return modules
+
+    def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
+        ensemble = (prefix, "ensemble")
+        # Without a delay only the mask of a state with a past must be told apart; a past elsewhere is not looked at.
+        late = self.lag > 0 and (sensor.delay > 0 or sensor.late is not None or self.gaussian)
+        return StateObservation(
+            sensor.observation,
+            ensemble,
+            ("forecast", name, "observation"),
+            reading_keys=[wired.reading, wired.noise],
+            observed_key=wired.observed,
+            delay=sensor.delay,
+            late_key=sensor.late,
+            past_key=None if self.gaussian or not late else ("forecast", "past"),
+            state_dim=self.size if late else None,
+            # An update of a mean and a covariance runs the model inside, and reads the mask behind it.
+            seen_key=wired.observed if self.gaussian else ("forecast", name, "observed"),
+        )
+
+    def _update(self, name, model, prefix, to, angles, analysis, *, reading, noise, observed):
+        make = self.analysis if analysis is None else analysis
+        keys = {"noise_variance_key": noise, "observed_key": observed, "belief_prefix": to, "angles": list(angles)}
+        predicted = unravel_key(model.out_keys[0])
+        if self.gaussian:
+            keys |= {"observation_key": reading, "forecast_prefix": prefix}
+            return {name: make(model, ensemble_key=(prefix, "ensemble"), predicted_key=predicted, **keys)}
+        update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
+        return {f"{name}_observation": model, name: LaggedAnalysis(update) if self.lag else update}
+
+
+def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
+    """The angles among the readings side by side."""
+    found, begin = [], 0
+    for name, sensor in sensors.items():
+        if not any(other.angles for other in sensors.values()):
+            return []
+        size = _observation_dim(sensor)
+        if size is None:
+            raise ValueError(f"The size of {name!r}'s readings is not known, so angles cannot be found side by side.")
+        found += [begin + dim for dim in sensor.angles]
+        begin += size
+    return found
+
+
+def _observation_dim(sensor: FusedSensor) -> int | None:
+    noise = sensor.noise
+    if isinstance(noise, TensorDictModuleBase):
+        return getattr(noise, "observation_dim", getattr(noise, "dim", None))
+    return len(noise)

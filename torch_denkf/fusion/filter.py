@@ -1,0 +1,217 @@
+"""One filter of several sensors, each with its own rate, noise, mask and delay."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Unpack
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf._checks import check_count
+from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.base import Filter
+from torch_denkf.fusion._updates import Updates
+from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint
+from torch_denkf.fusion.sensor import FusedSensor, wire
+from torch_denkf.modules import (
+    EKFAnalysis,
+    EKFTransition,
+    EnsembleAnalysis,
+    LinearTransition,
+    NoisyTransition,
+    UKFAnalysis,
+    UKFTransition,
+    as_process_noise,
+)
+from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
+from torch_denkf.modules._running import check_module, writes
+from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
+from torch_denkf.smoothers.past_moments import CrossTransition
+
+__all__ = ["FusedFilter"]
+
+
+class FusedFilter(Filter):
+    """A filter of any number of sensors, each with its own rate, noise, mask and delay.
+
+    The belief follows from ``initial``: an ensemble, or a mean and a covariance (a Kalman, extended or unscented Kalman
+    filter). In each step the transition forecasts, and the readings that are there correct the forecast: one sensor
+    after the other, or all in one update. For linear Gaussian systems both give the same. The first takes less where
+    sensors are many, and lets each linearise at the belief that the sensors before it left.
+
+    Readings that come late need the last L states beside the belief, L the largest delay. An ensemble carries them as
+    :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
+    systems gives what readings in their order give. With process noise and few members, the sample covariances of an
+    ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
+    is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
+    belongs to the time before the episode is not observed.
+
+    An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
+    A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
+    are refused, and so they are with the lag of a mean and a covariance. :class:`Refiltering` and
+    :class:`~torch_denkf.smoothers.FixedLag` take them.
+
+    Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
+    ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
+
+    Args:
+        transition: forecasts an ensemble; or, for a mean and a covariance,
+            :class:`~torch_denkf.modules.LinearTransition`, :class:`~torch_denkf.modules.EKFTransition` or
+            :class:`~torch_denkf.modules.UKFTransition`, or a transition of ensembles, which becomes that of an extended
+            Kalman filter.
+        sensors: by name, in the order of their updates.
+        initial: the initial belief.
+        process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q.
+        joint: whether all readings make one update.
+        analysis: makes the update of each sensor, or of all. For an ensemble it gets keys as
+            :class:`~torch_denkf.modules.EnsembleAnalysis` takes them, ``partial(EnsembleAnalysis, "etkf")`` by default;
+            for a mean and a covariance an observation model in front of them, as
+            :class:`~torch_denkf.modules.EKFAnalysis`.
+        weights: a network that says how much each reading counts, :class:`~torch_denkf.fusion.SensorAttention`; the
+            weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
+        lag: L; by default the largest delay.
+        **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
+            ``check_finite`` and ``reject`` of :class:`Filter`.
+
+    Raises:
+        ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
+            twice, or an analysis inflates or relaxes where that is refused.
+        TypeError: for particles, sensors that are no dict, or an analysis that cannot correct earlier states.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import LinearTransition, MomentPrior, Select
+        >>> move, noise = torch.tensor([[1.0, 0.1], [0.0, 1.0]]), torch.diag(torch.tensor([0.0, 0.01]))
+        >>> cart = FusedFilter(
+        ...     LinearTransition(move, noise),
+        ...     {"wheel": FusedSensor(Select([1]), [0.3]), "gps": FusedSensor(Select([0]), [1.0], delay=3)},
+        ...     initial=MomentPrior(torch.zeros(2), torch.eye(2)),
+        ... )
+        >>> drive = TensorDict({"wheel": torch.ones(20, 1), "gps": torch.ones(20, 1)}, [20])
+        >>> drive["gps_observed"] = torch.arange(20).unsqueeze(-1) % 10 == 3  # a fix a second, 0.3 s late
+        >>> cart.sequence(drive)["info", "gps", "nis"].count_nonzero()
+        tensor(2)
+    """
+
+    def __init__(
+        self,
+        transition: TensorDictModuleBase,
+        sensors: Mapping[str, FusedSensor],
+        *,
+        initial: TensorDictModuleBase,
+        process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
+        joint: bool = False,
+        analysis: Callable[..., TensorDictModuleBase] | None = None,
+        weights: torch.nn.Module | None = None,
+        lag: int | None = None,
+        **kwargs: Unpack[FilterOptions],
+    ):
+        check_module("transition", transition)
+        check_module("initial", initial)
+        if not isinstance(sensors, Mapping) or not all(isinstance(one, FusedSensor) for one in sensors.values()):
+            raise TypeError(f"sensors is a dict, {{name: FusedSensor(...)}}; got {type(sensors).__name__}: {sensors}")
+        if not sensors:
+            raise ValueError("FusedFilter needs at least one sensor: sensors={name: FusedSensor(...)}.")
+        gaussian = _is_gaussian(initial)
+        lag = _lag_of(sensors, lag)
+        transition = _moving(transition, process_noise, initial, gaussian)
+        modules: OrderedDict[str, TensorDictModuleBase] = OrderedDict()
+        wired = {}
+        for name, sensor in sensors.items():
+            wired[name] = wire(name, sensor)
+            modules.update(wired[name].modules)
+        age = -1 if kwargs.get("update_at_reset") else 0
+        size = getattr(initial, "state_dim", 0)
+        if lag and not size:
+            raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
+        prefix = "forecast"
+        if gaussian and lag:
+            modules["transition"], modules["past"] = CrossTransition(transition), JointForecast()
+            initial, prefix = with_past(initial, lag, JOINT_PAST, age=age), "joint"
+        elif lag:
+            modules["transition"], modules["past"] = transition, EnsemblePast()
+            initial = with_past(initial, lag, ENSEMBLE_PAST, age=age)
+        else:
+            modules["transition"] = transition
+        build = Updates(gaussian, lag, size, _analysis_for(transition, gaussian) if analysis is None else analysis)
+        if weights is not None:
+            modules.update(build.weighted(prefix, sensors, wired, weights))
+        last = "fused" if gaussian and lag else "belief"
+        updates = (build.joint if joint else build.in_turn)(prefix, last, sensors, wired)
+        _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
+        modules.update(updates)
+        if lag:
+            modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief()
+        super().__init__(modules, initial=initial, **kwargs)
+        self.sensors, self.lag = tuple(sensors), lag
+
+
+def _is_gaussian(initial: TensorDictModuleBase) -> bool:
+    written = writes(initial)
+    if ("belief", "log_weight") in written:
+        raise TypeError("FusedFilter has no particles; give ParticleFilter one likelihood of all readings.")
+    return ("belief", "ensemble") not in written
+
+
+def _refuse_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
+    """Raises where an update would spread other states than the present one that is read."""
+    if late:
+        why = "belongs to the step at which a reading is taken, and with delay= others have been made since"
+        cure = "Leave delay= out and let Refiltering make them again"
+    elif joint_past:
+        why = "would spread the past anew with each reading: with lag= it is one Gaussian with the present"
+        cure = "Leave lag= out and put FixedLag(filter, lag) around the filter"
+    else:
+        return
+    for name, update in updates.items():
+        for part in update.modules():
+            inflates = isinstance(part, EnsembleUpdate | GaussianAnalysis) and part.inflation != 1
+            if inflates or (isinstance(part, EnsembleUpdate) and part.relaxation):
+                raise ValueError(
+                    f"The inflation or relaxation of {name!r} {why}. {cure}, or say by process_noise what the motion "
+                    "does not know."
+                )
+
+
+def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
+    """L: what is given, or the largest delay."""
+    for name, sensor in sensors.items():
+        check_count(f"delay of {name!r}", sensor.delay, least=0)
+        if sensor.late is not None and sensor.delay < 1:
+            raise ValueError(f"{name!r} has late={sensor.late!r}; say how late its readings can be: delay=...")
+    longest = max(sensor.delay for sensor in sensors.values())
+    if lag is not None and lag < longest:
+        raise ValueError(f"A reading comes up to {longest} steps late, beyond lag={lag}.")
+    return longest if lag is None else lag
+
+
+def _moving(transition, process_noise, initial, gaussian):
+    """The transition with its process noise."""
+    moments = isinstance(transition, LinearTransition | GaussianTransition)
+    if moments and not gaussian:
+        raise ValueError(
+            f"{type(transition).__name__} moves a mean and a covariance, and {type(initial).__name__} writes an "
+            "ensemble: use MomentPrior or GaussianAround, or a transition of ensembles."
+        )
+    if moments and process_noise is not None:
+        raise ValueError(f"{type(transition).__name__} has its process noise already; leave process_noise out.")
+    if moments:
+        return transition
+    if process_noise is None:
+        if gaussian:
+            raise ValueError("A mean and a covariance need process_noise=..., standard deviations [S] or a module.")
+        return transition
+    noise = as_process_noise(process_noise, initial)
+    return EKFTransition(transition, noise) if gaussian else NoisyTransition(transition, noise)
+
+
+def _analysis_for(transition: TensorDictModuleBase, gaussian: bool) -> Callable[..., TensorDictModuleBase]:
+    if not gaussian:
+        return partial(EnsembleAnalysis, "etkf")
+    if isinstance(transition, UKFTransition):
+        return partial(UKFAnalysis, alpha=transition.alpha, beta=transition.beta, kappa=transition.kappa)
+    return EKFAnalysis

@@ -1,0 +1,80 @@
+r"""A mean and a covariance of the present state and the last L states together, for readings that come late.
+
+:class:`torch_denkf.fusion.FusedFilter` puts these parts around the update of a Kalman filter. A reading of any of the
+L + 1 states is a reading of the joint state, so that the update itself needs nothing new. For linear systems the result
+is that of readings in their order.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey
+from torch import nn
+
+from torch_denkf.fusion.joint_forecast import joint_forecast
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
+from torch_denkf.smoothers.past import Past
+
+__all__ = ["JOINT_PAST", "JointForecast", "PresentOfJoint"]
+
+
+def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
+    mean, cov = belief[prefix, "mean"], belief[prefix, "cov"]
+    ones, count = [1] * (mean.ndim - 1), lag + 1
+    return [mean.repeat(*ones, count), cov.repeat(*ones, count, count)]
+
+
+def _present_and_oldest(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
+    mean, cov = entries[prefix, "joint_mean"], entries[prefix, "joint_cov"]
+    size = mean.shape[-1] // (lag + 1)
+    return *_part(mean, cov, slice(None, size)), *_part(mean, cov, slice(-size, None))
+
+
+def _part(mean: torch.Tensor, cov: torch.Tensor, part: slice) -> tuple[torch.Tensor, ...]:
+    """Mean, covariance and variance of one of the states in a joint one."""
+    return mean[..., part], cov[..., part, part], cov[..., part, part].diagonal(dim1=-2, dim2=-1)
+
+
+_MOMENTS = ("mean", "cov", "var")
+#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the past states, the latest first.
+JOINT_PAST = Past(("joint_mean", "joint_cov"), _MOMENTS, _copies, _present_and_oldest, present=_MOMENTS)
+
+
+class JointForecast(SubModel):
+    """The joint state moves on by one step: the forecast in front of the last belief's states, the oldest is forgotten.
+
+    It reads what :class:`CrossTransition` wrote, and writes ``("joint", "mean")`` ``[*B, (L + 1) S]`` and
+    ``("joint", "cov")``.
+    """
+
+    def __init__(self):
+        in_keys = [("forecast", name) for name in ("mean", "cov", "cross")]
+        in_keys += [("belief", "joint_mean"), ("belief", "joint_cov"), ("smoothed", "age")]
+        super().__init__(nn.Identity(), in_keys, [("joint", "mean"), ("joint", "cov")])
+
+    def compute(self, mean, cov, cross, joint_mean, joint_cov, age):
+        """Mean and covariance of the joint state."""
+        # At the start of an episode, before its own frame, no step has been made.
+        return joint_forecast(mean, cov, cross, joint_mean, joint_cov, unmoved=age < 0)
+
+
+class PresentOfJoint(SubModel):
+    """The belief of the present state and of the state L steps ago, from the joint state after all readings.
+
+    Args:
+        size: S.
+        joint_key: prefix of ``mean`` ``[*B, (L + 1) S]`` and ``cov``.
+    """
+
+    def __init__(self, size: int, joint_key: str = "joint"):
+        out_keys: list[NestedKey] = [("belief", name) for name in ("mean", "cov", "var", "joint_mean", "joint_cov")]
+        out_keys += [("smoothed", name) for name in (*_MOMENTS, "age")]
+        super().__init__(nn.Identity(), [(joint_key, "mean"), (joint_key, "cov"), ("smoothed", "age")], out_keys)
+        self.size = size
+
+    def compute(self, mean, cov, age):
+        """The beliefs."""
+        size = self.size
+        present, oldest = (_part(mean, cov, part) for part in (slice(None, size), slice(-size, None)))
+        return *present, mean, cov, *oldest, (age + 1).clamp(max=mean.shape[-1] // size - 1)

@@ -1,0 +1,244 @@
+"""Parts for filters of several sensors: modules under other keys, readings that come late, readings side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torch_denkf._checks import check_mask
+from torch_denkf.functional.angles import mean_observation
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import check_module, marks_of, reads, run_module, writes
+from torch_denkf.modules.carried import InPlaceOf
+
+__all__ = ["JoinedObservation", "JoinedReading", "Renamed", "StateObservation"]
+
+
+class Renamed(InPlaceOf):
+    """A module that reads and writes under other keys, so that two of a kind fit into one filter.
+
+    Args:
+        module: any module of a filter; its noise keeps its place.
+        keys: the module's own keys, and those to use in their place.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import ConstantNoise
+        >>> noise = Renamed(ConstantNoise([0.5], in_key="wheel"), {("sensor", "noise"): "wheel_noise"})
+        >>> noise(TensorDict({"wheel": torch.zeros(1)}))["wheel_noise"]
+        tensor([0.2500])
+    """
+
+    def __init__(self, module: TensorDictModuleBase, keys: Mapping[NestedKey, NestedKey]):
+        check_module("module", module)
+        names = {unravel_key(key): unravel_key(name) for key, name in keys.items()}
+        needed, optional = reads(module)
+        new = [[names.get(key, key) for key in group] for group in (needed, writes(module), optional)]
+        super().__init__(module, new[0], new[1], optional_keys=new[2])
+        self.names = names
+        self.marks = {names.get(made, made): names.get(key, key) for made, key in marks_of(module).items()}
+
+    def noise_sizes(self, *values):
+        """Those of the module inside."""
+        return self.module.noise_sizes(*values)
+
+    def on_entries(self, entries, call):
+        """What the module writes."""
+        inside = {key: value for key, value in entries.items() if key not in self.names}
+        inside.update({key: entries[name] for key, name in self.names.items() if name in entries})
+        written = run_module(self.module, inside, call)
+        return {self.names.get(key, key): value for key, value in written.items()}
+
+
+class StateObservation(InPlaceOf):
+    """An observation model of one sensor, of the present state or of an earlier one that a late reading belongs to.
+
+    Args:
+        observation: observes ensembles, e.g. :class:`Select`; it reads its first key, and writes its first.
+        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the past themselves, the
+            latest first: ``[*B, E, (L + 1) S]``.
+        predicted_key: predicted observations, ``[*B, E, O]``.
+        reading_keys: what is compared with them, and its noise.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
+        delay: by how many steps readings are late.
+        late_key: optional entry that says it for each, ``[*B, 1]`` int64, 0 to L.
+        past_key: the last L states, ``[*B, E, L, S]``.
+        state_dim: S, where there is a past: then the mask is written, too.
+        seen_key: the mask ``[*B, O]`` or ``[*B, 1]`` that is written: a reading that belongs to the time before the
+            episode, or before the lag, is not observed.
+        age_key: by how many steps the oldest state lay back one step ago, ``[*B, 1]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import Select
+        >>> past = {"ensemble": torch.tensor([[5.0]]), "past": torch.tensor([[[4.0], [3.0]]])}
+        >>> model = StateObservation(
+        ...     Select([0]), ("forecast", "ensemble"), "predicted", reading_keys=["gps"], observed_key="gps_observed",
+        ...     delay=2, past_key=("forecast", "past"), state_dim=1,
+        ... )
+        >>> model(TensorDict({"forecast": past, "smoothed": {"age": torch.tensor([0])}}))["predicted"]
+        tensor([[3.]])
+    """
+
+    def __init__(
+        self,
+        observation: TensorDictModuleBase,
+        ensemble_key: NestedKey,
+        predicted_key: NestedKey,
+        *,
+        reading_keys: Sequence[NestedKey],
+        observed_key: NestedKey,
+        delay: int = 0,
+        late_key: NestedKey | None = None,
+        past_key: NestedKey | None = None,
+        state_dim: int | None = None,
+        seen_key: NestedKey = ("forecast", "observed"),
+        age_key: NestedKey = ("smoothed", "age"),
+    ):
+        check_module("observation", observation)
+        needed, optional = ([unravel_key(key) for key in keys] for keys in reads(observation))
+        self_made = unravel_key(observation.in_keys[0])
+        in_keys = [ensemble_key, *(key for key in needed if key != self_made)]
+        out_keys, optional_keys = [predicted_key], [observed_key, *optional]
+        if state_dim is not None:
+            in_keys += [age_key] + ([] if past_key is None else [past_key])
+            out_keys, optional_keys = [predicted_key, seen_key], optional_keys + ([late_key] if late_key else [])
+        super().__init__(observation, in_keys, out_keys, optional_keys=optional_keys)
+        self.delay, self.state_dim = delay, state_dim
+        keys = (ensemble_key, predicted_key, observed_key, age_key)
+        self.ensemble_key, self.predicted_key, self.observed_key, self.age_key = map(unravel_key, keys)
+        self.late_key = None if late_key is None else unravel_key(late_key)
+        self.past_key = None if past_key is None else unravel_key(past_key)
+        # For readings that are rejected: what the mask hides.
+        self.reading_keys, self.reads_components = list(map(unravel_key, reading_keys)), True
+
+    def noise_sizes(self, *values):
+        """Those of the model inside."""
+        return self.module.noise_sizes(*values)
+
+    def on_entries(self, entries, call):
+        """The predicted observations, and the mask."""
+        states, written = self.required(entries, self.ensemble_key), {}
+        if self.state_dim is not None:
+            if self.past_key is None:
+                whole = states.unflatten(-1, (-1, self.state_dim))
+            else:
+                whole = torch.cat([states.unsqueeze(-2), self.required(entries, self.past_key)], -2)
+            states, mask = self._of_its_time(whole, entries)
+            written[unravel_key(self.out_keys[1])] = mask
+        key, out_key = unravel_key(self.module.in_keys[0]), unravel_key(self.module.out_keys[0])
+        return {self.predicted_key: run_module(self.module, {**entries, key: states}, call)[out_key], **written}
+
+    def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
+        """The predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        written = run_module(self, entries, call)
+        mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
+        return written[self.predicted_key], mask
+
+    def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
+        """The states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
+        observed, age = entries.get(self.observed_key), entries.get(self.age_key)
+        check_mask(str(self.observed_key), observed)
+        if age is None:  # a call that learns shapes brings no age
+            age = torch.full_like(whole[..., 0, 0, :1], whole.shape[-2], dtype=torch.int64)
+        late = None if self.late_key is None else entries.get(self.late_key)
+        if late is None:
+            states, fits = whole[..., self.delay, :], age + 1 >= self.delay
+        else:
+            last = whole.shape[-2] - 1
+            index = late.long().clamp(0, last)[..., None, None].expand(*whole.shape[:-2], 1, whole.shape[-1])
+            states = whole.gather(-2, index).squeeze(-2)
+            fits = (late >= 0) & (late <= last) & (late <= age + 1)
+        return states, fits if observed is None else observed & fits
+
+
+class JoinedObservation(SubModel):
+    """The predicted observations of several sensors side by side, and their masks.
+
+    Args:
+        models: by name, in the order of the readings.
+        predicted_key: ``[*B, E, O]``, the sum of all O.
+        observed_key: the mask ``[*B, O]``.
+    """
+
+    def __init__(self, models: Mapping[str, StateObservation], *, predicted_key: NestedKey, observed_key: NestedKey):
+        needed, optional = ({} for _ in range(2))
+        for model in models.values():
+            must, may = reads(model)
+            needed.update(dict.fromkeys(must))
+            optional.update(dict.fromkeys(may))
+        super().__init__(
+            nn.ModuleDict(models), list(needed), [predicted_key, observed_key], optional_keys=list(optional)
+        )
+
+    def parts(self):
+        """The models."""
+        return dict(self.module.items())
+
+    def on_entries(self, entries, call):
+        """The predicted observations, and the mask."""
+        predicted, masks = [], []
+        for name, model in self.module.items():
+            values, seen = model.seen(entries, call.part(name))
+            predicted.append(values)
+            like = values[..., 0, :]
+            masks.append(torch.ones_like(like, dtype=torch.bool) if seen is None else seen.expand(like.shape))
+        return self.by_key((torch.cat(predicted, -1), torch.cat(masks, -1)))
+
+
+class JoinedReading(SubModel):
+    """The readings of several sensors side by side, and their noise.
+
+    Args:
+        reading_keys: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose mean is taken.
+        noise_keys: variances ``[*B, O]`` or covariances ``[*B, O, O]``, in the same order.
+        angles: components of each reading that are angles in radians.
+        observation_key: all readings, ``[*B, O]``.
+        noise_key: all variances ``[*B, O]``, or one covariance ``[*B, O, O]`` if any sensor has one.
+        observation_dim: O of all, where it is known.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"a": torch.ones(4, 2), "b": torch.zeros(1), "qa": torch.ones(2), "qb": torch.ones(1)})
+        >>> join = JoinedReading(["a", "b"], ["qa", "qb"], [(), ()], observation_key="c", noise_key="qc")
+        >>> join(td)["c"]
+        tensor([1., 1., 0.])
+    """
+
+    joins_readings = True  # without one of them it has nothing to say
+
+    def __init__(
+        self,
+        reading_keys: Sequence[NestedKey],
+        noise_keys: Sequence[NestedKey],
+        angles: Sequence[Sequence[int]],
+        *,
+        observation_key: NestedKey,
+        noise_key: NestedKey,
+        observation_dim: int | None = None,
+    ):
+        super().__init__(nn.Identity(), [*reading_keys, *noise_keys], [observation_key, noise_key])
+        self.observation_dim = observation_dim
+        self.angles = [list(dims) for dims in angles]
+
+    def compute(self, *values, batch_size):
+        """The readings and their noise."""
+        count, size = len(self.angles), len(batch_size)
+        readings = [
+            value if value.ndim == size + 1 else mean_observation(value, dims)
+            for value, dims in zip(values[:count], self.angles, strict=True)
+        ]
+        noises, total, begin = list(values[count:]), sum(reading.shape[-1] for reading in readings), 0
+        if any(noise.ndim > size + 1 for noise in noises):
+            for index, noise in enumerate(noises):
+                noise = noise if noise.ndim > size + 1 else noise.diag_embed()
+                noises[index] = F.pad(noise, (begin, total - begin - noise.shape[-1]))
+                begin += noise.shape[-1]
+            return torch.cat(readings, -1), torch.cat(noises, -2)
+        return torch.cat(readings, -1), torch.cat(noises, -1)

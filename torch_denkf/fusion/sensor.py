@@ -1,0 +1,95 @@
+"""One sensor of a filter of several: its model, noise, mask and delay, and its modules under keys of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+
+from torch_denkf.fusion.parts import Renamed
+from torch_denkf.modules import ConstantNoise
+from torch_denkf.modules._running import in_sequences, marks_of, writes
+
+__all__ = ["FusedSensor", "Wired", "wire"]
+
+
+@dataclass(frozen=True)
+class FusedSensor:
+    """One sensor of a :class:`FusedFilter`.
+
+    The keys of its modules need not be chosen: what they write is put under ``("sensor", NAME, ...)``.
+
+    Attributes:
+        observation: h, what the sensor would read in a state: :class:`~torch_denkf.modules.Select`,
+            :class:`~torch_denkf.modules.LinearObservation`, :class:`~torch_denkf.modules.LearnedObservation`.
+        noise: R: standard deviations ``[O]``, or a module that writes variances ``[*B, O]``.
+        sensor: a module that reads frames and writes the reading, such as an image sensor; ``None`` where the reading
+            is in the data.
+        reading: its key in the data, ``[*B, O]``; by default the sensor's name.
+        observed: its mask, ``[*B, 1]`` or ``[*B, O]``, True where there is a reading; by default NAME_observed. A
+            sensor with a lower rate than the filter's has it True in every n-th step. It is the mask of the *data*:
+            where ``sensor`` makes a further one of it, as :class:`~torch_denkf.monitoring.BlackIsMissing` does, the
+            update reads that one by itself.
+        delay: by how many steps its readings come late. Each then corrects the state that it belongs to, and through
+            the covariances all since.
+        late: key of an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
+        angles: components of the reading that are angles in radians.
+        features: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the data,
+            or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
+        analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
+    """
+
+    observation: TensorDictModuleBase
+    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor
+    sensor: TensorDictModuleBase | None = None
+    reading: NestedKey | None = None
+    observed: NestedKey | None = None
+    delay: int = 0
+    late: NestedKey | None = None
+    angles: Sequence[int] = ()
+    features: NestedKey | None = None
+    analysis: Callable[..., TensorDictModuleBase] | None = None
+
+
+@dataclass(frozen=True)
+class Wired:
+    """A sensor's modules under keys of their own, and those keys."""
+
+    modules: dict[str, TensorDictModuleBase]
+    reading: NestedKey
+    noise: NestedKey
+    observed: NestedKey
+    features: NestedKey | None
+
+
+def wire(name: str, sensor: FusedSensor) -> Wired:
+    """Puts what a sensor's modules write under ``("sensor", name, ...)``."""
+    reading = unravel_key(name if sensor.reading is None else sensor.reading)
+    observed = unravel_key(f"{name}_observed" if sensor.observed is None else sensor.observed)
+    names: dict[NestedKey, NestedKey] = {"observed": observed}
+    modules: dict[str, TensorDictModuleBase] = {}
+    if sensor.sensor is None:
+        names["sensor", "ensemble"] = reading
+    else:
+        for key in writes(sensor.sensor):
+            names[key] = ("sensor", name, key if isinstance(key, str) else key[-1])
+        *_, last = in_sequences(sensor.sensor)
+        reading = names[writes(last)[0]]
+        modules[f"{name}_sensor"] = Renamed(sensor.sensor, names)
+        marks = marks_of(sensor.sensor)
+        if observed in marks or any(read not in ("observed", observed, *marks) for read in marks.values()):
+            raise ValueError(
+                f"The sensor {name!r} makes the mask {list(marks)} of {list(marks.values())}, and observed= names "
+                f"{observed!r}, which it would not read. observed= is the mask of the data, by default "
+                f"'{name}_observed'; leave observed_key of the module that makes the mask at its default."
+            )
+        observed = next((names[key] for key in marks), observed)
+    own = ("sensor", name, "noise")
+    noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
+    names[writes(noise)[0]] = own
+    modules[f"{name}_noise"] = Renamed(noise, names)
+    features = None if sensor.features is None else unravel_key(sensor.features)
+    return Wired(modules, reading, own, observed, names.get(features, features))

@@ -1,0 +1,21 @@
+"""Gates, monitors and signs: what a filter believes of a reading, and which sensor is not to be believed."""
+
+from torch_denkf.monitoring.black import BlackIsMissing
+from torch_denkf.monitoring.chi_square import detectable_bias
+from torch_denkf.monitoring.filters import Gated, Monitored
+from torch_denkf.monitoring.gate import GatedAnalysis
+from torch_denkf.monitoring.innovation_tests import observe
+from torch_denkf.monitoring.monitor import InnovationMonitor, MonitoredSensor
+from torch_denkf.monitoring.signs import SignGate
+
+__all__ = [
+    "BlackIsMissing",
+    "Gated",
+    "GatedAnalysis",
+    "InnovationMonitor",
+    "Monitored",
+    "MonitoredSensor",
+    "SignGate",
+    "detectable_bias",
+    "observe",
+]

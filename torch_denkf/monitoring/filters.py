@@ -1,0 +1,234 @@
+"""Filters that watch their sensors, and filters that answer to what they see."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Unpack
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+
+from torch_denkf.filters._options import options_of
+from torch_denkf.filters.base import Filter
+from torch_denkf.fusion.parts import StateObservation
+from torch_denkf.modules import KalmanAnalysis
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._running import check_module, named_modules_of
+from torch_denkf.modules.carried import with_state
+from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions
+from torch_denkf.monitoring.monitor import InnovationMonitor
+from torch_denkf.smoothers.past import LaggedAnalysis
+
+__all__ = ["Gated", "Monitored"]
+
+
+class Monitored(Filter):
+    """A filter with a monitor behind its analyses: beside the belief it writes an alarm, and what speaks for it.
+
+    It is a :class:`Filter` itself: steps, sequences, masks, resets, policies, transforms, replay buffers and compiled
+    steps work as with any other. The belief is that of the filter, bit for bit. The modules are the filter's own, not
+    copies.
+
+    Args:
+        filter: the filter.
+        monitor: what to watch, see :class:`~torch_denkf.monitoring.InnovationMonitor`.
+
+    Raises:
+        TypeError: if the filter is none.
+        KeyError: if the filter does not write what the monitor reads.
+        ValueError: if the filter writes under the monitor's ``monitor_prefix`` already, as another monitor does.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> from torch_denkf.monitoring.monitor import MonitoredSensor
+        >>> one = torch.eye(1)
+        >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
+        >>> watched = Monitored(kf, InnovationMonitor({"gps": MonitoredSensor("info", 1)}))
+        >>> reading = torch.zeros(9, 1).index_fill(0, torch.tensor([5, 6, 7, 8]), 50.0)  # the GPS jumps, and back
+        >>> watched.sequence(TensorDict({"observation": reading}, [9]))["monitor", "alarm"].flatten().tolist()
+        [False, False, False, False, False, True, True, True, True]
+    """
+
+    def __init__(self, filter: Filter, monitor: InnovationMonitor):
+        _check_filter("Monitored", filter)
+        check_module("monitor", monitor)
+        read = [key for key in monitor.in_keys if key not in monitor.state_keys]
+        written = filter.structure.out_keys
+        missing = [key for key in map(unravel_key, read) if key not in written]
+        if missing:
+            raise KeyError(f"the monitor reads {missing}, which the filter does not write; it writes {written}")
+        like = filter.like()
+        modules = OrderedDict(named_modules_of(filter))
+        taken = [key for key in monitor.state_keys if key in written]
+        if taken:
+            raise ValueError(
+                f"the filter writes {taken[0]} already; give this monitor another name: monitor_prefix="
+                f"{monitor.monitor_prefix + '2'!r}"
+            )
+        place = "monitor"
+        while place in modules:
+            place += "_"
+        modules[place] = monitor if like is None else monitor.to(like.device, like.dtype)
+        super().__init__(modules, initial=with_state(filter.initial, [monitor]), **options_of(filter))
+        self._place = place
+
+    @property
+    def monitor(self) -> InnovationMonitor:
+        """What watches."""
+        return self[self._place]
+
+    def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Monitored:
+        """Calibrates the monitor on clean data, see :meth:`~torch_denkf.monitoring.InnovationMonitor.calibrate`.
+
+        Args:
+            clean: sequences ``[*B, T]`` that the filter can run on, not outputs.
+            **options: of the monitor's.
+        """
+        self.monitor.calibrate([self.sequence(each.copy()) for each in clean], **options)
+        return self
+
+
+class Gated(Filter):
+    """A filter whose analyses believe a reading as far as its last innovations deserve it.
+
+    Each analysis becomes a :class:`~torch_denkf.monitoring.GatedAnalysis`, in its place. The filter is a
+    :class:`Filter` itself, like :class:`Monitored`, which goes around this one: ``Monitored(Gated(filter), monitor)``,
+    with ``"gate"`` as the monitor's ``info_prefix``.
+
+    Args:
+        filter: of an ensemble, or of a mean and a covariance.
+        observation_dim: components of the readings; by default as the filter's noise models say. By the place of the
+            analysis where there are several.
+        places: of the analyses that get a gate; all by default. With other options for others, put one ``Gated`` around
+            another.
+        **options: of all gates, see :class:`~torch_denkf.monitoring.gate.GateOptions`. Of several the ``gate_prefix``
+            is followed by the analysis' place, ``"gate_camera"``, and by a number where a sequence in one place has
+            several.
+
+    Raises:
+        TypeError: if the filter has no analysis that can be gated.
+        ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is asked
+            of a filter that observes states of the past, a :class:`FusedFilter` with a delay.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> kf = Gated(plain, response="reject", window=1)
+        >>> reading = torch.tensor([[0.0], [1.0], [90.0], [0.0]])
+        >>> out = kf.sequence(TensorDict({"observation": reading}, [4]))
+        >>> out["gate", "factor"].flatten().tolist(), out["belief", "mean"].abs().max() < 1
+        ([0.0, 1.0, inf, 1.0], tensor(True))
+    """
+
+    def __init__(
+        self,
+        filter: Filter,
+        observation_dim: int | Mapping[str, int] | None = None,
+        *,
+        places: Sequence[str] | None = None,
+        **options: Unpack[GateOptions],
+    ):
+        _check_filter("Gated", filter)
+        if options.get("adapt_inflation") and any(_with_past(part) for part in filter.modules()):
+            raise ValueError(
+                "adapt_inflation spreads the forecast of the step at which a reading is taken. A FusedFilter with "
+                "delay=, or with lag= of a mean and a covariance, observes the past, too. Leave them out and put "
+                "Refiltering(Gated(filter), ...) or FixedLag(Gated(filter), lag) around; or use adapt_noise."
+            )
+        modules = OrderedDict(named_modules_of(filter))
+        found = [name for name, module in modules.items() if any(_analyses(module))]
+        count = sum(1 for name in found for _ in _analyses(modules[name]))
+        several = count + sum(isinstance(module, GatedAnalysis) for module in filter.modules()) > 1
+        if places is not None:
+            if unknown := [place for place in places if place not in found]:
+                raise ValueError(f"places names {unknown}; the filter has analyses at {found}")
+            found = list(places)
+        if not found:
+            raise TypeError(
+                f"{type(filter).__name__} has no analysis that a gate goes around: EnsembleAnalysis, "
+                "LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
+            )
+        key, gates = options.get("gate_prefix", "gate"), []
+        for name in found:
+            inside = list(_analyses(modules[name]))
+            for number, analysis in enumerate(inside):
+                own = observation_dim[name] if isinstance(observation_dim, Mapping) else observation_dim
+                dim = _dim(filter, analysis) if own is None else own
+                own_key = f"{key}_{name}" + (f"_{number}" if len(inside) > 1 else "")
+                own_options: GateOptions = {**options, "gate_prefix": own_key if several else key}
+                gates.append(GatedAnalysis(analysis, dim, **own_options))
+                like = filter.like()
+                gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)
+                modules[name] = _with(modules[name], analysis, gates[-1])
+        super().__init__(modules, initial=with_state(filter.initial, gates), **options_of(filter))
+
+    @property
+    def gates(self) -> list[GatedAnalysis]:
+        """The gated analyses, in order."""
+        return [module for module in self.modules() if isinstance(module, GatedAnalysis)]
+
+    def calibrate(self, clean: Sequence[TensorDictBase], **options) -> Gated:
+        """Calibrates the gates on clean data, see :meth:`~torch_denkf.monitoring.GatedAnalysis.calibrate`.
+
+        Args:
+            clean: sequences ``[*B, T]`` that the filter can run on, not outputs. The gates are open meanwhile.
+            **options: of the gates'.
+        """
+        rates = [gate.rate for gate in self.gates]
+        for gate in self.gates:
+            gate.rate = 0.0
+        outputs = [self.sequence(each.copy()) for each in clean]
+        for gate, rate in zip(self.gates, rates, strict=True):
+            gate.rate = rate
+            gate.calibrate(outputs, **options)
+        return self
+
+
+def _with_past(part: torch.nn.Module) -> bool:
+    """Whether a module observes states of the past, or present and past as one."""
+    return isinstance(part, StateObservation) and part.state_dim is not None
+
+
+def _check_filter(name: str, filter: object) -> None:
+    if not isinstance(filter, Filter):
+        raise TypeError(
+            f"{name} goes around a torch_denkf Filter; got {type(filter).__name__}. A Refiltering goes outermost: "
+            f"Refiltering({name}(filter, ...), ...)."
+        )
+
+
+def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
+    """The analyses of a module of a filter that can be gated."""
+    if type(module) is TensorDictSequential:
+        for _, part in named_modules_of(module):
+            yield from _analyses(part)
+    elif isinstance(module, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis | LaggedAnalysis):
+        yield module
+
+
+def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
+    """The module, or a plain sequence in which one module is replaced."""
+    if type(module) is not TensorDictSequential:
+        return new if module is old else module
+    return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
+
+
+def _dim(filter: Filter, analysis: SubModel) -> int:
+    """How many components an analysis' reading has."""
+    if isinstance(analysis, KalmanAnalysis):
+        return analysis.matrix.shape[0]
+    dim = filter.structure.observation_dims.get(unravel_key(analysis.in_keys[3]))
+    if dim is None:
+        raise ValueError(
+            f"how many components the reading of {type(analysis).__name__} has is not known; pass observation_dim"
+        )
+    return dim

@@ -1,0 +1,411 @@
+"""An analysis that believes a reading as far as its last innovations deserve it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, TypedDict
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.utils import expand_as_right
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Call, Entries, flat_noise
+from torch_denkf.modules._ensemble import EnsembleUpdate
+from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._running import writes
+from torch_denkf.modules.carried import AnalysisAround
+from torch_denkf.modules.kalman import KalmanAnalysis
+from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
+from torch_denkf.monitoring.chi_square import chi_square_quantile
+from torch_denkf.monitoring.gating import adapt, disbelief, spread_about_mean
+from torch_denkf.monitoring.innovation_tests import interpolate
+from torch_denkf.smoothers.past import LaggedAnalysis
+
+__all__ = ["GateOptions", "GatedAnalysis"]
+
+_USUAL = 0.05  # probability of a sum that opens a gate that is shut
+_LARGEST_FACTOR = 1e6  # on variances, up or down: what adaptation may reach
+
+
+class GateOptions(TypedDict, total=False):
+    """What :class:`GatedAnalysis` takes beside the analysis.
+
+    Attributes:
+        response: what happens to a reading that is not believed: ``"reject"`` takes it out, ``"student"`` and
+            ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
+        default.
+        window: observed steps whose normalised innovations squared are summed up; 3 by default.
+        rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
+            acts.
+        freedom: of Student's t; 4 by default.
+        patience: after so many rejected steps in a row the gate opens: the forecast, and the past states that are
+            carried beside it, are spread until they reach the reading, and the window is emptied. 50 by default.
+        by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
+        adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
+            steps that are remembered; 0 by default, for none.
+        adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
+            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
+            is too small, not what: use one of the two.
+        gate_prefix: prefix of the state, ``"gate"`` by default.
+    """
+
+    response: Literal["reject", "student", "huber"]
+    window: int
+    rate: float
+    freedom: float
+    patience: int
+    by_component: bool
+    adapt_noise: float
+    adapt_inflation: float
+    gate_prefix: str
+
+
+class GatedAnalysis(AnalysisAround):
+    """Lets a reading count as far as the innovations of the last steps, its own included, deserve it.
+
+    The analysis runs twice: as it would, to see the innovation, and then with the variances, mask and spread that
+    follow. With ``rate=0`` and no adaptation the second gives bit for bit what the analysis gives.
+
+    What is written beside the belief, K being the number of components with ``by_component`` and else 1:
+
+    ========================= ============ ============================================================================
+    entry                     shape        content
+    ========================= ============ ============================================================================
+    (key, ``terms``)          ``[W,K,2]``  normalised innovations squared of the last observed steps, the latest first,
+                                           and their degrees of freedom
+    (key, ``shut``)           ``[K]``      rejected steps in a row
+    (key, ``log_noise``)      ``[K]``      logarithm of the adapted factor on the variances
+    (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
+    (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
+    (key, ``nis``)            ``[1]``      of the reading as it came, for an :class:`InnovationMonitor`
+    (key, ``innovation``)     ``[O]``      likewise
+    (key, ``part_nis``)       ``[K]``      of each component by itself
+    ========================= ============ ============================================================================
+
+    A reading that was rejected is believed again when the sum falls to what one in twenty exceeds.
+
+    The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. A filter needs the state
+    to begin somewhere: :class:`~torch_denkf.monitoring.Gated` sees to that.
+
+    Args:
+        analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
+            :class:`EKFAnalysis` or :class:`UKFAnalysis`; or a :class:`LaggedAnalysis`, whose past a reading then
+            corrects as far as it is believed. Its keys and its noise are kept.
+        observation_dim: O, components of the reading.
+        response: see :class:`GateOptions`, like all that follows.
+        window: likewise.
+        rate: likewise.
+        freedom: likewise.
+        patience: likewise.
+        by_component: likewise.
+        adapt_noise: likewise.
+        adapt_inflation: likewise.
+        gate_prefix: likewise.
+
+    Raises:
+        TypeError: for another analysis, whose variances and forecast are not known.
+        ValueError: if a number is out of range, or ``by_component`` is asked of a mean and a covariance.
+
+    Source:
+        Student's t and Huber's loss in filters: Agamennoni, Nieto & Nebot 2012, IEEE Trans. Signal Processing 60;
+        adaptation by innovations: Mehra 1970, IEEE Trans. Automatic Control 15; Anderson 2009, Tellus A 61.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import EnsembleAnalysis
+        >>> gate = GatedAnalysis(EnsembleAnalysis("etkf"), 1, response="reject", window=1)
+        >>> members = torch.tensor([[-1.0], [1.0]])
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": members, "observation": members},
+        ...     "sensor": {"ensemble": torch.tensor([40.0]), "noise": torch.tensor([2.0])},
+        ... })
+        >>> for key, value in zip(gate.state_keys, gate.initial_state([]), strict=True):
+        ...     td[key] = value
+        >>> gate(td)["belief", "mean"], td["gate", "factor"]
+        (tensor([0.]), tensor([inf]))
+    """
+
+    tables: Tensor
+    slack: Tensor
+    limits: Tensor
+    usual: Tensor
+    claimed: Tensor | None
+
+    def __init__(
+        self,
+        analysis: SubModel,
+        observation_dim: int,
+        *,
+        response: Literal["reject", "student", "huber"] = "student",
+        window: int = 3,
+        rate: float = 1e-3,
+        freedom: float = 4.0,
+        patience: int = 50,
+        by_component: bool = False,
+        adapt_noise: float = 0.0,
+        adapt_inflation: float = 0.0,
+        gate_prefix: str = "gate",
+    ):
+        update = analysis.module if isinstance(analysis, LaggedAnalysis) else analysis
+        if not isinstance(update, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
+            raise TypeError(
+                f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around "
+                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
+            )
+        of_ensemble = isinstance(update, EnsembleUpdate)
+        if by_component and not of_ensemble:
+            raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
+        if response not in ("reject", "student", "huber"):
+            raise ValueError(f'response is "reject", "student" or "huber"; got {response!r}')
+        check_count("observation_dim", observation_dim)
+        check_count("window", window)
+        check_count("patience", patience)
+        check_number("rate", rate, least=0, below=1)
+        check_number("freedom", freedom, above=0)
+        check_number("adapt_noise", adapt_noise, least=0, below=1)
+        check_number("adapt_inflation", adapt_inflation, least=0, below=1)
+        claimed = None
+        if isinstance(analysis, KalmanAnalysis) and analysis.noise is not None:
+            claimed, analysis = analysis.noise, _with_noise_from((gate_prefix, "claimed"), analysis)
+        state = [(gate_prefix, name) for name in ("terms", "shut", "log_noise", "log_inflation")]
+        further = [(gate_prefix, name) for name in ("factor", "nis", "innovation", "part_nis")]
+        in_keys = [key for key in analysis.in_keys if claimed is None or key != analysis.in_keys[3]]
+        out_keys = [*analysis.out_keys, *state, *further]
+        super().__init__(analysis, [*in_keys, *state], out_keys, optional_keys=analysis.optional_keys)
+        self.register_buffer("claimed", claimed)
+        self.state_keys, self._further, self.of_ensemble = state, further, of_ensemble
+        self.response, self.window, self.rate, self.freedom = response, window, rate, freedom
+        self.patience, self.by_component = patience, by_component
+        self.adapt_noise, self.adapt_inflation = adapt_noise, adapt_inflation
+        self.gate_prefix, self.info_prefix = gate_prefix, analysis.info_prefix
+        self.reading_keys = [key for key in analysis.reading_keys if key in in_keys]
+        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
+        self.noise_variance_key = unravel_key(analysis.in_keys[3])
+        self.observation_dim, self.parts_count = observation_dim, observation_dim if by_component else 1
+        self.register_buffer("tables", IDENTITY.repeat(self.parts_count, 1, 1))
+        self.register_buffer("slack", torch.ones(self.parts_count))
+        most = window * observation_dim // self.parts_count
+        limits = [torch.inf] + [chi_square_quantile(rate, n) if rate else torch.inf for n in range(1, most + 1)]
+        self.register_buffer("limits", torch.tensor(limits))
+        usual = [chi_square_quantile(max(rate, _USUAL), n) for n in range(1, most + 1)]
+        self.register_buffer("usual", torch.tensor([torch.inf, *usual]))
+
+    def noise_sizes(self, *values):
+        """Those of the analysis."""
+        return self.module.noise_sizes(*values)
+
+    def around(self, analysis: SubModel) -> GatedAnalysis:
+        """The same gate, with the same calibration, around another analysis.
+
+        Args:
+            analysis: of the same reading, e.g. a :class:`LaggedAnalysis` of the one inside.
+        """
+        options = {name: getattr(self, name) for name in GateOptions.__annotations__}
+        gate = GatedAnalysis(analysis, self.observation_dim, **options)
+        for name in ("tables", "slack", "limits", "usual"):
+            setattr(gate, name, getattr(self, name))
+        return gate
+
+    def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
+        """The state before anything was observed, in the order of ``state_keys``."""
+        count = self.parts_count
+        sizes = ((self.window, count, 2), (count,), (count,), (1,))
+        return [torch.zeros(*batch_size, *size, device=device, dtype=dtype) for size in sizes]
+
+    # ------------------------------------------------------------------------------------------------------ one step
+
+    def on_entries(self, entries, call):
+        """The belief, the diagnostics and the state."""
+        terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
+        plain = self._with_mask(self._with_noise(entries, call), call)
+        if self.of_ensemble:
+            plain = self.module.aligned(plain)
+        if self.adapt_noise:
+            plain = self._noisier(plain, log_noise.exp())
+        entries, inflation = plain, torch.ones_like(log_inflation)
+        if self.adapt_inflation:
+            mask = plain.get(self.observed_key)
+            inflation = log_inflation.exp()
+            if mask is not None:  # without a reading there is nothing to make up for, and factors would pile up
+                inflation = torch.where(mask.any(-1, keepdim=True), inflation, 1)
+            entries = self._wider(plain, inflation)
+        out = self._analyse(entries, call)
+        nis, innovation = (out[self.info_prefix, name] for name in ("nis", "innovation"))
+        check_observation_dim(self.observation_dim, innovation, f"the gate {self.gate_prefix!r}")
+        part, freedom = self._parts(entries, nis, innovation)
+        dtype = nis.dtype
+        calibrated = interpolate(part, *self.tables.to(dtype).unbind(1)).clamp_min(0)
+        seen = freedom > 0
+        term = torch.stack([calibrated, freedom], -1).unsqueeze(-3)
+        terms = torch.where(seen[..., None, :, None], torch.cat([term, terms[..., :-1, :, :]], -3), terms)
+        if self.rate:
+            evidence, total = terms.sum(-3).unbind(-1)
+            # What was rejected is believed again when it fits well, not when it is just within the limit.
+            limits = torch.where(shut > 0, self.usual[total.long()], self.limits[total.long()] * self.slack)
+            limit = limits.to(dtype)
+            factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)
+            if self.response == "reject":
+                rejected = factor > 1
+                opens = rejected & (shut >= self.patience)
+                rejected = rejected & ~opens
+                factor = torch.where(opens, 1, factor)
+                terms = torch.where(opens[..., None, :, None], 0, terms)
+                shut = torch.where(rejected, shut + 1, torch.where(seen, 0, shut))
+                reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
+                seen = seen & ~rejected  # an outlier is no measure of the noise
+                wider = torch.where(seen.any(-1, keepdim=True), inflation * reach, 1)
+                out = self._without(self._with_past(self._wider(plain, wider), reach), call, rejected)
+            else:
+                out = self._analyse(self._noisier(entries, factor), call)
+        else:
+            factor = torch.ones_like(part)
+        if self.adapt_noise:
+            bound = math.log(_LARGEST_FACTOR)
+            log_noise = adapt(log_noise, calibrated, seen * freedom, self.adapt_noise).clamp(-bound, bound)
+        if self.adapt_inflation:
+            used = seen * freedom
+            whole = (seen * calibrated).sum(-1, keepdim=True)
+            grown = adapt(log_inflation, whole, used.sum(-1, keepdim=True), self.adapt_inflation)
+            log_inflation = grown.clamp(0, math.log(_LARGEST_FACTOR))
+        own = (terms, shut, log_noise, log_inflation, factor, nis, innovation, part)
+        return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
+
+    def without_reading(self, *values):
+        """The belief where there is no reading: the forecast; the state stays."""
+        inner = len(self.in_keys) - len(self.state_keys)
+        out = self.module.without_reading(*values[:inner])
+        by_key = dict(zip(map(unravel_key, self.module.out_keys), out, strict=True))
+        nis, innovation = (by_key[self.info_prefix, name] for name in ("nis", "innovation"))
+        none = nis.new_zeros(*nis.shape[:-1], self.parts_count)
+        return (*out, *values[inner : len(self.in_keys)], none + 1, nis, innovation, none)
+
+    def _analyse(self, entries: Entries, call: Call) -> Entries:
+        """What the analysis writes; the angles of an ensemble's entries are on one turn already."""
+        return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
+
+    def _with_noise(self, entries: Entries, call: Call) -> Entries:
+        """The entries with the random numbers that both runs share, and the variances that a Kalman analysis holds."""
+        entries = dict(entries)
+        if self.claimed is not None:
+            mean = self.required(entries, self.in_keys[0])
+            entries[self.noise_variance_key] = self.claimed.expand(*mean.shape[:-1], *self.claimed.shape)
+        if self.noise_names and call.sample:
+            values = [self.required(entries, key) for key in self.module.in_keys]
+            entries.update(flat_noise(self.module._noise(entries, values, call), call.place))
+        return entries
+
+    def _with_mask(self, entries: Entries, call: Call) -> Entries:
+        """The entries with the mask, where an observation model inside the analysis makes it."""
+        if not isinstance(self.module, GaussianAnalysis) or self.observed_key not in writes(self.module.module):
+            return entries
+        mean = self.required(entries, self.in_keys[0])
+        mask = self.module.mask(entries, mean, call)
+        return entries if mask is None else {**entries, self.observed_key: mask}
+
+    def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
+        mask = entries.get(self.observed_key)
+        observed = torch.ones_like(innovation) if mask is None else mask.expand(innovation.shape).to(nis.dtype)
+        if not self.by_component:
+            return nis, observed.sum(-1, keepdim=True)
+        predicted, variance = entries[self.module.in_keys[1]], entries[self.noise_variance_key]
+        seen = observed > 0  # what is not observed may be NaN
+        predicted = predicted.var(-2) if predicted.shape[-2] > 1 else torch.zeros_like(innovation)
+        spread = torch.where(seen, predicted, 0) + torch.where(seen, variance, 1)
+        return torch.where(seen, innovation.square() / spread, 0), observed
+
+    def _noisier(self, entries: Entries, factor: Tensor) -> Entries:
+        """The entries with variances ``[*B, O]`` or a covariance ``[*B, O, O]`` times a factor ``[*B, K]``."""
+        noise = self.required(entries, self.noise_variance_key)
+        if noise.ndim > factor.ndim:
+            factor = factor.unsqueeze(-1)
+        return {**entries, self.noise_variance_key: noise * factor}
+
+    def _wider(self, entries: Entries, factor: Tensor) -> Entries:
+        """The entries with the forecast's covariance times a factor ``[*B, 1]``."""
+        if not self.of_ensemble:
+            key = self.module.in_keys[1]
+            return {**entries, key: entries[key] * factor.unsqueeze(-1)}
+        keys = self.module.in_keys[:2]  # states, and what is predicted of them
+        return {**entries, **{key: spread_about_mean(entries[key], factor.sqrt()) for key in keys}}
+
+    def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
+        """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+        if not isinstance(self.module, LaggedAnalysis):
+            return entries
+        key = self.module.in_keys[-1]
+        past = entries[key]
+        wider = spread_about_mean(past.flatten(-2), factor.sqrt())
+        return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
+
+    def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
+        """What the analysis writes without what is rejected ``[*B, K]``."""
+        if self.by_component:
+            mask = entries.get(self.observed_key)
+            kept = ~rejected if mask is None else mask & ~rejected
+            return self._analyse({**entries, self.observed_key: kept}, call)
+        out = self._analyse(entries, call)
+        values = self.module.without_reading(*(entries[key] for key in self.module.in_keys))
+        none = dict(zip(map(unravel_key, self.module.out_keys), values, strict=True))
+        return {key: torch.where(expand_as_right(rejected, value), none[key], value) for key, value in out.items()}
+
+    # --------------------------------------------------------------------------------------------------- calibration
+
+    @torch.no_grad()
+    def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> GatedAnalysis:
+        """Takes the distribution of the innovations, and of their windows, from clean data.
+
+        Args:
+            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: what the filter wrote while the
+                gate did nothing.
+            margin: factor on the limits.
+
+        Returns:
+            This analysis.
+
+        Raises:
+            ValueError: if fewer than 50 steps were observed.
+        """
+        columns = [each[self.gate_prefix, "part_nis"] for each in clean]
+        freedom = self.observation_dim // self.parts_count
+        for part in range(self.parts_count):
+            values = torch.cat([column[..., part].flatten() for column in columns]).double()
+            values = values[values > 0]  # 0 where a belief begins, or nothing is observed
+            if len(values) < 50:
+                raise ValueError(f"calibrate needs 50 steps at which part {part} is observed; there are {len(values)}")
+            self.tables[part] = chi_square_table(values, freedom)
+        ratios = []
+        for column in columns:
+            calibrated = interpolate(column, *self.tables.to(column.dtype).unbind(1)).clamp_min(0)
+            steps = calibrated.unfold(-2, min(self.window, column.shape[-2]), 1).sum(-1)
+            ratios.append(steps.flatten(0, -2) / self.limits[freedom * min(self.window, column.shape[-2])])
+        ratio = torch.cat(ratios).double()
+        for part in range(self.parts_count):
+            found = float(empirical_quantile(ratio[:, part], torch.tensor([1 - self.rate])))
+            self.slack[part] = margin * max(1.0, found)
+        return self
+
+
+def _with_noise_from(key: NestedKey, analysis: KalmanAnalysis) -> KalmanAnalysis:
+    """A Kalman analysis that shares the matrix of another, and reads the noise that the other holds."""
+    keys = analysis.in_keys
+    changed = KalmanAnalysis(
+        analysis.matrix.detach(),
+        None,
+        inflation=analysis.inflation,
+        angles=analysis.angles,
+        observation_key=keys[2],
+        noise_variance_key=key,
+        observed_key=analysis.observed_key,
+        forecast_prefix=keys[0][0],
+        belief_prefix=analysis.out_keys[0][0],
+        info_prefix=analysis.info_prefix,
+    )
+    if isinstance(analysis.matrix, nn.Parameter):
+        del changed.matrix
+    changed.matrix = analysis.matrix
+    return changed

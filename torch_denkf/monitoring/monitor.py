@@ -1,0 +1,377 @@
+"""Watches the innovations of a filter's sensors, and says which of them is not to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.utils import expand_as_right
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.modules._base import SubModel
+from torch_denkf.monitoring._calibration import (
+    IDENTITY,
+    check_observation_dim,
+    chi_square_table,
+    empirical_quantile,
+    score_table,
+    sign_limits,
+)
+from torch_denkf.monitoring.change_detection import cusum_step, cusum_threshold, normal_score
+from torch_denkf.monitoring.chi_square import chi_square_p_value, detectable_bias
+from torch_denkf.monitoring.innovation_tests import (
+    InnovationWindow,
+    innovation_tests,
+    interpolate,
+    observe,
+)
+from torch_denkf.monitoring.signs import floors
+
+__all__ = ["InnovationMonitor", "MonitoredSensor"]
+
+_CLAIMS = 3  # steps whose claimed noise is averaged
+_STATE = ("terms", "last", "cusum", "claim", "p_value", "whiteness", "evidence")
+
+
+class MonitoredSensor(NamedTuple):
+    """Where a sensor's innovations are.
+
+    Attributes:
+        info_prefix: prefix of ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``; where a filter has several analyses,
+            an analysis' own, such as ``("info", "camera_analysis")``; of a gated analysis its ``gate_prefix``.
+        observation_dim: O.
+        observed_key: the analysis' mask ``[*B, 1]`` or ``[*B, O]``, read where it is there.
+        noise_key: variances that the sensor claims ``[*B, O]``, to be watched, too; ``None`` for none.
+        sign_key: further signs of a fault ``[*B, K]``, see :class:`SignGate`, read where they are there, also in steps
+            at which the sensor is not observed; ``None`` for none.
+        signs: K.
+        floor: values up to which a sign is never large, one for all or one for each.
+    """
+
+    info_prefix: NestedKey
+    observation_dim: int
+    observed_key: NestedKey = "observed"
+    noise_key: NestedKey | None = None
+    sign_key: NestedKey | None = None
+    signs: int = 0
+    floor: float | Sequence[float] = 0.0
+
+
+class InnovationMonitor(SubModel):
+    r"""Are a sensor's innovations what the filter expects of them? Tests for each sensor, and one alarm.
+
+    * The *normalised innovation squared* :math:`d^T S^{-1} d`, summed over a window of observed steps: a chi-square
+      variable while the filter is right.
+    * A *cumulative sum* of the normal scores of single steps: the fastest test for a change of one size (Page 1954).
+    * *Whiteness*: the correlation of successive normalised innovations over the window.
+    * The *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations are then smaller
+      than usual, not larger. The mean of three steps' scores; it begins to count with :meth:`calibrate`.
+    * *Signs* of any kind, such as the share of a picture that is black: the largest of one step. They, too, begin to
+      count with :meth:`calibrate`.
+
+    Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
+    members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
+
+    The monitor keeps nothing on itself. Its state lies under ``(monitor_prefix, sensor, ...)`` and goes on from step to
+    step where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
+    not observed leaves its entries as they are.
+
+    ============================== ========= ===========================================================================
+    entry                          shape     content
+    ============================== ========= ===========================================================================
+    (key, sensor, ``p_value``)     ``[1]``   of the windowed normalised innovation squared
+    (key, sensor, ``whiteness``)   ``[1]``   p-value of the correlation of successive innovations, two-sided
+    (key, sensor, ``cusum``)       ``[1]``   cumulative sum, in standard normal numbers
+    (key, sensor, ``claim``)       ``[3]``   scores of the claimed noise, the latest first
+    (key, sensor, ``evidence``)    ``[1]``   the largest of all tests, as a multiple of its limit
+    (key, ``alarm``)               ``[1]``   bool: some sensor's evidence exceeds 1
+    (key, ``sensor``)              ``[1]``   int64: whose evidence is largest, by its place in ``sensors``; -1 without
+                                             an alarm
+    ============================== ========= ===========================================================================
+
+    Args:
+        sensors: by name.
+        window: steps.
+        false_alarm_rate: false alarms a step, shared equally by all tests of all sensors; a cumulative sum's is the
+            inverse of its average run length.
+        reference: half of the shift that the cumulative sums find fastest, in standard deviations of a step's score.
+        largest: score that a single step may have, so that several steps decide.
+        ceiling: of the cumulative sums, as a multiple of their limits: how long an alarm may outlast its cause.
+        whiteness: whether the correlation of successive innovations may raise the alarm. Slow errors of a learned
+            sensor fail it on clean data.
+        monitor_prefix: prefix of what is written.
+
+    Raises:
+        ValueError: if a number is out of range, or there is no sensor.
+
+    Example:
+        >>> monitor = InnovationMonitor({"gps": MonitoredSensor("info", 2)}, window=10)
+        >>> round(monitor.detectable_bias()["gps"], 2)  # standard deviations of the innovation
+        2.14
+    """
+
+    p_limit: Tensor
+    cusum_limit: Tensor
+    claim_limit: Tensor
+    whiteness_limit: Tensor
+    tables: Tensor
+    claims: Tensor
+
+    def __init__(
+        self,
+        sensors: Mapping[str, MonitoredSensor],
+        *,
+        window: int = 10,
+        false_alarm_rate: float = 1e-3,
+        reference: float = 0.5,
+        largest: float = 4.0,
+        ceiling: float = 1.5,
+        whiteness: bool = False,
+        monitor_prefix: str = "monitor",
+    ):
+        if not sensors:
+            raise ValueError("sensors names none; pass at least one, such as {'camera': MonitoredSensor('info', 2)}")
+        check_count("window", window)
+        check_number("false_alarm_rate", false_alarm_rate, above=0, below=0.5)
+        check_number("reference", reference, above=0)
+        check_number("largest", largest, above=reference)
+        check_number("ceiling", ceiling, least=1)
+        read: list[NestedKey] = []
+        state: list[NestedKey] = []
+        optional: list[NestedKey] = []
+        for name, sensor in sensors.items():
+            check_count(f"the observation_dim of {name!r}", sensor.observation_dim)
+            info = unravel_key(sensor.info_prefix)
+            info = (info,) if isinstance(info, str) else info
+            read += [(*info, "nis"), (*info, "innovation")]
+            read += [] if sensor.noise_key is None else [sensor.noise_key]
+            state += [(monitor_prefix, name, entry) for entry in _STATE]
+            optional.append(sensor.observed_key)
+            optional += [] if sensor.sign_key is None else [sensor.sign_key]
+        state += [(monitor_prefix, "alarm"), (monitor_prefix, "sensor")]
+        super().__init__(nn.Identity(), [*read, *state], state, optional_keys=optional)
+        self.sensors, self.state_keys, self.window = dict(sensors), list(self.out_keys), window
+        self.false_alarm_rate, self.reference, self.largest = false_alarm_rate, reference, largest
+        self.ceiling, self.whiteness, self.monitor_prefix = ceiling, whiteness, monitor_prefix
+        further = sum((sensor.noise_key is not None) + (sensor.sign_key is not None) for sensor in sensors.values())
+        count = len(sensors)
+        self.share = false_alarm_rate / (count * (3 if whiteness else 2) + further)
+        self.register_buffer("p_limit", torch.full((count,), self.share))
+        self.register_buffer("whiteness_limit", torch.full((count,), self.share))
+        self.register_buffer("cusum_limit", torch.full((count,), cusum_threshold(1 / self.share, reference)))
+        self.register_buffer("claim_limit", torch.full((count,), torch.inf))
+        self.register_buffer("tables", IDENTITY.repeat(count, 1, 1))
+        self.register_buffer("claims", IDENTITY.repeat(count, 1, 1))
+        for name, sensor in sensors.items():
+            self.register_buffer(f"scale_{name}", torch.ones(sensor.observation_dim))
+            if sensor.sign_key is not None:
+                check_count(f"signs of {name!r}", sensor.signs)
+                self.register_buffer(f"floor_{name}", floors(sensor.floor, sensor.signs))
+                self.register_buffer(f"sign_limit_{name}", torch.full((sensor.signs,), torch.inf))
+
+    # ------------------------------------------------------------------------------------------------------ one step
+
+    def on_entries(self, entries, call):
+        """State and verdict after one more step."""
+        written = {}
+        for place, (name, sensor) in enumerate(self.sensors.items()):
+            written.update(self._after(place, name, sensor, entries))
+        sizes = [written[self.monitor_prefix, name, "evidence"] for name in self.sensors]
+        most, which = torch.cat(sizes, -1).max(-1, keepdim=True)
+        alarm = most > 1
+        written[self.state_keys[-2]], written[self.state_keys[-1]] = alarm, torch.where(alarm, which, -1)
+        return written
+
+    def _after(self, place: int, name: str, sensor: MonitoredSensor, entries) -> dict:
+        """The entries of one sensor after one more step."""
+        nis, innovation, noise, freedom = self._read(sensor, entries)
+        keys = [(self.monitor_prefix, name, entry) for entry in _STATE]
+        old = dict(zip(_STATE, (self.required(entries, key) for key in keys), strict=True))
+        dtype = nis.dtype
+        nis = interpolate(nis, *self.tables[place].to(dtype)).clamp_min(0)
+        scale = getattr(self, f"scale_{name}").to(dtype)
+        window = observe(InnovationWindow(old["terms"], old["last"]), nis, innovation, freedom, scale)
+        tests, seen = innovation_tests(window), freedom > 0
+        score = normal_score(chi_square_p_value(nis, freedom), self.largest)
+        cusum = self._sum(old["cusum"], score, seen, self.cusum_limit[place])
+        limits = [limit[place].to(dtype) for limit in (self.p_limit, self.whiteness_limit)]
+        evidence = [cusum / self.cusum_limit[place], _logarithms(tests.p_value, limits[0])]
+        claim = old["claim"]
+        if noise is not None:
+            # Nothing blurs the beginning of blindness: twice the bound, so that two steps decide.
+            most = 2 * self.largest
+            score = self.claim_score(name, noise).clamp(-most, most)
+            claim = torch.where(seen, torch.cat([score, claim[..., :-1]], -1), claim)
+            evidence.append(claim.mean(-1, keepdim=True) / self.claim_limit[place])
+        if self.whiteness:
+            evidence.append(_logarithms(tests.whiteness, limits[1]))
+        evidence += self._signs(name, sensor, entries)
+        size = torch.cat(evidence, -1).amax(-1, keepdim=True).to(dtype)
+        values = (*window, cusum, claim, tests.p_value, tests.whiteness, size)
+        return dict(zip(keys, values, strict=True))
+
+    def claim_score(self, name: str, noise: Tensor) -> Tensor:
+        """The standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
+
+        It is that of the mean logarithm, among those of the clean data that the monitor was calibrated on.
+        """
+        place = list(self.sensors).index(name)
+        return interpolate(_claimed(noise), *self.claims[place].to(noise.dtype))
+
+    def _signs(self, name: str, sensor: MonitoredSensor, entries) -> list[Tensor]:
+        """The signs as multiples of their limits, if there are any."""
+        signs = None if sensor.sign_key is None else entries.get(unravel_key(sensor.sign_key))
+        if signs is None:
+            return []
+        return [(signs / getattr(self, f"sign_limit_{name}").to(signs.dtype)).nan_to_num(0.0, posinf=0.0)]
+
+    def _read(self, sensor: MonitoredSensor, entries) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """Normalised innovation squared, innovation, claimed noise, and how many components were observed."""
+        info = unravel_key(sensor.info_prefix)
+        info = (info,) if isinstance(info, str) else info
+        nis, innovation = (self.required(entries, (*info, entry)) for entry in ("nis", "innovation"))
+        check_observation_dim(sensor.observation_dim, innovation, f"the monitored sensor at {sensor.info_prefix!r}")
+        noise = None if sensor.noise_key is None else self.required(entries, unravel_key(sensor.noise_key))
+        mask = entries.get(unravel_key(sensor.observed_key))
+        # Without a mask to be read, as where an observation model makes it: what is not observed has no innovation.
+        seen = innovation != 0 if mask is None else mask.expand(innovation.shape)
+        count = seen.sum(-1, keepdim=True).to(nis.dtype)
+        return nis, innovation, noise, torch.where(nis > 0, count, 0)  # it is 0 where a belief begins
+
+    def _sum(self, total: Tensor, score: Tensor, seen: Tensor, limit: Tensor) -> Tensor:
+        ceiling = (self.ceiling * limit).to(total.dtype)
+        return torch.where(seen, torch.minimum(cusum_step(total, score, self.reference), ceiling), total)
+
+    def initial_state(self, batch_size: Sequence[int], *, device=None, dtype=None) -> list[Tensor]:
+        """The entries before anything was observed, in the order of ``state_keys``."""
+        make = {"device": device, "dtype": dtype}
+        zero, values = torch.zeros(*batch_size, 1, **make), []
+        for sensor in self.sensors.values():
+            values += [torch.zeros(*batch_size, self.window, 4, **make)]
+            values += [torch.zeros(*batch_size, sensor.observation_dim, **make), zero]
+            values += [torch.zeros(*batch_size, _CLAIMS, **make)]
+            values += [torch.ones_like(zero), torch.ones_like(zero), zero]
+        alarm = torch.zeros(*batch_size, 1, dtype=torch.bool, device=device)
+        return [*values, alarm, torch.full_like(alarm, -1, dtype=torch.int64)]
+
+    # --------------------------------------------------------------------------------------------------- calibration
+
+    @torch.no_grad()
+    def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> InnovationMonitor:
+        """Takes the distributions of the tests from innovations on clean data.
+
+        Quantiles of the normalised innovation squared are mapped to those of the chi-square distribution, those of the
+        claimed noise to normal scores. Then each test's limit becomes its quantile on the data, where theory's is not
+        stricter.
+
+        Args:
+            clean: recordings ``[*B, T]``, time last: what a filter wrote, with the entries that the monitor reads; an
+                episode begins at the first step, and where ``is_init`` says so. To know a limit takes about ten times
+                as many steps as lie between two false alarms.
+            margin: factor on the limits, where the data are fewer or less varied than what will come.
+
+        Returns:
+            This monitor.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a sensor is observed at fewer than 50 steps.
+        """
+        recordings = [_entries(each) for each in clean]
+        for place, (name, sensor) in enumerate(self.sensors.items()):
+            parts, claims = [], []
+            for entries in recordings:
+                nis, innovation, noise, freedom = self._read(sensor, entries)
+                seen = (freedom > 0).squeeze(-1)
+                parts.append((nis.squeeze(-1)[seen], innovation[seen]))
+                claims += [] if noise is None else [_claimed(noise[seen]).squeeze(-1)]
+            nis, innovation = (torch.cat(column).double() for column in zip(*parts, strict=True))
+            if len(nis) < 50:
+                raise ValueError(f"calibrate needs 50 steps at which {name!r} is observed; there are {len(nis)}")
+            getattr(self, f"scale_{name}").copy_(innovation.square().mean(0).sqrt().clamp_min(1e-12))
+            self.tables[place] = chi_square_table(nis, sensor.observation_dim)
+            if claims:
+                self.claims[place] = score_table(torch.cat(claims).double())
+            if sensor.sign_key is not None:
+                signs = [entries.get(unravel_key(sensor.sign_key)) for entries in recordings]
+                known = [each.flatten(0, -2) for each in signs if each is not None]
+                if known:
+                    limits = sign_limits(torch.cat(known), self.share, getattr(self, f"floor_{name}"), margin)
+                    getattr(self, f"sign_limit_{name}").copy_(limits)
+        self._set_limits([self.replay(each) for each in clean], margin)
+        return self
+
+    def _set_limits(self, tests: Sequence[TensorDictBase], margin: float) -> None:
+        strict = cusum_threshold(1 / self.share, self.reference)
+        for place, (name, sensor) in enumerate(self.sensors.items()):
+
+            def extreme(entry: str, level: float, name: str = name) -> float:
+                values = [each[self.monitor_prefix, name, entry].flatten().double() for each in tests]
+                return float(empirical_quantile(torch.cat(values), torch.tensor([level])))
+
+            self.p_limit[place] = min(self.share, extreme("p_value", self.share)) ** margin
+            self.whiteness_limit[place] = min(self.share, extreme("whiteness", self.share)) ** margin
+            self.cusum_limit[place] = margin * max(strict, extreme("cusum", 1 - self.share))
+            if sensor.noise_key is not None:
+                means = [each[self.monitor_prefix, name, "claim"].double().mean(-1).flatten() for each in tests]
+                found = float(empirical_quantile(torch.cat(means), torch.tensor([1 - self.share])))
+                # The scores of successive frames may be one: then their mean is a normal number, too.
+                normal = -float(torch.special.ndtri(torch.tensor(self.share, dtype=torch.float64)))
+                self.claim_limit[place] = margin * max(normal, found)
+
+    @torch.no_grad()
+    def replay(self, recorded: TensorDictBase) -> TensorDictBase:
+        """The monitor's entries on what a filter has written before, ``[*B, T]``, time last."""
+        batch, entries = recorded.batch_size[:-1], _entries(recorded)
+        read = [key for key in (*self.in_keys, *self.optional_keys, "is_init") if key not in self.state_keys]
+        rows = recorded.select(*(key for key in read if key in entries)).unbind(-1)
+        dtype = self._read(next(iter(self.sensors.values())), entries)[0].dtype
+        start = self.initial_state(batch, device=recorded.device, dtype=dtype)
+        state, out = dict(zip(self.state_keys, start, strict=True)), []
+        for row in rows:
+            new = row.get("is_init", None)
+            if new is not None:
+                pairs = zip(state.items(), start, strict=True)
+                state = {key: torch.where(expand_as_right(new, old), value, old) for (key, old), value in pairs}
+            for key, value in state.items():
+                row.set(key, value)
+            row = self(row)
+            state = {key: row.get(key) for key in self.state_keys}
+            out.append(row.select(*self.state_keys))
+        return torch.stack(out, len(batch))
+
+    def detectable_bias(self, power: float = 0.9) -> dict[str, float]:
+        """The smallest constant bias of each sensor's innovations that the windowed test finds, at its limit.
+
+        The filter follows a biased sensor, so that the innovation's bias is smaller than the sensor's. What is smaller
+        than this is not noticed within a window, and a gate does nothing against it.
+
+        Args:
+            power: probability with which it is to be found.
+
+        Returns:
+            By sensor, in standard deviations of its innovation.
+        """
+        limits = self.p_limit.double().clamp_min(1e-300).tolist()
+        return {
+            name: detectable_bias(sensor.observation_dim, limit, power=power, window=self.window)
+            for (name, sensor), limit in zip(self.sensors.items(), limits, strict=True)
+        }
+
+
+def _logarithms(p_value: Tensor, limit: Tensor) -> Tensor:
+    """How many times the logarithm of a p-value is that of its limit."""
+    least = torch.finfo(p_value.dtype).tiny
+    return p_value.clamp_min(least).log() / limit.clamp_min(least).log()
+
+
+def _claimed(noise: Tensor) -> Tensor:
+    """Mean logarithm of the claimed variances ``[*B, 1]``."""
+    return noise.clamp_min(torch.finfo(noise.dtype).tiny).log().mean(-1, keepdim=True)
+
+
+def _entries(tensordict: TensorDictBase) -> dict:
+    return {unravel_key(key): value for key, value in tensordict.items(True, True)}

@@ -1,0 +1,99 @@
+"""Readings whose own signs say that the sensor fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_count, check_number
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import mask_of
+from torch_denkf.monitoring._calibration import sign_limits
+
+__all__ = ["SignGate"]
+
+
+class SignGate(SubModel):
+    """Marks readings as not observed whose signs are larger than they are on clean data.
+
+    A *sign* is a number that is small while a sensor is sound and large when it fails, whatever it reads: the share of
+    a picture that is black (:func:`torch_denkf.applications.car.vision.picture_signs`), the residual of a fit, a
+    motor's temperature. It tells at once what innovations tell after some steps, or never. Put this module in front of
+    the filter, or of its sensor; an :class:`InnovationMonitor` raises its alarm by the same signs.
+
+    Args:
+        count: K, signs of a reading.
+        rate: share of the clean readings that are marked, all signs together.
+        floor: values up to which a sign is never large, one for all signs or one for each.
+        sign_key: the signs ``[*B, K]``. NaN says nothing.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of readings that were missing before.
+        out_key: the mask, of the same shape: False where a sign is large, and where a reading was missing before. Let
+            the filter read it, ``observed_key="seen"``.
+
+    Raises:
+        ValueError: if a number is out of range, or both masks have one key.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> clean = TensorDict({"signs": torch.linspace(0, 0.5, 1001).unsqueeze(-1)}, [1001])
+        >>> gate = SignGate(1, rate=0.01).calibrate([clean])
+        >>> gate(TensorDict({"signs": torch.tensor([[0.2], [0.8]])}, [2]))["seen"].tolist()
+        [[True], [False]]
+    """
+
+    limits: Tensor
+    floor: Tensor
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        rate: float = 1e-3,
+        floor: float | Sequence[float] = 0.0,
+        sign_key: NestedKey = "signs",
+        observed_key: NestedKey = "observed",
+        out_key: NestedKey = "seen",
+    ):
+        check_count("count", count)
+        check_number("rate", rate, above=0, below=0.5)
+        super().__init__(nn.Identity(), [sign_key], [out_key], optional_keys=[observed_key])
+        self.rate, self.marks = rate, mask_of(observed_key, out_key)
+        self.register_buffer("floor", floors(floor, count))
+        self.register_buffer("limits", torch.full((count,), torch.inf))
+
+    def compute(self, signs: Tensor, before: Tensor | None = None) -> Tensor:
+        """The mask."""
+        sound = ~(signs > self.limits.to(signs.dtype)).any(-1, keepdim=True)
+        return sound if before is None else sound & before
+
+    @torch.no_grad()
+    def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> SignGate:
+        """Takes from clean data what is large.
+
+        Args:
+            clean: recordings ``[*B]`` with the signs.
+            margin: factor on the limits, where the data are fewer or less varied than what will come.
+
+        Returns:
+            This module.
+        """
+        values = torch.cat([each[self.in_keys[0]].flatten(0, -2) for each in clean])
+        self.limits.copy_(sign_limits(values, self.rate, self.floor, margin))
+        return self
+
+
+def floors(floor: float | Sequence[float], count: int) -> Tensor:
+    """Floors ``[K]``.
+
+    Raises:
+        ValueError: if there are not K of them, or one is negative.
+    """
+    values = [floor] * count if isinstance(floor, (int, float)) else list(floor)
+    if len(values) != count:
+        raise ValueError(f"floor is one number, or one for each of the {count} signs; got {len(values)}")
+    for value in values:
+        check_number("floor", value, least=0)
+    return torch.tensor(values, dtype=torch.get_default_dtype())

@@ -1,0 +1,318 @@
+"""The terms of the library's losses, and the scores that they are made of: of members, of particles and of a Gaussian.
+
+Errors are zero where there is no label; a score is of the components that have one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import NestedKey, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torch_denkf.filters import Filter
+from torch_denkf.functional import crps_ensemble, crps_gaussian, crps_weighted, energy_score
+from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.weighted import weighted_mean
+from torch_denkf.modules import StochasticMLP
+from torch_denkf.modules._gaussian import as_covariance
+from torch_denkf.objectives._labels import Labels, Truth, check_row_mask, mean_of
+from torch_denkf.objectives.filter_loss import FilterLoss, Term
+
+MEMBER_SCORES = ("crps", "energy", "mse")
+GAUSSIAN_SCORES = ("crps", "nll", "mse")
+
+#: Which objective is for which belief, for messages.
+BELIEFS = (
+    "DEnKFLoss scores members that count alike, MixtureLoss particles with weights, GaussianLoss a mean and a "
+    "covariance. "
+)
+
+
+class OfBelief(Term):
+    """A term of a belief, a forecast or a smoothed belief, which stands under the ``key`` of this name."""
+
+    def __init__(self, name: str, key: str, weight: float = 1.0):
+        self.name, self.key = name, key
+        super().__init__(weight)
+
+    def place(self, truth: Truth) -> NestedKey:
+        """Where it stands."""
+        return getattr(truth.keys, self.key)
+
+
+class Members(OfBelief):
+    """The score of members that count alike."""
+
+    def forward(self, out, truth):
+        filter = truth.loss.filter
+        weights = [key for key in written_by(filter) if isinstance(key, tuple) and key[-1] == "log_weight"]
+        if weights:
+            raise TypeError(
+                f"DEnKFLoss scores members that count alike, but those of this {type(filter).__name__} have weights, "
+                f'{weights[0]!r}. Take MixtureLoss, with score="crps" for this one\'s score'
+            )
+        return score_ensemble(truth, truth.entry(self.place(truth), BELIEFS))
+
+
+class Moments(OfBelief):
+    """The score of a mean and a covariance."""
+
+    def forward(self, out, truth):
+        mean, cov = (truth.entry((self.place(truth), name), BELIEFS) for name in ("mean", "cov"))
+        return score_moments(truth, mean, cov)
+
+
+class Particles(OfBelief):
+    """The score of weighted particles."""
+
+    def forward(self, out, truth):
+        errors, log_weights, labels = self.errors(truth)
+        std = labels.in_all_components("component_std", truth.loss.component_std)
+        return score_mixture(errors, labels.mask, log_weights, truth.loss.score, std, labels.scale), labels.rows
+
+    def errors(self, truth: Truth) -> tuple[Tensor, Tensor, Labels]:
+        """Errors of the particles ``[*B, T, E, S]``, their log-weights ``[*B, T, E]`` and the labels."""
+        place = self.place(truth)
+        particles = truth.entry((place, "ensemble"), BELIEFS)
+        log_weights = truth.out.get((place, "log_weight"), None)
+        if log_weights is None:
+            log_weights = torch.full_like(particles[..., 0], -math.log(particles.shape[-2]))
+        labels = truth.state(particles.shape[-1])
+        return labels.errors(particles), log_weights, labels
+
+
+class Mean(Particles):
+    """The squared error of the particles' mean."""
+
+    def forward(self, out, truth):
+        errors, log_weights, labels = self.errors(truth)
+        # The mean of errors, because the mean of angles on both sides of pi is none.
+        return labels.mean(weighted_mean(errors, log_weights).square()), labels.rows
+
+
+class Sensor(Term):
+    """The score of a sensor's samples against the true observation."""
+
+    name = "sensor"
+    of_frames = True
+
+    def forward(self, out, truth):
+        samples, labels = sensor_samples(truth)
+        # Samples have no density: what scores the state by one scores them by their CRPS.
+        score = truth.loss.score if truth.loss.score in ("mse", "energy") else "crps"
+        return score_members(labels.errors(samples), labels.mask, score), labels.rows
+
+    def exists(self, loss: FilterLoss) -> bool:
+        """A module writes its samples, or the user has named where they are."""
+        key = unravel_key(loss.tensor_keys.sensor)
+        return key in written_by(loss.filter) or key != loss.default_keys.sensor
+
+
+class Noise(Term):
+    """The negative log-likelihood of the true observation under the samples' mean and R."""
+
+    name = "noise"
+    of_frames = True
+
+    def forward(self, out, truth):
+        samples, labels = sensor_samples(truth)
+        noise = truth.entry(truth.keys.noise, "R must follow from frames alone. ")
+        error = labels.errors(samples).mean(-2)
+        return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
+
+
+class Observation(Term):
+    """The squared error of what the observation model reads of the true state."""
+
+    name = "observation"
+    of_frames = True
+
+    def forward(self, out, truth):
+        model = observation_model(truth.loss.filter)
+        if model is None:
+            raise KeyError(
+                "loss_observation is of a model with an observe() method, and the filter has no observation model with "
+                "one. Set the weight observation=0."
+            )
+        state = truth.whole_state()
+        observation = model.observe(state.values)
+        labels = truth.observation(truth.entry(truth.keys.target_observation, given=True), observation.shape[-1])
+        labels = labels._replace(mask=labels.mask & state.mask)
+        return labels.mean(labels.errors(observation).square()), labels.rows
+
+
+class Likelihood(Term):
+    """The negative log-likelihood of the readings."""
+
+    name = "nll"
+    needs_state = False
+
+    def forward(self, out, truth):
+        key = truth.keys.log_likelihood
+        # Of several analyses, each with its own readings, the likelihoods multiply.
+        keys = truth.loss.filter.structure.likelihoods if key == truth.loss.default_keys.log_likelihood else []
+        first, *others = [truth.entry(key) for key in keys or [key]]
+        return -sum(others, first).squeeze(-1), None
+
+
+class Divergence(Term):
+    """The KL divergence of flipout weights from their prior."""
+
+    name = "kl"
+    needs_state = False
+
+    def forward(self, out, truth):
+        layers = (part for part in truth.loss.filter.modules() if isinstance(part, StochasticMLP))
+        return sum((layer.kl() for layer in layers), torch.zeros(())), None
+
+
+def score_members(errors: Tensor, mask: Tensor, score: str) -> Tensor:
+    """Scores members that are off by ``errors``.
+
+    One member is a point, and the CRPS of a point is its absolute error; the energy score is the length of its error.
+    The fair scores of more members need pairs of them.
+
+    Args:
+        errors: ``[*, E, N]``, in the units of the score.
+        mask: which components have a label, ``[*, N]``.
+        score: ``"crps"``, fair, in each dimension, averaged; ``"energy"``, fair, of all dimensions together; ``"mse"``,
+            the squared error of the mean.
+
+    Returns:
+        The scores, ``[*]``.
+
+    Example:
+        >>> score_members(torch.tensor([[-3.0]]), torch.tensor([True]), "crps")
+        tensor(3.)
+        >>> score_members(torch.tensor([[-1.0], [1.0]]), torch.tensor([True]), "crps")
+        tensor(0.)
+    """
+    if score == "mse":
+        return mean_of(errors.mean(-2).square(), mask)
+    zero, fair = torch.zeros_like(errors[..., 0, :]), errors.shape[-2] > 1
+    if score == "energy":
+        return energy_score(errors, zero, fair=fair)
+    return mean_of(crps_ensemble(errors, zero, fair=fair), mask)
+
+
+def score_mixture(
+    errors: Tensor, mask: Tensor, log_weights: Tensor, score: str, std: Tensor, scale: Tensor | None
+) -> Tensor:
+    """Scores weighted particles that are off by ``errors``.
+
+    Args:
+        errors: ``[*, E, N]``, divided by ``scale``.
+        mask: which components have a label, ``[*, N]``.
+        log_weights: ``[*, E]``.
+        score: ``"mixture"``, the negative log-density of all dimensions together in their own units, with a Gaussian
+            around each particle; ``"crps"`` with weights, in each dimension, averaged.
+        std: width of these Gaussians, ``[N]``.
+        scale: ``[N]``; ``None`` for one.
+
+    Returns:
+        The scores, ``[*]``.
+    """
+    if score == "crps":
+        return mean_of(crps_weighted(errors, log_weights, torch.zeros_like(errors[..., 0, :])), mask)
+    # In the state's own units the density is one of the scaled state, divided by all scales.
+    width = std if scale is None else std * scale
+    constant = torch.where(mask, width.log() + 0.5 * math.log(2 * math.pi), 0).sum(-1)
+    log_density = log_weights - 0.5 * (errors / std).square().sum(-1)
+    return constant - torch.logsumexp(log_density, -1)
+
+
+def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale: Tensor | None = None) -> Tensor:
+    """Scores a Gaussian whose mean is off by ``errors``.
+
+    Args:
+        errors: ``[*, N]``, divided by ``scale``.
+        mask: which components have a label, ``[*, N]``.
+        cov: ``[*, N, N]``, in its own units.
+        score: ``"crps"`` in each dimension, averaged; ``"nll"``, the negative log-density of all dimensions together,
+            in nats, in their own units; ``"mse"`` of the mean.
+        scale: ``[N]``; ``None`` for one.
+
+    Returns:
+        The scores, ``[*]``.
+
+    Example:
+        >>> score_gaussian(torch.zeros(2), torch.tensor([True, False]), torch.eye(2), "nll")
+        tensor(0.9189)
+    """
+    if score == "mse":
+        return mean_of(errors.square(), mask)
+    if scale is not None:
+        cov = cov / scale.unsqueeze(-1) / scale
+    zero = torch.zeros_like(errors)
+    if score == "nll":
+        # Components without a label are made independent and standard normal; their density at zero is taken out
+        # again. It is a density of the unscaled errors: the scale only conditions the arithmetic.
+        identity = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
+        cov = torch.where(mask.unsqueeze(-1) & mask.unsqueeze(-2), cov, identity)
+        units = zero if scale is None else scale.log().expand_as(errors)
+        added = torch.where(mask, units, -0.5 * math.log(2 * math.pi))
+        return added.sum(-1) - gaussian_log_prob(errors, zero, cov)
+    # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
+    variance = cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
+    return mean_of(crps_gaussian(zero, variance, errors), mask)
+
+
+def score_ensemble(truth: Truth, ensemble: Tensor) -> tuple[Tensor, Tensor]:
+    """The loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
+    labels = truth.state(ensemble.shape[-1])
+    return score_members(labels.errors(ensemble), labels.mask, truth.loss.score), labels.rows
+
+
+def score_moments(truth: Truth, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
+    """Likewise, of a mean ``[*B, S]`` and a covariance ``[*B, S, S]``."""
+    labels = truth.state(mean.shape[-1])
+    return score_gaussian(labels.errors(mean), labels.mask, cov, truth.loss.score, labels.scale), labels.rows
+
+
+def sensor_samples(truth: Truth) -> tuple[Tensor, Labels]:
+    """The sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
+
+    Raises:
+        KeyError: if there are no samples, or no true observation.
+    """
+    keys, filter, data = truth.keys, truth.loss.filter, truth.data
+    target, model = data.get(keys.target_observation, None), observation_model(filter)
+    if target is None:
+        if model is None or learns(model):
+            why = (
+                "has no observation model with an observe() method" if model is None else "learns its observation model"
+            )
+            raise KeyError(
+                f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "
+                "the entry, rename it with set_keys(target_observation=...), or set the weight sensor=0.0."
+            )
+        target = truth.observed_state(model.observe)
+    cure = "" if keys.sensor in written_by(filter) else "No module of the filter writes it: set the weight sensor=0.0. "
+    samples = truth.entry(keys.sensor, cure)
+    if samples.ndim == data.ndim + 1:
+        samples = samples.unsqueeze(-2)
+    labels = truth.observation(target, samples.shape[-1])
+    observed = data.get(keys.observed, None)
+    if observed is not None:
+        check_row_mask(keys.observed, observed, labels.values)
+        labels = labels._replace(mask=labels.mask & observed.all(-1, keepdim=True))
+    return samples, labels
+
+
+def observation_model(filter: Filter) -> TensorDictModuleBase | None:
+    """The filter's model of what it observes in a state, which may be a part of its analysis."""
+    parts = (part for module in filter.update_modules for part in module.modules())
+    return next((part for part in parts if hasattr(part, "observe")), None)
+
+
+def learns(model: nn.Module) -> bool:
+    """Whether a model has parameters."""
+    return any(True for _ in model.parameters())
+
+
+def written_by(filter: Filter) -> list[NestedKey]:
+    """What a filter writes, by the names of its modules: what stands before them is taken off."""
+    return [*filter.structure.frame_keys, *filter.structure.step_keys]

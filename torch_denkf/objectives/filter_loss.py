@@ -1,0 +1,344 @@
+"""The one loss of filters, and what its terms are: it runs a filter once over a batch, and returns weighted terms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypedDict
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torch_denkf._arguments import Checked, check_key
+from torch_denkf._checks import check_number
+from torch_denkf.filters import Filter
+from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.modules._tensors import as_floating, check_dims
+from torch_denkf.objectives._labels import Keys, Truth
+
+__all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]
+
+
+#: A scale of each dimension; infinite where the dimension does not count.
+Scale = Sequence[float] | Tensor | None
+
+
+class ReadingsOptions(TypedDict, total=False):
+    """What every loss that scores readings takes.
+
+    Labels, true states and true observations, may have gaps. A mask of labels, which is named like them with
+    ``_observed`` behind (``"state_observed"``; ``[*B, 1]``, or one for each dimension), says where there are some, and
+    NaN is none. A gap has no value and no gradient: a score is of the dimensions that have a label, and means are over
+    the elements that have one. Of a batch without any the loss is zero.
+
+    Attributes:
+        observation_scale: ``[O]``; errors of observations are divided by it, so that dimensions with different units
+            count alike. A dimension with infinite scale does not count: means are taken over the others. A term that
+            is a likelihood stays a density in the observation's own units.
+        observation_angles: dimensions of observations that are angles in radians; their errors are wrapped to
+            [-pi, pi).
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``: the shape of the batch, zero where an element does
+            not count.
+    """
+
+    observation_scale: Scale
+    observation_angles: Sequence[int]
+    reduction: Literal["mean", "sum", "none"]
+
+
+class StateOptions(TypedDict, total=False):
+    """What every loss takes that scores the state.
+
+    The true state may have fewer dimensions than the belief: its labels are of the leading ones, or of ``dims``.
+
+    Attributes:
+        dims: state dimensions that count; all that have labels by default. Labels are of the leading dimensions; or of
+            ``dims`` alone, in their order, where some of these lie beyond as many leading ones.
+        state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
+            dimension with infinite scale does not count.
+        angles: state dimensions that are angles in radians, counted in the whole state; their errors are wrapped to
+            [-pi, pi).
+    """
+
+    dims: Sequence[int] | None
+    state_scale: Scale
+    angles: Sequence[int]
+
+
+class SequenceOptions(ReadingsOptions, StateOptions, total=False):
+    """What every loss of a whole filter takes.
+
+    Attributes:
+        detach_every: truncated back-propagation: steps after which the belief is detached.
+    """
+
+    detach_every: int | None
+
+
+class Term(nn.Module):
+    """A term of a loss, ``loss_<name>``; a subclass writes :meth:`forward`.
+
+    A term may have parameters and buffers of its own: they are the loss's, too.
+
+    Args:
+        weight: its weight; zero for a term that is neither computed nor returned, ``None`` for 1 where :meth:`exists`
+            finds what it scores, else 0.
+
+    Attributes:
+        name: its name, after ``loss_``.
+        of_frames: whether it counts in all elements that have what it scores, and not only in those that the filter
+            stepped to.
+        needs_state: whether it needs the true state.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> class Absolute(Term):
+        ...     name = "absolute"
+        ...     def forward(self, out, truth):
+        ...         mean = out["belief", "mean"]
+        ...         labels = truth.state(mean.shape[-1])
+        ...         return labels.mean(labels.errors(mean).abs()), labels.rows
+        >>> one = torch.eye(1)
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> loss = FilterLoss(plain, [Absolute()])
+        >>> loss(TensorDict({"observation": torch.zeros(8, 1), "state": torch.ones(8, 1)}, [8]))["loss_absolute"]
+        tensor(1.)
+    """
+
+    name: str
+    of_frames = False
+    needs_state = True
+
+    def __init__(self, weight: float | None = 1.0):
+        super().__init__()
+        if weight is not None:
+            check_number(self.name, weight, least=0, cure="It is a term's weight")
+        self.weight = weight
+
+    def forward(self, out: TensorDictBase, truth: Truth) -> tuple[Tensor, Tensor | None]:
+        """The term's value in each element.
+
+        Args:
+            out: the batch ``[*B]`` with what the filter wrote.
+            truth: the labels: ``truth.state(S)`` and ``truth.observation(target, O)`` give true values, where they are
+                known, and errors with the loss's scales and angles.
+
+        Returns:
+            Its values ``[*B]``, or one number; and which elements have what it scores, ``[*B]`` bool (``None``: all).
+        """
+        raise NotImplementedError
+
+    def exists(self, loss: FilterLoss) -> bool:
+        """Whether there is what the term scores, for a weight of ``None``."""
+        return True
+
+
+@dataclass
+class SequenceKeys(Keys):
+    """The entries that losses of whole filters read beside those of all losses.
+
+    Attributes:
+        belief: prefix of the belief's entries: ``mean`` and ``cov``, or ``ensemble`` and ``log_weight``.
+        forecast: likewise, of the forecast.
+        log_likelihood: that of the innovation, or of the reading.
+    """
+
+    belief: NestedKey = "belief"
+    forecast: NestedKey = "forecast"
+    log_likelihood: NestedKey = ("info", "log_likelihood")
+
+
+class FilterLoss(Checked, LossModule):
+    """Runs a filter once over sequences ``[*B, T]``, and returns weighted terms: ``loss_<name>`` for each.
+
+    The other losses are this one with terms of their own. Terms with weight zero are neither computed nor returned; the
+    others are returned with their weight applied, so that their sum is the objective. Those elements count that were
+    stepped to; the first of a sequence and those with ``is_init`` hold an initial belief. A mask of padding in the
+    data, such as ``("collector", "mask")``, leaves elements out of every term. Slices in a flat ``[N]``, as torchrl's
+    ``SliceSampler`` returns them, must be marked.
+
+    Args:
+        filter: the filter; its parameters are the loss's.
+        terms: what is scored, see :class:`Term`.
+        score: one of the class's ``SCORES``, where it has some.
+        dims: state dimensions that count; all that have labels by default.
+        state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
+            dimension with infinite scale does not count: means are taken over the others.
+        observation_scale: ``[O]``, likewise, for observations.
+        angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        observation_angles: likewise, dimensions of observations.
+        detach_every: truncated back-propagation: steps after which the belief is detached.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
+
+    Raises:
+        TypeError: for what is no filter or no term.
+        ValueError: on an unknown score, two terms of one name, a scale that is not positive, infinite in all
+            dimensions, or of another length than what is scored, labels of another shape, or slices that are not
+            marked.
+
+    Example:
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> class Square(Term):
+        ...     name = "square"
+        ...     def forward(self, out, truth):
+        ...         labels = truth.state(1)
+        ...         return labels.mean(labels.errors(out["belief", "mean"]).square()), labels.rows
+        >>> one = torch.eye(1)
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> loss = FilterLoss(plain, [Square(0.5)])
+        >>> loss(TensorDict({"observation": torch.zeros(8, 1), "state": torch.ones(8, 1)}, [8]))["loss_square"]
+        tensor(0.5000)
+    """
+
+    _AcceptedKeys: type[Keys] = SequenceKeys
+    default_keys: type[Keys] = SequenceKeys
+    SCORES: Sequence[str] = ()
+    #: The filter keeps its parameters.
+    functional = False
+
+    def __init__(
+        self,
+        filter: Filter,
+        terms: Sequence[Term],
+        *,
+        score: str = "crps",
+        dims: Sequence[int] | None = None,
+        state_scale: Scale = None,
+        observation_scale: Scale = None,
+        angles: Sequence[int] = (),
+        observation_angles: Sequence[int] = (),
+        detach_every: int | None = None,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ):
+        if self.SCORES and score not in self.SCORES:
+            *others, last = (f'"{name}"' for name in self.SCORES)
+            raise ValueError(f"score is {', '.join(others)} or {last}; got {score!r}.")
+        if not isinstance(filter, Filter):
+            raise TypeError(f"filter must be a torch_denkf Filter; got {filter!r}"[:200])
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f'reduction is "mean", "sum" or "none"; got {reduction!r}.')
+        check_dims("angles", angles)
+        check_dims("observation_angles", observation_angles)
+        if dims is not None:
+            check_dims("dims", dims, once=True)
+            if not len(dims):
+                raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
+        super().__init__()
+        self.dims = None if dims is None else [int(dim) for dim in dims]
+        self.filter, self.score, self.reduction, self.detach_every = filter, score, reduction, detach_every
+        self.angles, self.observation_angles = list(angles), list(observation_angles)
+        self.register_buffer("state_scale", _checked_scale("state_scale", state_scale))
+        self.register_buffer("observation_scale", _checked_scale("observation_scale", observation_scale))
+        if self.dims is not None and self.state_scale is not None and self.state_scale.numel() != len(self.dims):
+            raise ValueError(f"state_scale has one entry for each of dims={self.dims}; got {self.state_scale.numel()}.")
+        self.terms = nn.ModuleList(_checked_terms(terms))
+        self._choose_terms()
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What must be there."""
+        return self._needed()
+
+    @in_keys.setter
+    def in_keys(self, value) -> None:
+        raise AttributeError("in_keys follow from the filter; rename the state with set_keys(state=...).")
+
+    def set_keys(self, **kwargs: NestedKey | None) -> None:
+        """Names entries otherwise, see the class's ``_AcceptedKeys``; ``None`` for the default.
+
+        Raises:
+            TypeError: for what is no key: a string, or a tuple of strings.
+            ValueError: for entries that the loss does not read.
+        """
+        for name, key in kwargs.items():
+            if key is not None:
+                check_key(name, key)
+        super().set_keys(**kwargs)
+        self._choose_terms()
+
+    def _choose_terms(self) -> None:
+        given = {term.name: float(term.exists(self)) if term.weight is None else term.weight for term in self.terms}
+        self.weights = {name: weight for name, weight in given.items() if weight}
+        self.out_keys = [f"loss_{name}" for name in self.weights]
+
+    def named_parameters(self, prefix: str = "", recurse: bool = True) -> Iterator[tuple[str, nn.Parameter]]:
+        """The parameters that are trained, with their names in the loss."""
+        found, parts = super().named_parameters(prefix, recurse), self._trained()
+        if parts is None:
+            return found
+        own = {id(parameter) for part in parts for parameter in part.parameters()}
+        return ((name, value) for name, value in found if id(value) in own)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the weighted terms; ``tensordict`` is left as it is."""
+        out = self._run(tensordict)
+        truth, losses = Truth(self, tensordict, out), TensorDict({}, batch_size=[])
+        for term in self.terms:
+            if term.name not in self.weights:
+                continue
+            value, mask = term(out, truth)
+            if mask is None or not term.of_frames:
+                mask = truth.counts if mask is None else mask & truth.counts
+            if value.ndim and self.reduction == "none":
+                value = self._reduce_loss(torch.where(mask, value, 0), tensordict)
+            elif value.ndim:
+                value = self._reduce_loss(value, tensordict, mask=mask)
+            losses[f"loss_{term.name}"] = self.weights[term.name] * value
+        return losses
+
+    # ------------------------------------------------------------------------ what a loss of a part has otherwise
+
+    def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The batch with what the filter, or its part, writes."""
+        refuse_unmarked_slices(tensordict, self.filter.init_key)
+        return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
+
+    def _filters(self):
+        """What runs over the sequences."""
+        return self.filter
+
+    def _counts(self, tensordict: TensorDictBase) -> Tensor:
+        """Which elements were stepped to, ``[*B]``."""
+        return self.filter.stepped(tensordict)
+
+    def _needed(self) -> list[NestedKey]:
+        """What the filter must find beside its belief, and the true state."""
+        structure = self.filter.structure
+        needed = [*structure.needed, *structure.controls]
+        supervised = any(term.needs_state for term in self.terms if term.name in self.weights)
+        return [*needed, self.tensor_keys.state] if supervised else needed
+
+    def _trained(self) -> Iterable[nn.Module] | None:
+        """The modules of the part that is trained; ``None`` for all.
+
+        The whole filter is kept, so that it follows the loss to another device, and its names stay in the state dict.
+        """
+        return None
+
+
+def _checked_scale(name: str, scale: Scale) -> Tensor | None:
+    if scale is None:
+        return None
+    scale = as_floating(scale, name)
+    if scale.ndim > 1:
+        raise ValueError(f"{name} is one number a dimension; got {list(scale.shape)}.")
+    if not ((scale > 0).all() and scale.isfinite().any()):
+        raise ValueError(f"{name} is positive, and infinite where a dimension does not count; one must. Got {scale}.")
+    return scale
+
+
+def _checked_terms(terms: Sequence[Term]) -> list[Term]:
+    names = set()
+    for term in terms:
+        if not isinstance(term, Term):
+            raise TypeError(f"terms are objects of classes made of torch_denkf's Term; got {term!r}"[:200])
+        if term.name in names:
+            raise ValueError(f"Two terms are called {term.name!r}; give one of them another name.")
+        names.add(term.name)
+    return list(terms)

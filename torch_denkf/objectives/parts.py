@@ -1,0 +1,366 @@
+"""Training objectives of one part of a filter: they train that part, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from math import log
+from typing import Literal, Unpack
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
+
+from torch_denkf._arguments import check_key
+from torch_denkf._checks import check_count
+from torch_denkf.filters import Filter
+from torch_denkf.filters._one_sequence import refuse_unmarked_slices
+from torch_denkf.filters._structure import previous_key
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._running import reads, reads_of, run_module, run_modules
+from torch_denkf.modules._tensors import as_floating
+from torch_denkf.objectives import _terms
+from torch_denkf.objectives._labels import Keys, Truth
+from torch_denkf.objectives.filter_loss import FilterLoss, ReadingsOptions, StateOptions, Term
+
+__all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
+
+
+class ObservationLoss(FilterLoss):
+    r"""Scores what a filter's observation model reads of true states, ``[*B]``.
+
+    Its term ``loss_observation`` is the squared error of :math:`h_\psi(x_t)` against the true observation, the term of
+    that name in :class:`~torch_denkf.objectives.DEnKFLoss`. The parameters of the loss are those of the model.
+
+    Args:
+        filter: the filter whose observation model is trained; a module with an ``observe()`` method.
+        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
+
+    Raises:
+        ValueError: if a scale is not positive, or labels have another shape.
+        KeyError: if the filter has no such model, or an entry is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> plain = KalmanFilter(one, 3 * one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> loss = ObservationLoss(plain)
+        >>> td = TensorDict({"state": torch.ones(8, 1), "target_observation": torch.ones(8, 1)}, [8])
+        >>> loss(td)["loss_observation"]
+        tensor(4.)
+    """
+
+    _AcceptedKeys = default_keys = Keys
+    SCORES = ("mse",)
+
+    def __init__(self, filter: Filter, **options: Unpack[ReadingsOptions]):
+        super().__init__(filter, [_terms.Observation()], score="mse", **options)
+
+    def _trained(self):
+        model = _terms.observation_model(self.filter)
+        return [] if model is None else [model]
+
+    def _needed(self):
+        return [self.tensor_keys.state, self.tensor_keys.target_observation]
+
+    def _run(self, tensordict):
+        return tensordict
+
+
+class SensorLoss(FilterLoss):
+    r"""Scores what a filter's sensor reads, without the filter, on any batch of frames ``[*B]``. Of two or
+    more dimensions the last is time, for modules that tell times apart.
+
+    Those modules are run that read frames alone and lead to what is scored: the sensor, and with ``noise`` its noise
+    model. Other sensors of the filter, and their readings, need not be there.
+
+    ========================  =====================================================================================
+    ``loss_sensor``           score of the sensor's samples against the true observation, the term of that name in
+                              :class:`~torch_denkf.objectives.DEnKFLoss`
+    ``loss_noise``            negative log-likelihood of the true observation under N(mean of the samples, R), nats
+    ========================  =====================================================================================
+
+    Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames
+    count where the sensor observed all and the true observation is known, see :class:`ReadingsOptions`. The parameters
+    of the loss are those of the modules it runs.
+
+    Args:
+        filter: the filter whose sensor is trained.
+        score: of the samples: ``"crps"`` (fair), ``"energy"`` (fair) or ``"mse"`` (of the mean). Of one sample the
+            first two are its absolute error, and the length of its error: the scores of a point.
+        sensor: weight of ``loss_sensor``.
+        noise: weight of ``loss_noise``. R must follow from frames alone.
+        **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
+
+    Raises:
+        ValueError: on an unknown score, a scale that is not positive, or labels of another shape.
+        KeyError: if an entry that a term needs is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import DEnKF
+        >>> loss = SensorLoss(DEnKF.paper(5, 2, ensemble_size=4), noise=0.1)
+        >>> frames = TensorDict({"pixels": torch.rand(3, 6, 50, 150), "target_observation": torch.randn(3, 2)}, [3])
+        >>> sorted(loss(frames).keys())
+        ['loss_noise', 'loss_sensor']
+    """
+
+    @dataclass
+    class _AcceptedKeys(Keys):
+        """The entries that the loss reads.
+
+        Attributes:
+            state: true state ``[*B, S]``, read where there is no true observation.
+            state_observed: where it is known, ``[*B, 1]`` or ``[*B, S]``.
+            target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
+                no parameters, it is that model's observation of the true state.
+            target_observed: where it is known, ``[*B, 1]`` or ``[*B, O]``.
+            observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
+            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+            noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+        """
+
+        noise: NestedKey = ("sensor", "noise")
+
+    default_keys = _AcceptedKeys
+    SCORES = _terms.MEMBER_SCORES
+
+    def __init__(
+        self,
+        filter: Filter,
+        *,
+        score: Literal["crps", "energy", "mse"] = "crps",
+        sensor: float = 1.0,
+        noise: float = 0.0,
+        **options: Unpack[ReadingsOptions],
+    ):
+        super().__init__(filter, [_terms.Sensor(sensor), _terms.Noise(noise)], score=score, **options)
+
+    def _trained(self):
+        return [module for _, module in self._placed()]
+
+    def _placed(self):
+        """The modules that read frames alone and lead to what is scored: the sensor, and R where its weight is set."""
+        wanted = {unravel_key(self.tensor_keys.sensor)}
+        wanted |= {unravel_key(self.tensor_keys.noise)} if "noise" in self.weights else set()
+        placed = []
+        for place, module in reversed(self.filter.structure.frames):
+            if not wanted.isdisjoint(map(unravel_key, module.out_keys)):
+                placed.append((place, module))
+                wanted.update(key for keys in reads(module) for key in keys)
+        return placed[::-1]
+
+    def _needed(self):
+        """What the modules read, and the true observation, or the state that it follows from."""
+        model, keys = _terms.observation_model(self.filter), self.tensor_keys
+        unknown = model is None or _terms.learns(model)
+        return [*reads_of(self._trained())[0], keys.target_observation if unknown else keys.state]
+
+    def _run(self, tensordict):
+        size, out = tensordict.batch_size, tensordict.copy()
+        call = Call(size, time=len(size) > 1)
+        # As in Filter.sequence: a recurrent network among these modules reads whole sequences.
+        with set_recurrent_mode(True) if call.time else nullcontext():
+            written = run_modules(self._placed(), self.filter.entries_of(tensordict), call)
+        for key, value in written.items():
+            out.set(key, value)
+        return out
+
+
+class TransitionLoss(FilterLoss):
+    r"""Scores the forecast of one step from the true state at t-1 against the true state at t, on ``[*B, T]``.
+
+    Nothing is filtered: all steps are made at once, each from the truth. The members of an ensemble filter are all at
+    the truth, or around it by ``spread``; the transition's own noise makes them differ. A filter with a mean and a
+    covariance starts from N(truth, spread²). The one term is ``loss_transition``. The first element of a sequence, and
+    those where an episode begins, do not count. Nor do those with gaps in their labels: a step starts where all of the
+    state is known, and is scored against what is known one step later, see :class:`ReadingsOptions`. The parameters of
+    the loss are those of the transition.
+
+    Args:
+        filter: the filter whose transition is trained.
+        score: ``"crps"``, ``"energy"`` or ``"mse"`` of members, as in :class:`~torch_denkf.objectives.DEnKFLoss`;
+            ``"crps"``, ``"nll"`` or ``"mse"`` of a Gaussian, as in :class:`~torch_denkf.objectives.GaussianLoss`. A
+            transition without noise has no spread but ``spread``: teach it by ``"mse"``.
+        spread: standard deviation around the truth, in the state's units: a number or ``[S]``. Members are drawn anew
+            in each call.
+        members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
+        belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+        **options: ``dims``, ``state_scale`` and ``angles``, see :class:`StateOptions`.
+
+    Raises:
+        ValueError: on an unknown score, a scale that is not positive, a negative spread, too few members, a filter that
+            carries neither members nor moments, labels of a part of the state, a batch without time, or slices that
+            are not marked.
+        KeyError: if an entry is missing.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.filters import KalmanFilter
+        >>> one = torch.eye(1)
+        >>> plain = KalmanFilter(one, one, process_noise=[1.0], noise=[1.0], mean=torch.zeros(1), cov=one)
+        >>> loss = TransitionLoss(plain, score="mse")
+        >>> loss(TensorDict({"state": torch.tensor([[0.0], [1.0], [3.0]])}, [3]))["loss_transition"]  # (1 + 4) / 2
+        tensor(2.5000)
+    """
+
+    _AcceptedKeys = default_keys = Keys
+
+    def __init__(
+        self,
+        filter: Filter,
+        *,
+        score: Literal["crps", "energy", "nll", "mse"] = "crps",
+        spread: float | Sequence[float] | Tensor = 0.0,
+        members: int | None = None,
+        belief: str = "belief",
+        reduction: Literal["mean", "sum", "none"] = "mean",
+        **options: Unpack[StateOptions],
+    ):
+        check_key("belief", belief)
+        found = members_of(filter, belief, members)
+        self.SCORES = _terms.GAUSSIAN_SCORES if found is None else _terms.MEMBER_SCORES
+        if members is not None:
+            check_count(
+                "members", members, least=1 if score == "mse" else 2, cure='One member has no spread: score it by "mse"'
+            )
+        super().__init__(filter, [Step()], score=score, reduction=reduction, **options)
+        self.belief, self.members = belief, found
+        self.register_buffer("spread", as_floating(spread, "spread"))
+        if not ((self.spread >= 0) & self.spread.isfinite()).all():
+            raise ValueError(f"spread is a standard deviation, finite and not negative; got {spread}.")
+
+    def _trained(self):
+        return [self.filter.transition_module]
+
+    def _needed(self):
+        """What the transition reads beside the belief, and the true state."""
+        structure = self.filter.structure
+        needed = [*structure.needed, *structure.controls]
+        read = reads(self.filter.transition_module)[0]
+        if not set(read).isdisjoint(structure.frame_keys):
+            read = needed
+        return [*(key for key in needed if key in read), self.tensor_keys.state]
+
+    def _run(self, tensordict):
+        if not tensordict.ndim:
+            raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
+        refuse_unmarked_slices(tensordict, self.filter.init_key)
+        truth = Truth(self, tensordict, tensordict).whole_state().values
+        # Whatever else reads the true state finds no NaN either.
+        known = tensordict.copy().set(self.tensor_keys.state, truth)
+        written = forecasts_from_truth(self.filter, known, truth, self.belief, spread=self.spread, members=self.members)
+        return TensorDict(written, tensordict.batch_size)
+
+    def _counts(self, tensordict):
+        # Without a stored belief, which would let the first element of a slice count: its truth before is unknown.
+        stepped = self.filter.stepped(tensordict.exclude("previous"))
+        known = Truth(self, tensordict, tensordict).whole_state().rows
+        return stepped & one_earlier(known, tensordict.ndim - 1)
+
+
+class Step(Term):
+    """The score of a step from the truth."""
+
+    name = "transition"
+
+    def forward(self, out, truth):
+        belief = truth.loss.belief
+        if truth.loss.members is None:
+            return _terms.score_moments(truth, out[belief, "mean"], out[belief, "cov"])
+        return _terms.score_ensemble(truth, out[belief, "ensemble"])
+
+
+def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
+    """E, as many as were asked for or as the initial belief has; ``None`` of a filter with a mean and a covariance.
+
+    Raises:
+        ValueError: if the filter carries neither below the prefix ``belief``, or nobody says how many.
+    """
+    carry = filter.structure.carry
+    if (belief, "ensemble") not in carry:
+        if not {(belief, "mean"), (belief, "cov")} <= set(carry):
+            raise ValueError(
+                f"A step from a true state needs {(belief, 'ensemble')}, or {(belief, 'mean')} and {(belief, 'cov')}; "
+                f"the filter carries {list(carry)}. Name the prefix of its belief, belief=..."
+            )
+        return None
+    members = getattr(filter.initial, "ensemble_size", None) if members is None else members
+    if members is None:
+        raise ValueError(
+            f"{type(filter.initial).__name__} does not say how many members the belief has; pass members=..."
+        )
+    return members
+
+
+def forecasts_from_truth(
+    filter: Filter, tensordict: TensorDictBase, truth: Tensor, belief: str, *, spread: Tensor, members: int | None
+) -> Entries:
+    """What the transition writes at every time of ``[*B, T]`` where the state before was the true one.
+
+    What else the belief carries is read where it is stored, and taken from the initial belief of that time where not.
+
+    Args:
+        filter: the filter.
+        tensordict: actions, which are read one step earlier, and what else the transition reads.
+        truth: ``[*B, T, S]``; that of the first time stands for the one before it, too.
+        belief: prefix of the belief.
+        spread: standard deviation of members around the truth, or of the Gaussian, ``[S]`` or one number.
+        members: E.
+
+    Returns:
+        What it writes, by the names of the belief: ``(belief, "ensemble")`` and so on.
+    """
+    structure, size = filter.structure, tensordict.batch_size
+    place, transition = structure.transition
+    time, call = len(size) - 1, Call(size, time=True)
+    entries = filter.entries_of(tensordict)
+    if any(key in structure.frame_keys for keys in reads(transition) for key in keys):
+        with torch.no_grad():  # these parts are not the ones that are trained
+            entries.update(run_modules(structure.frames, entries, call))
+    carried = _belief_at(truth, belief, spread, members)
+    others = [key for key in structure.carry if key not in carried and key not in entries]
+    if others:
+        without = {key: value for key, value in entries.items() if unravel_key(key) not in structure.belief}
+        with torch.no_grad():
+            start = run_module(filter.initial, without, call.part("initial"))
+        entries.update({key: start[key] for key in others})
+    entries.update(carried)
+    for key in structure.carry:
+        entries[key] = one_earlier(entries[key], time)
+    for key in structure.controls:
+        if previous_key(key) in entries:
+            entries[key] = entries[previous_key(key)]
+        elif key in entries:
+            entries[key] = one_earlier(entries[key], time)
+    written = run_module(transition, entries, call.part(place))
+    return {key: written[forecast] for key, forecast in structure.forecast_of.items()}
+
+
+def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None) -> Entries:
+    """What a belief may hold that is at the truth, or around it by ``spread``."""
+    std = spread.to(truth.dtype).expand_as(truth)
+    if members is None:
+        return {(belief, "mean"): truth, (belief, "cov"): std.square().diag_embed()}
+    ensemble = truth.unsqueeze(-2).expand(*truth.shape[:-1], members, truth.shape[-1])
+    if spread.any():
+        ensemble = ensemble + std.unsqueeze(-2) * torch.randn_like(ensemble)
+    return {
+        (belief, "ensemble"): ensemble,
+        (belief, "log_weight"): torch.full_like(ensemble[..., 0], -log(members)),
+        (belief, "mean"): truth,
+        (belief, "var"): std.square(),
+    }
+
+
+def one_earlier(value: Tensor, time: int) -> Tensor:
+    """Every element from one step before; the first stays where it is."""
+    count = value.shape[time]
+    return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)

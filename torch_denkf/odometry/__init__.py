@@ -1,6 +1,0 @@
-"""Where a car is, from one camera: a filter that is trained once, saved as a folder, and run on images."""
-
-import lazy_loader
-
-# __init__.pyi names what is here, and where; a module is imported when one of its names is first used.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

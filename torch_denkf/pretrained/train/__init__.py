@@ -1,1 +1,0 @@
-"""How the filters of the library were trained: ``python -m torch_denkf.pretrained.train NAME --out FOLDER``."""

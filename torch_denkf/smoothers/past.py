@@ -1,0 +1,251 @@
+r"""A filter that also carries its last L states, which each new reading corrects: the parts of fixed-lag smoothing.
+
+:class:`torch_denkf.smoothers.FixedLag` puts them into a filter. The order of a step is
+
+    transition -- past (moves on by one) -- observation, analysis (of present and past) -- lagged belief
+
+The past of the first steps of an episode is the episode's first state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from torch_denkf._checks import check_count, check_shape
+from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.weighted import weighted_mean, weighted_var
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
+from torch_denkf.modules.analysis import EnsembleAnalysis
+from torch_denkf.modules.carried import Beside, InPlaceOf
+from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
+
+__all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "with_past"]
+
+
+class Past(NamedTuple):
+    """Which entries hold the last L states, and what is believed of the oldest.
+
+    Attributes:
+        carried: last names of the entries.
+        follow: last names of what follows from these, of the state L steps ago.
+        copies: the entries at the start of an episode, from the prefix of the belief, L, and the belief.
+        oldest: what follows, from the prefix, L, and the entries that are carried on.
+        present: last names of the belief's entries that follow from those that are carried, too, before the oldest's.
+    """
+
+    carried: tuple[str, ...]
+    follow: tuple[str, ...]
+    copies: Callable[[str, int, Entries], Sequence[torch.Tensor]]
+    oldest: Callable[[str, int, Entries], Sequence[torch.Tensor]]
+    present: tuple[str, ...] = ()
+
+
+def with_past(
+    initial: TensorDictModuleBase,
+    lag: int,
+    past: Past,
+    *,
+    age: int = 0,
+    belief_prefix: str = "belief",
+    smoothed_prefix: str = "smoothed",
+) -> Beside:
+    """An initial belief with a past: L copies of its state.
+
+    Args:
+        initial: the initial belief.
+        lag: L.
+        past: ``ENSEMBLE_PAST``, ``MOMENTS_PAST`` or ``JOINT_PAST``.
+        age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
+            updated with its own frame.
+        belief_prefix: prefix of what ``initial`` writes, and of the past.
+        smoothed_prefix: prefix of what follows of the oldest state, and of its ``age``, see :class:`LaggedBelief`.
+
+    Raises:
+        ValueError: if ``lag`` is not positive.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import GaussianPrior
+        >>> start = with_past(GaussianPrior([0.0], [1.0], ensemble_size=4), 3, ENSEMBLE_PAST)
+        >>> start(TensorDict({}))["belief", "past"].shape
+        torch.Size([4, 3, 1])
+    """
+    check_count("lag", lag, cure="It counts the steps to look back")
+    return Beside(
+        initial,
+        [*((belief_prefix, name) for name in past.carried), (smoothed_prefix, "age")],
+        partial(_begin, past.copies, belief_prefix, lag, age),
+        follow_keys=[*((belief_prefix, name) for name in past.present), *((smoothed_prefix, n) for n in past.follow)],
+        follow=partial(past.oldest, belief_prefix, lag),
+    )
+
+
+def _begin(copies: Callable, prefix: str, lag: int, age: int, belief: Entries, batch_size: torch.Size):
+    past = copies(prefix, lag, belief)
+    return [*past, torch.full((*batch_size, 1), age, device=past[0].device)]
+
+
+def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
+    return [belief[prefix, "ensemble"].unsqueeze(-2).repeat_interleave(lag, -2)]
+
+
+def _oldest(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
+    ensemble = entries[prefix, "past"][..., -1, :]
+    return ensemble, *moments_of(ensemble, entries.get((prefix, "log_weight")))
+
+
+#: The members of the past, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
+ENSEMBLE_PAST = Past(("past",), ("ensemble", "mean", "var"), _copies, _oldest)
+
+
+class EnsemblePast(SubModel):
+    """The past moves on by one step: the last belief becomes its latest state, the oldest is forgotten.
+
+    Args:
+        belief_prefix: prefix of ``ensemble`` ``[*B, E, S]`` and ``past`` ``[*B, E, L, S]``, the latest first.
+        out_key: the past of the new time, ``[*B, E, L, S]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> belief = {"ensemble": torch.tensor([[3.0]]), "past": torch.tensor([[[2.0], [1.0]]])}
+        >>> EnsemblePast()(TensorDict({"belief": belief}))["forecast", "past"].flatten()
+        tensor([3., 2.])
+    """
+
+    def __init__(self, *, belief_prefix: str = "belief", out_key: NestedKey = ("forecast", "past")):
+        super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [out_key])
+
+    def compute(self, ensemble, past):
+        """The past."""
+        return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
+
+
+class LaggedAnalysis(InPlaceOf):
+    """An analysis that corrects the past with the same reading, by the past's covariance with the prediction.
+
+    It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
+
+    Args:
+        analysis: :class:`EnsembleAnalysis` or :class:`LocalEnsembleAnalysis`; its keys and its noise are kept.
+        past_key: the past ``[*B, E, L, S]``, read and written.
+
+    Raises:
+        TypeError: for another analysis, which does not say what it does to other states.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> members = torch.tensor([[-1.0], [1.0]])
+        >>> td = TensorDict({
+        ...     "forecast": {"ensemble": members, "observation": members, "past": members.unsqueeze(-1) / 2},
+        ...     "sensor": {"ensemble": torch.tensor([4.0]), "noise": torch.tensor([2.0])},
+        ... })
+        >>> td = LaggedAnalysis(EnsembleAnalysis("etkf"))(td)
+        >>> td["belief", "mean"].round(decimals=4), td["forecast", "past"].mean().round(decimals=4)
+        (tensor([2.]), tensor(1.))
+    """
+
+    def __init__(
+        self,
+        analysis: EnsembleAnalysis | LocalEnsembleAnalysis,
+        *,
+        past_key: NestedKey = ("forecast", "past"),
+    ):
+        if not isinstance(analysis, EnsembleAnalysis | LocalEnsembleAnalysis):
+            raise TypeError(
+                f"{type(analysis).__name__} does not say what a reading means for earlier states. A lag needs an "
+                "EnsembleAnalysis or a LocalEnsembleAnalysis; smooth other ensembles with EnRTS."
+            )
+        super().__init__(
+            analysis,
+            [*analysis.in_keys, past_key],
+            [*analysis.out_keys, past_key],
+            optional_keys=analysis.optional_keys,
+        )
+        self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
+        self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
+        if hasattr(analysis, "noise_variance_key"):
+            self.noise_variance_key = analysis.noise_variance_key
+
+    def noise_sizes(self, *values):
+        """Those of the analysis."""
+        return self.module.noise_sizes(*values)
+
+    def without_reading(self, *values):
+        """The belief where there is no reading: the forecast, and the past as it is."""
+        past = values[len(self.module.in_keys)]
+        return *self.module.without_reading(*values), past
+
+    def on_entries(self, entries, call):
+        """The belief, the diagnostics, and the past."""
+        return self.on_aligned(self.aligned(entries), call)
+
+    def aligned(self, entries):
+        """See :meth:`EnsembleAnalysis.aligned`."""
+        return self.module.aligned(entries)
+
+    def on_aligned(self, entries, call):
+        """See :meth:`EnsembleAnalysis.on_aligned`."""
+        return super().on_entries(entries, call)
+
+    def compute(self, forecast, predicted, observation, variance, past, observed=None, *, noise):
+        """The belief, the diagnostics, and the past."""
+        out = self.module.compute(forecast, predicted, observation, variance, observed, noise=noise)
+        return *out, self.module.move_past(past, predicted, observation, variance, observed, noise=noise)
+
+
+class LaggedBelief(SubModel):
+    """What is believed of the state L steps ago, given all readings up to now.
+
+    Args:
+        belief_prefix: prefix of the ``past`` ``[*B, E, L, S]`` that is carried on, and of ``log_weight`` ``[*B, E]``.
+        smoothed_prefix: prefix of ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``, and ``age`` ``[*B,
+            1]``: by how many steps the state lies back, L, or fewer where the episode is younger.
+        past_key: the past after the analysis, ``[*B, E, L, S]``.
+        weighted: whether the members are particles with log-weights.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"forecast": {"past": torch.tensor([[[3.0], [1.0]], [[5.0], [2.0]]])}})
+        >>> td["smoothed", "age"] = torch.tensor([7])
+        >>> LaggedBelief()(td)["smoothed", "mean"], td["smoothed", "age"]
+        (tensor([1.5000]), tensor([2]))
+    """
+
+    def __init__(
+        self,
+        *,
+        belief_prefix: str = "belief",
+        smoothed_prefix: str = "smoothed",
+        past_key: NestedKey = ("forecast", "past"),
+        weighted: bool = False,
+    ):
+        age = (smoothed_prefix, "age")
+        out_keys = [(belief_prefix, "past"), *((smoothed_prefix, name) for name in ("ensemble", "mean", "var")), age]
+        super().__init__(nn.Identity(), [past_key, age] + [(belief_prefix, "log_weight")] * weighted, out_keys)
+
+    def compute(self, past, age, log_weight=None):
+        """The past, and the belief of its oldest state."""
+        check_age(age, past.shape[:-3])
+        ensemble = past[..., -1, :]
+        return past, ensemble, *moments_of(ensemble, log_weight), (age + 1).clamp(max=past.shape[-2])
+
+
+def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
+    """Raise unless the age of the oldest state that is carried is ``[*B, 1]``."""
+    check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
+
+
+def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and variance ``[*B, S]`` of members, or of weighted particles."""
+    if log_weight is not None:
+        return weighted_mean(ensemble, log_weight), weighted_var(ensemble, log_weight)
+    mean = ensemble_mean(ensemble)
+    return mean, ensemble_var(ensemble, mean)

@@ -1,0 +1,165 @@
+r"""Fixed-lag smoothing of a mean and a covariance: the last L states of a Kalman filter, corrected by each reading.
+
+Of a state :math:`x_{t-j}` three things are carried: its smoothed mean, the product D of the smoother's gains of the
+steps since, and the covariance V that :math:`x_{t-j}` would keep if :math:`x_t` were known. With the belief of t,
+P, the covariance is :math:`V + D P D^T`, and a reading that moves the mean of t by d moves that of t - j by D d. It is
+the Rauch-Tung-Striebel smoother, forward in time, and does not ask how the reading was used.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, unravel_key
+from torch import nn
+
+from torch_denkf.functional.smoothing import smoothing_gain
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._call import Entries
+from torch_denkf.modules._gaussian import GaussianTransition
+from torch_denkf.modules._running import reads
+from torch_denkf.modules.carried import InPlaceOf
+from torch_denkf.modules.kalman import LinearTransition
+from torch_denkf.smoothers.past import Past, check_age
+
+__all__ = ["MOMENTS_PAST", "CrossTransition", "LaggedMoments", "MomentsPast"]
+
+
+class CrossTransition(InPlaceOf):
+    """A forecast of mean and covariance, with the covariance of the states before and after the step.
+
+    Args:
+        transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
+            are kept.
+        cross_key: the covariance, ``[*B, S, S]``, rows before the step.
+
+    Raises:
+        TypeError: for another transition.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> double = CrossTransition(LinearTransition(2 * torch.eye(1), torch.eye(1)))
+        >>> double(TensorDict({"belief": {"mean": torch.ones(1), "cov": torch.eye(1)}}))["forecast", "cross"]
+        tensor([[2.]])
+    """
+
+    def __init__(
+        self,
+        transition: LinearTransition | GaussianTransition,
+        *,
+        cross_key: NestedKey = ("forecast", "cross"),
+    ):
+        if not isinstance(transition, LinearTransition | GaussianTransition):
+            raise TypeError(
+                f"{type(transition).__name__} does not give the covariance of the states before and after a step; "
+                "LinearTransition, EKFTransition and UKFTransition do."
+            )
+        needed, optional = reads(transition)
+        super().__init__(transition, needed, [*transition.out_keys, cross_key], optional_keys=optional)
+
+    def on_entries(self, entries, call):
+        """The forecast and the cross-covariance."""
+        written, cross = self.module.with_cross(entries, call, wanted=True)
+        return {**written, unravel_key(self.out_keys[-1]): cross}
+
+    def without_step(self, entries):
+        """What stands beside the forecast where an episode begins: there is no state before."""
+        mean = self.required(entries, self.in_keys[0])
+        return {unravel_key(self.out_keys[-1]): mean.new_zeros(*mean.shape, mean.shape[-1])}
+
+
+def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
+    """The state itself, of which nothing is left open."""
+    mean, cov = belief[prefix, "mean"], belief[prefix, "cov"]
+    gain = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
+    return [torch.stack([value] * lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
+
+
+def _oldest_carried(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
+    return _oldest(*(entries[prefix, name] for name in ("cov", *MOMENTS_PAST.carried)))
+
+
+def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Tensor, ...]:
+    """Mean, covariance and variance of the oldest state, beside the covariance of the present one."""
+    gain = past_gain[..., -1, :, :]
+    smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
+    smoothed = (smoothed + smoothed.mT) / 2
+    return past_mean[..., -1, :], smoothed, smoothed.diagonal(dim1=-2, dim2=-1)
+
+
+#: Means ``[*B, L, S]`` of the past, and V and D of above, ``[*B, L, S, S]``, the latest first.
+MOMENTS_PAST = Past(("past_mean", "past_cov", "past_gain"), ("mean", "cov", "var"), _copies, _oldest_carried)
+
+
+class MomentsPast(SubModel):
+    """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
+
+    Args:
+        belief_prefix: prefix of ``mean``, ``cov`` and of the past, see ``MOMENTS_PAST``.
+        forecast_prefix: prefix of ``cov`` and ``cross`` of the forecast, see :class:`CrossTransition`.
+        smoothed_prefix: prefix of ``age``.
+        out_key: prefix of ``mean``, ``cov`` and ``gain`` of the past at the new time, before its reading.
+    """
+
+    def __init__(
+        self,
+        *,
+        belief_prefix: str = "belief",
+        forecast_prefix: str = "forecast",
+        smoothed_prefix: str = "smoothed",
+        out_key: str = "past",
+    ):
+        in_keys = [
+            (belief_prefix, "mean"),
+            (belief_prefix, "cov"),
+            (forecast_prefix, "cov"),
+            (forecast_prefix, "cross"),
+        ]
+        in_keys += [*((belief_prefix, name) for name in MOMENTS_PAST.carried), (smoothed_prefix, "age")]
+        super().__init__(nn.Identity(), in_keys, [(out_key, name) for name in ("mean", "cov", "gain")])
+
+    def compute(self, mean, cov, forecast_cov, cross, past_mean, past_cov, past_gain, age):
+        """The past."""
+        check_age(age, mean.shape[:-1])
+        # At the start of an episode, before its own frame, no step has been made.
+        start = (age < 0).unsqueeze(-1)
+        identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+        gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, forecast_cov)))
+        left_open = torch.where(start, 0, cov - gain @ torch.where(start, 0, cross.mT))
+        means = torch.cat([mean.unsqueeze(-2), past_mean[..., :-1, :]], -2)
+        gains = torch.cat([identity.expand(cov.shape).unsqueeze(-3), past_gain[..., :-1, :, :]], -3)
+        opens = torch.cat([torch.zeros_like(cov).unsqueeze(-3), past_cov[..., :-1, :, :]], -3)
+        opens = opens + gains @ left_open.unsqueeze(-3) @ gains.mT
+        return means, (opens + opens.mT) / 2, gains @ gain.unsqueeze(-3)
+
+
+class LaggedMoments(SubModel):
+    """The past after a reading, and what is believed of the state L steps ago.
+
+    Args:
+        belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.
+        forecast_prefix: prefix of ``mean`` of the forecast.
+        smoothed_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]``, ``var`` ``[*B, S]`` and ``age``
+            ``[*B, 1]``, see :class:`LaggedBelief`.
+        past_key: prefix of what :class:`MomentsPast` writes.
+    """
+
+    def __init__(
+        self,
+        *,
+        belief_prefix: str = "belief",
+        forecast_prefix: str = "forecast",
+        smoothed_prefix: str = "smoothed",
+        past_key: str = "past",
+    ):
+        in_keys = [(belief_prefix, "mean"), (belief_prefix, "cov"), (forecast_prefix, "mean")]
+        in_keys += [*((past_key, name) for name in ("mean", "cov", "gain")), (smoothed_prefix, "age")]
+        out_keys = [(belief_prefix, name) for name in MOMENTS_PAST.carried]
+        out_keys += [(smoothed_prefix, name) for name in (*MOMENTS_PAST.follow, "age")]
+        super().__init__(nn.Identity(), in_keys, out_keys)
+
+    def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
+        """The past, and the belief of its oldest state."""
+        shift = (past_gain @ (mean - forecast)[..., None, :, None]).squeeze(-1)
+        past_mean = past_mean + shift
+        age = (age + 1).clamp(max=past_mean.shape[-2])
+        return past_mean, past_cov, past_gain, *_oldest(cov, past_mean, past_cov, past_gain), age
