@@ -1,7 +1,8 @@
-"""What the folders of ``torch_denkf.applications`` register: builders of filters, weights, commands of the terminal.
+"""What outer rings register with inner ones, which import nothing of theirs: here it is looked up by name.
 
-An application has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in ``weights/NAME/``.
-Nothing else of the library knows an application.
+A folder of ``torch_denkf.applications`` has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in
+``weights/NAME/``. Nothing else of the library knows an application. ``torch_denkf.inductor`` is what filters compile
+with.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ def builders() -> dict[str, Callable[..., Any]]:
 def commands() -> dict[str, tuple[str, str]]:
     """Modules whose ``main`` runs a command of the terminal, and what it does, by the command's name."""
     return {name: command for each in _all() for name, command in each.COMMANDS.items()}
+
+
+def compiler() -> ModuleType:
+    """The room that knows torch's compiler; importing inductor itself, which it does later, takes half a second."""
+    return import_module("torch_denkf.inductor")
 
 
 def weights() -> dict[str, Path]:

@@ -11,7 +11,7 @@ from torch import nn
 
 from torch_denkf.deployment import export, export_step, load_step
 from torch_denkf.filters import DEnKF, KalmanFilter
-from torch_denkf.filters._inductor import trace_below_autograd
+from torch_denkf.inductor import trace_below_autograd
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select, StochasticMLP
 
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="no C++ compiler")

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
-from torch_denkf.filters._inductor import need_compiler
+from torch_denkf.inductor import need_compiler
 from torch_denkf.modules import ConstantNoise, LinearObservation
 
 #: float32: a few roundings through eight steps; float64 likewise.

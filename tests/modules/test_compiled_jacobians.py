@@ -11,8 +11,8 @@ from torch import nn
 from tests.filters.factories import has_compiler
 from torch_denkf.applications.car import PairObservation, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import ClonedTransition
-from torch_denkf.filters._inductor import options_for_processors
 from torch_denkf.fusion.parts import JoinedObservation, StateObservation
+from torch_denkf.inductor import options_for_processors
 from torch_denkf.modules import (
     BiasedObservation,
     BiasedTransition,

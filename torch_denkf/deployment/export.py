@@ -14,9 +14,14 @@ from torch import Tensor, nn
 from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
-from torch_denkf.filters._compared import refuse_other_numbers
-from torch_denkf.filters._inductor import clear_damaged_libraries, clear_full_cache, need_compiler, trace_below_autograd
 from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.inductor import (
+    clear_damaged_libraries,
+    clear_full_cache,
+    need_compiler,
+    refuse_other_numbers,
+    trace_below_autograd,
+)
 from torch_denkf.modules._call import Entries
 
 

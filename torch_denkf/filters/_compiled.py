@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import has_values
-from torch_denkf.filters._compared import placed, refuse_other_numbers, tensors
+from torch_denkf._registered import compiler
 from torch_denkf.filters._steps import Steps
 from torch_denkf.modules._call import Call, Entries
 
@@ -32,16 +32,14 @@ class CompiledSteps:
 
     Args:
         chunk: steps of a sequence in one graph.
-        options: of ``torch.compile``; on a processor, if there are none, the passes of ``filters._inductor``.
+        options: of ``torch.compile``; on a processor, if there are none, the passes of ``torch_denkf.inductor``.
     """
 
     def __init__(self, chunk: int, options: Mapping[str, Any]):
         if chunk < 0:
             raise ValueError(f"chunk is a number of steps, or 0 for none; got {chunk}.")
         if options.get("backend", "inductor") == "inductor":
-            from torch_denkf.filters._inductor import need_compiler
-
-            need_compiler()
+            compiler().need_compiler()
         self.chunk, self.options = chunk, dict(options)
         self._functions: dict[tuple, tuple[Callable, set]] = {}
 
@@ -108,14 +106,13 @@ class CompiledSteps:
         Raises:
             RuntimeError: if it does not return what it returns eagerly.
         """
-        some = next(tensors(inputs))
+        room = compiler()
+        some = next(room.tensors(inputs))
         device = some.device
         kind = (*kind, steps.structure.modules, steps.update_at_reset, steps.ceiling, steps.reject, device)
         if kind not in self._functions:
             if self.options.get("backend", "inductor") == "inductor":
-                from torch_denkf.filters._inductor import clear_damaged_libraries
-
-                clear_damaged_libraries()
+                room.clear_damaged_libraries()
             function = make()
             # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
             code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
@@ -125,7 +122,7 @@ class CompiledSteps:
         function, compared = self._functions[kind]
         mode = torch.is_grad_enabled(), some.dtype  # for each torch.compile compiles anew
         if mode not in compared and has_values(some):
-            refuse_other_numbers(
+            room.refuse_other_numbers(
                 function,
                 make(),
                 inputs,
@@ -141,7 +138,7 @@ class CompiledSteps:
             )
             compared.add(mode)
         out = function(*inputs)
-        return placed(out, (value.clone() for value in tensors(out))) if self._overwrites(device) else out
+        return room.placed(out, (value.clone() for value in room.tensors(out))) if self._overwrites(device) else out
 
     def _overwrites(self, device: torch.device) -> bool:
         """Whether outputs lie in memory that the next call uses again: that of CUDA graphs."""
@@ -153,9 +150,7 @@ class CompiledSteps:
     def _arguments(self, device: torch.device) -> dict[str, Any]:
         if self.options or device.type != "cpu":
             return self.options
-        from torch_denkf.filters._inductor import options_for_processors  # importing inductor takes half a second
-
-        return {"options": options_for_processors()}
+        return {"options": compiler().options_for_processors()}
 
 
 def _frames(steps: Steps, names: tuple) -> list[NestedKey]:

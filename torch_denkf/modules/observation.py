@@ -111,7 +111,7 @@ class Select(_Observation):
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns the selected dimensions of states ``[*, S]``."""
-        # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up, see tests/filters/test_compared.py.
+        # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up, see tests/inductor/test_compared.py.
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
 

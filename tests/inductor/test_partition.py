@@ -8,8 +8,8 @@ from torch._inductor import config
 from torch._inductor.compile_fx import partition_fn
 from torch._inductor.decomposition import select_decomp_table
 
-from torch_denkf.filters._inductor import partition as _partition
-from torch_denkf.filters._inductor.partition import FewSavedTensors
+from torch_denkf.inductor import partition as _partition
+from torch_denkf.inductor.partition import FewSavedTensors
 
 
 def compiled(function, partitioner=None):

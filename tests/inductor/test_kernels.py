@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torch_denkf.filters._inductor.kernels import FEW_ROWS, SMALL, SMALL_OF_ROWS, FewCalls
+from torch_denkf.inductor.kernels import FEW_ROWS, SMALL, SMALL_OF_ROWS, FewCalls
 
 aten = torch.ops.aten
 

@@ -5,7 +5,7 @@ import torch
 from torch._inductor.utils import run_and_get_code
 
 from tests.filters.factories import has_compiler
-from torch_denkf.filters._inductor import options_for_processors
+from torch_denkf.inductor import options_for_processors
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import torch
 from tests.conftest import COMPILED
 from tests.filters.factories import has_compiler
 from torch_denkf._lock import locked
-from torch_denkf.filters._inductor.libraries import clear_damaged_libraries, is_whole
+from torch_denkf.inductor.libraries import clear_damaged_libraries, is_whole
 
 ROOT = Path(__file__).parents[2]
 

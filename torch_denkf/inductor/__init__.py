@@ -1,4 +1,6 @@
-"""Passes for inductor, torch.compile's backend, and the tracing of packages: the only room for torch's private names.
+"""What knows torch's compiler: its passes, the tracing of packages, and what compares compiled with eager numbers.
+
+It is the only room for torch's private names.
 
 A step is thirty kernels of a microsecond or two; so calling them, and what they save for the backward pass, must cost
 little. The passes make no result right that is wrong without them. They are used with the versions of torch that they
@@ -14,9 +16,12 @@ from typing import Any
 
 import torch
 
-from torch_denkf.filters._inductor.libraries import clear_damaged_libraries as clear_damaged_libraries
-from torch_denkf.filters._inductor.libraries import clear_full_cache as clear_full_cache
-from torch_denkf.filters._inductor.tracing import trace_below_autograd as trace_below_autograd
+from torch_denkf.inductor.compared import placed as placed
+from torch_denkf.inductor.compared import refuse_other_numbers as refuse_other_numbers
+from torch_denkf.inductor.compared import tensors as tensors
+from torch_denkf.inductor.libraries import clear_damaged_libraries as clear_damaged_libraries
+from torch_denkf.inductor.libraries import clear_full_cache as clear_full_cache
+from torch_denkf.inductor.tracing import trace_below_autograd as trace_below_autograd
 
 #: Versions of torch, by their first two numbers, that the passes were tested with.
 TESTED_VERSIONS = ("2.13",)
@@ -31,9 +36,9 @@ def options_for_processors() -> dict[str, Any]:
     version = ".".join(torch.__version__.split(".")[:2])
     if version in TESTED_VERSIONS:
         try:
-            from torch_denkf.filters._inductor.kernels import FewCalls
-            from torch_denkf.filters._inductor.partition import FewSavedTensors
-            from torch_denkf.filters._inductor.scheduling import ShortFunctions
+            from torch_denkf.inductor.kernels import FewCalls
+            from torch_denkf.inductor.partition import FewSavedTensors
+            from torch_denkf.inductor.scheduling import ShortFunctions
 
             return {
                 "cpp_wrapper": True,

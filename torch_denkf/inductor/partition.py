@@ -18,7 +18,7 @@ from torch._functorch.partitioners import min_cut_rematerialization_partition
 from torch._inductor.custom_graph_pass import CustomPartitionerFn, get_hash_for_files
 from torch.fx import Graph, GraphModule, Node
 
-from torch_denkf.filters._inductor.kernels import insert_call
+from torch_denkf.inductor.kernels import insert_call
 
 __all__ = ["FewSavedTensors"]
 

@@ -13,9 +13,9 @@ from torch._dynamo.backends.common import aot_autograd
 from tests.filters.factories import has_compiler, linear_denkf, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import linear_filter, linear_frames
 from tests.filters.test_contract import particles
-from torch_denkf.filters import EKF, Filter, KalmanFilter, _compared
-from torch_denkf.filters._compared import refuse_other_numbers
+from torch_denkf.filters import EKF, Filter, KalmanFilter
 from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.inductor import compared, refuse_other_numbers
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 from torch_denkf.modules._running import named_modules_of
 
@@ -204,7 +204,7 @@ def test_rounding_is_measured(make, monkeypatch):
     filter.compile(backend=compiler(rounded))
     with torch.no_grad():
         with monkeypatch.context() as patch:
-            patch.setattr(_compared, "_NUDGES", 0)
+            patch.setattr(compared, "_NUDGES", 0)
             with pytest.raises(RuntimeError, match="rounding explains"):  # it is more than the last digits
                 filter.step(row.copy())
         assert filter.step(row.copy())["belief", "mean"].isfinite().all()
@@ -220,7 +220,7 @@ def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
     with torch.no_grad():
         filter.step(row.copy())
         assert counting.graphs == 1
-        monkeypatch.setattr(_compared, "_results", None)
+        monkeypatch.setattr(compared, "_results", None)
         filter.step(row.copy())
     assert counting.graphs == 1
 
