@@ -142,7 +142,7 @@ def gaussian(kind):
                 MOVE, Sensor("samples"), torch.eye(2), noise(), process_noise_cov=Q.square().diag(), **options
             )
         walk = ConstantNoise(Q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
-        return kind(NoisyLinear(MOVE), walk, Sensor("samples"), Heading(), noise(), **options)
+        return kind(NoisyLinear(MOVE), Sensor("samples"), Heading(), noise(), process_noise=walk, **options)
 
     return make
 

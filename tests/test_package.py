@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -98,7 +99,7 @@ look("functional", "metrics")
 import tensordict
 look("plots")
 import torchrl.envs  # which itself imports mujoco where it is installed
-look(*"vision modules filters smoothers transforms objectives training data envs odometry pretrained".split())
+look(*"applications.car modules filters smoothers transforms objectives training data envs pretrained".split())
 print(json.dumps(found))
 """
 
@@ -107,7 +108,7 @@ def test_what_an_import_costs():
     done = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert found["functional"] == found["plots"] == []
-    assert set(found["vision"]) <= {"cv2", "PIL", "torchrl"}, "data sets and their environments read images"
+    assert set(found["applications.car"]) <= {"cv2", "PIL", "torchrl"}, "data sets and their environments read images"
 
 
 @pytest.mark.parametrize("package", ["torch_denkf", "torch_denkf.data"])
@@ -130,9 +131,15 @@ def test_every_public_name_is_there():
         "data",
         "envs",
         "plots",
-        "odometry",
         "pretrained",
+        "fusion",
+        "monitoring",
+        "training",
+        "deployment",
+        "applications.car",
+        "applications.ur5",
+        "applications.reacher",
     ):
-        package = __import__(f"torch_denkf.{name}", fromlist=["*"])
+        package = import_module(f"torch_denkf.{name}")
         for public in getattr(package, "__all__", ()):
             assert hasattr(package, public), f"torch_denkf.{name}.{public}"

@@ -59,10 +59,10 @@ def range_bearing(make):
     q = ConstantNoise(STD, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return make(
         UnicycleTransition(torch.zeros_like, DT),
-        q,
         None,
         LearnedObservation(RangeBearing()),
         ConstantNoise(READING_STD, in_key="reading"),
+        process_noise=q,
         initial=GaussianAround(START_STD, state_key="start"),
         observation_key="reading",
         angles=[2, 3],

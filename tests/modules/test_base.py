@@ -118,7 +118,7 @@ CASES = {
     "analysis": (
         lambda **k: EnsembleAnalysis("perturbed", **k),
         {
-            "forecast_prefix": "f",
+            "forecast_key": "f",
             "predicted_key": ("p", "y"),
             "observation_key": ("s", "y"),
             "noise_variance_key": ("s", "r"),

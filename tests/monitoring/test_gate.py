@@ -153,7 +153,8 @@ def test_adaptive_inflation_finds_the_missing_process_noise():
     generator, one = torch.Generator().manual_seed(0), torch.eye(1, dtype=torch.float64)
     walk = (0.4 * torch.randn(16, 600, 1, generator=generator)).cumsum(1).double()
     readings = walk + 0.1 * torch.randn(16, 600, 1, generator=generator).double()
-    told = {"process_noise": [0.1], "noise": [0.1]}
+    std = torch.tensor([0.1], dtype=torch.float64)
+    told = {"process_noise": std, "noise": std}
     td = TensorDict({"observation": readings}, [16, 600])
     plain = KalmanFilter(one, one, **told, mean=torch.zeros(1).double(), cov=one)
     wider = Gated(copy.deepcopy(plain), rate=0.0, adapt_inflation=0.02)

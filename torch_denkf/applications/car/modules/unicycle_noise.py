@@ -35,6 +35,7 @@ class UnicycleNoise(NoiseThrough):
 
     Example:
         >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import CholeskyNoise
         >>> noise = UnicycleNoise(CholeskyNoise(2, r=[0.5, 0.1], in_features=5), dt=0.1)
         >>> mean = torch.tensor([0.0, 0.0, 0.0, 10.0, 0.0])
         >>> td = TensorDict({"belief": {"mean": mean}, "forecast": {"mean": mean}})
