@@ -38,11 +38,10 @@ def with_motion(
     ========= =============== =========================================================================================
     key       shape           content
     ========= =============== =========================================================================================
-    ``flow``  [N, 3, 25, 79]  float16: coarse optical flow and its mismatch, see
-    :func:`torch_denkf.applications.car.vision.flow.coarse_flow` ``road``  [N, 13, 69]     float16: see
-    :func:`torch_denkf.applications.car.vision.road.road_correlation` ``signs`` [N, 4]          with ``signs=True``,
-    float32: see :func:`torch_denkf.applications.car.vision.picture_signs` ========= ===============
-    =========================================================================================
+    ``flow``  [N, 3, 25, 79]  float16: coarse optical flow and its mismatch, see ``vision.flow.coarse_flow``
+    ``road``  [N, 13, 69]     float16: see ``vision.road.road_correlation``
+    ``signs`` [N, 4]          with ``signs=True``, float32: see ``vision.picture_signs``
+    ========= =============== =========================================================================================
 
     With ``two_view`` also ``"two_view"`` ``[N, 8]``, float32: see
     :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`.

@@ -33,11 +33,12 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
     key                   shape        content
     ===================== ============ ===========================================================================
     ``pixels``            [n,2C,H,W]   float32: frame t in [0, 1], then the difference of frames t and t-1
-    ``flow``, ``road``    [n,3,h,w]..  float32, where ``flow`` adds them: see
-    :func:`torch_denkf.applications.car.with_motion` ``state``             [n,5]        float32, the truth: x m, y m, θ
-    rad, v m/s, θ_dot rad/s ``observed``          [n,1]        bool: frames t and t-1 are both there ``dt``
-      [n,1]        float32, s: the drive's median frame time ``frame``             [n,1]        int64, the frame's
-    number in the drive ``calibration``       [n,4]        float32: fx, fy, cx, cy in pixels of ``size``
+    ``flow``, ``road``    [n,3,h,w]..  float32, where ``flow`` adds them, see ``with_motion``
+    ``state``             [n,5]        float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s
+    ``observed``          [n,1]        bool: frames t and t-1 are both there
+    ``dt``                [n,1]        float32, s: the drive's median frame time
+    ``frame``             [n,1]        int64, the frame's number in the drive
+    ``calibration``       [n,4]        float32: fx, fy, cx, cy in pixels of ``size``
     ===================== ============ ===========================================================================
 
     as :func:`torch_denkf.applications.car.kitti.frames.frames_at` makes them. Pixels and flow come, when rows are

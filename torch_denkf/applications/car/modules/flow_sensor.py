@@ -133,8 +133,7 @@ class FlowSensor(StochasticSensor):
         rate: drop probability of the head's hidden units.
         trunk_dropout: drop probability of the flow's code, in training mode only.
         in_keys: the flow ``[*B, 3, 25, 79]`` and the road's correlation ``[*B, 13, 69]``, any floating type, as
-            written by :class:`torch_denkf.applications.car.OpticalFlow` or
-        :func:`torch_denkf.applications.car.with_motion`.
+            :class:`~torch_denkf.applications.car.OpticalFlow` or ``with_motion`` writes them.
         out_key: learned observations (v m/s, θ_dot rad/s) ``[*B, E, 2]``.
         two_view_key: the motion of tracked corners ``[*B, 8]``
             (:func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`), if the sensor is to read it as a

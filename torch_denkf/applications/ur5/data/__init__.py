@@ -1,7 +1,1 @@
-"""Demonstrations of the UR5 table, and the data set of them."""
-
-from torch_denkf.applications.ur5.data.replay import UR5ExperienceReplay
-
-__all__ = [
-    "UR5ExperienceReplay",
-]
+"""Demonstrations of the UR5 table: their files, what is kept of them, and the data set."""
