@@ -20,7 +20,7 @@ class GaussianOptions(FilterOptions, total=False):
     """What the filters with a mean, a covariance and a learned sensor take beside their models.
 
     They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-    ``check_finite`` and ``reject`` of :class:`Filter`.
+    ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
     Attributes:
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never
@@ -47,11 +47,7 @@ class GaussianFilter(Filter):
         analysis: makes the module that updates them, from ``inflation``, ``angles``, ``observation_key``,
             ``observed_key`` and ``noise_variance_key``.
         initial: the initial belief.
-        inflation: see :class:`GaussianOptions`.
-        angles: likewise.
-        observation_key: likewise.
-        observed_key: likewise.
-        **kwargs: of :class:`Filter`.
+        **options: see :class:`GaussianOptions`.
 
     Raises:
         ValueError: if ``initial`` writes no mean and covariance.

@@ -43,8 +43,9 @@ class LSTMFilter(Filter):
         hidden_size: of each layer.
         num_layers: of cells.
         observation_dim: O, where the LSTM reads ``observation_key``.
-        encoding_key: see :class:`~torch_denkf.modules.recurrent.LSTMUpdate`.
-        observation_key: likewise; read where ``observation_dim`` is given.
+        encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
+        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; read where
+            ``observation_dim`` is given.
         control_keys: see :class:`Filter`; give the action's key in ``extra_keys``, too.
         init_key: see :class:`Filter`.
         update_at_reset: see :class:`Filter`; not with ``motion``: nothing moves into the first frame.

@@ -23,15 +23,18 @@ class UKF(GaussianFilter):
     through the observation model.
 
     Args:
-        transition: see :class:`~torch_denkf.filters.EKF`.
-        sensor: likewise.
-        observation: likewise.
-        noise: likewise.
-        process_noise: likewise.
-        initial: likewise; its covariance may be singular.
-        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
-        beta: likewise.
-        kappa: likewise. Covariances stay positive where no weight is negative, as by default.
+        transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
+            reading is in the tensordict, under ``observation_key``.
+        observation: observes ensembles, writes ``("forecast", "observation")``.
+        noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
+        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
+            :mod:`torch_denkf.modules.process_noise`.
+        initial: the initial belief, :class:`~torch_denkf.modules.MomentPrior` or
+            :class:`~torch_denkf.modules.GaussianAround`; its covariance may be singular.
+        alpha: spread of the sigma points.
+        beta: extra weight of the central point in the covariance.
+        kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
         **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
             :class:`GaussianOptions`.
 

@@ -98,7 +98,7 @@ def rts_smooth(
         mean: of the filter's beliefs, ``[*B, T, S]``.
         cov: their covariances, ``[*B, T, S, S]``.
         forecast_mean: of each time, made from the belief before it, ``[*B, T, S]``.
-        forecast_cov: likewise, ``[*B, T, S, S]``.
+        forecast_cov: its covariance, ``[*B, T, S, S]``.
         cross: the covariance of the state before and the state at each time, ``[*B, T, S, S]``, rows before.
         follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it, such as the first
             of an episode: nothing flows back from there. The first element's is not read. None: all follow.

@@ -87,8 +87,8 @@ def enrts_smooth(
     Args:
         ensemble: the filter's beliefs, ``[*B, T, E, S]``.
         forecast: of each time, the members before it one step on, ``[*B, T, E, S]``.
-        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.smoothing.rts_smooth`.
-        lag: likewise.
+        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
+        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
         damping: see :func:`enrts_step`.
 
     Returns:

@@ -56,8 +56,8 @@ def backward_smooth(
         log_weights: of the filter's beliefs, normalised, ``[*B, T, E]``.
         log_transition: log-density of each particle at t, in the columns, given each at t − 1, in the rows,
             ``[*B, T, E, E]``.
-        follows: boolean ``[*B, T]``, see :func:`~torch_denkf.functional.smoothing.rts_smooth`.
-        lag: likewise.
+        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
+        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
 
     Returns:
         The smoothed log-weights, ``[*B, T, E]``.

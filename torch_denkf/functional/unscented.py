@@ -78,8 +78,8 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
     Args:
         mean: m, ``[*B, S]``.
         cov: P, symmetric, positive semi-definite, ``[*B, S, S]``.
-        alpha: see :func:`unscented_weights`.
-        kappa: likewise.
+        alpha: spread of the points.
+        kappa: their secondary spread.
 
     Returns:
         The points, ``[*B, 2 S + 1, S]``, the mean first; NaN where P has a clearly negative eigenvalue.

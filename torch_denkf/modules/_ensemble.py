@@ -52,13 +52,7 @@ class EnsembleUpdate(SubModel):
         rotate: random mean-preserving rotation of the anomalies.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        forecast_key: see :class:`EnsembleAnalysisKeys`, like the other keys.
-        predicted_key: likewise.
-        observation_key: likewise.
-        noise_variance_key: likewise.
-        observed_key: likewise.
-        belief_prefix: likewise.
-        info_prefix: likewise.
+        **keys: see :class:`EnsembleAnalysisKeys`.
 
     Raises:
         ValueError: if ``inflation`` is not positive, or ``relaxation`` is outside [0, 1].

@@ -46,10 +46,7 @@ class GaussianTransition(SubModel):
         transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.applications.car.UnicycleTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
-        belief_prefix: see :class:`GaussianTransitionKeys`, like the other keys.
-        forecast_prefix: likewise.
-        ensemble_key: likewise.
-        forecast_ensemble_key: likewise.
+        **keys: see :class:`GaussianTransitionKeys`.
 
     Raises:
         ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
@@ -144,16 +141,7 @@ class GaussianAnalysis(SubModel):
     Args:
         observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
             leaves in a copy of the tensordict.
-        inflation: see :class:`GaussianAnalysisOptions`, like all that follows.
-        angles: likewise.
-        observation_key: likewise.
-        noise_variance_key: likewise.
-        observed_key: likewise.
-        forecast_prefix: likewise.
-        belief_prefix: likewise.
-        info_prefix: likewise.
-        ensemble_key: likewise.
-        predicted_key: likewise.
+        **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
         ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.

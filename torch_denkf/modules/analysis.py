@@ -145,11 +145,11 @@ class EnsembleAnalysis(EnsembleUpdate):
 
         Args:
             past: ``[*B, E, L, S]``.
-            predicted: as in :meth:`compute`, like what follows.
-            observation: likewise.
-            variance: likewise.
-            observed: likewise.
-            noise: likewise: the same draws.
+            predicted: predicted observations ``[*B, E, O]``.
+            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
+            variance: of the reading, ``[*B, O]``.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
+            noise: what :meth:`compute` was given: the same draws.
 
         Returns:
             The updated past, ``[*B, E, L, S]``.

@@ -47,15 +47,16 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
     ``UnicycleTransition(drift=False)`` with a network that depends on the velocity, mixes the sigma points.
 
     Args:
-        transition: see :class:`EKFTransition`.
-        process_noise: likewise.
-        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
-        beta: likewise.
-        kappa: likewise.
+        transition: forecasts ensembles ``[*B, E, S]``.
+        process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
+            :mod:`torch_denkf.modules.process_noise`.
+        alpha: spread of the sigma points.
+        beta: extra weight of the central point in the covariance.
+        kappa: their secondary spread.
         **keys: see :class:`GaussianTransitionKeys`. The covariance of the last analysis may be singular.
 
     Raises:
-        ValueError: where :class:`EKFTransition` does.
+        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -93,15 +94,15 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
     """The update of mean and covariance by fresh sigma points of the forecast, through an observation model.
 
     Args:
-        observation: see :class:`EKFAnalysis`.
-        alpha: see :func:`torch_denkf.functional.unscented.unscented_weights`.
-        beta: likewise.
-        kappa: likewise.
+        observation: observes ensembles ``[*B, E, S]``.
+        alpha: spread of the sigma points.
+        beta: extra weight of the central point in the covariance.
+        kappa: their secondary spread.
         **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: where :class:`EKFAnalysis` does.
-        KeyError: likewise.
+        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        KeyError: if an entry is missing.
 
     Example:
         >>> from tensordict import TensorDict

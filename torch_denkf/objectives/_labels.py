@@ -35,7 +35,7 @@ class Keys:
             ``_observed``, as data sets write it. It may be missing.
         target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
             no parameters, it is that model's observation of the true state.
-        target_observed: likewise, of the true observation.
+        target_observed: which components of the true observation are known, ``[*B, 1]`` or ``[*B, O]``, bool.
         observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
         sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
     """

@@ -144,7 +144,7 @@ class SequenceKeys(Keys):
 
     Attributes:
         belief: prefix of the belief's entries: ``mean`` and ``cov``, or ``ensemble`` and ``log_weight``.
-        forecast: likewise, of the forecast.
+        forecast: prefix of the forecast's entries, of the same names.
         log_likelihood: that of the innovation, or of the reading.
     """
 
@@ -169,9 +169,9 @@ class FilterLoss(Checked, LossModule):
         dims: state dimensions that count; all that have labels by default.
         state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
             dimension with infinite scale does not count: means are taken over the others.
-        observation_scale: ``[O]``, likewise, for observations.
+        observation_scale: ``[O]``, what errors of observations are divided by.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        observation_angles: likewise, dimensions of observations.
+        observation_angles: dimensions of observations that are angles in radians.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
 

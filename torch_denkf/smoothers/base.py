@@ -72,8 +72,8 @@ class Smoother(Checked, TensorDictModuleBase):
             ``tensordict``, with the outputs.
 
         Raises:
-            ValueError: where :meth:`Filter.sequence` does.
-            KeyError: likewise.
+            ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
+            KeyError: if an entry is missing.
         """
         keep = list(self.filter.out_keys) if keep is None else list(keep)
         rows, new = as_rows(tensordict, starts_of(tensordict, self.filter.init_key))
