@@ -57,30 +57,20 @@ class CompiledSteps:
         """What the steps write on a sequence ``[*B, T]``, in chunks; all noise is among the inputs."""
         time, count = len(todo.size) - 1, todo.size[-1]
         batch = torch.Size(todo.size[:-1])
-        inputs, starts, begins, shifted, keep = todo.inputs, todo.starts, todo.begins, todo.shifted, todo.keep
+        inputs, starts, begins, keep = todo.inputs, todo.starts, todo.begins, todo.keep
         detach_every, keys, start_keys = todo.detach_every or 0, tuple(inputs), tuple(starts)
         carry, outputs, begin = (), [], 0
         while begin < count:
             first = begin == 0  # which also takes the first chunk's steps, if there are as many
-            moves = self.chunk if count - begin - first >= self.chunk else int(not first)
-            length, before = first + moves, max(begin - 1, 0)
-            cuts = tuple(bool(detach_every) and t % detach_every == 0 for t in range(begin + first, begin + length))
-            now = tuple(inputs[key].narrow(time, before if key in shifted else begin, length) for key in keys)
+            length = first + (self.chunk if count - begin - first >= self.chunk else int(not first))
+            cuts = tuple(bool(detach_every) and t > 0 and t % detach_every == 0 for t in range(begin, begin + length))
+            now = tuple(inputs[key].narrow(time, begin, length) for key in keys)
             resets, now_starts = None, tuple(value.narrow(time, 0, 1) for value in starts.values()) if first else ()
             if begins is not None:
                 resets = begins.narrow(time, begin, length)
                 now_starts = tuple(value.narrow(time, begin, length) for value in starts.values())
-            kind = (
-                "first" if first else "chunk",
-                begins is not None,
-                keys,
-                tuple(shifted),
-                start_keys,
-                batch,
-                cuts,
-                keep,
-            )
-            make = partial(_chunk, steps, keys, frozenset(shifted), start_keys, keep, batch, time, cuts, first)
+            kind = ("first" if first else "chunk", begins is not None, keys, start_keys, batch, cuts, keep)
+            make = partial(_chunk, steps, keys, start_keys, keep, batch, cuts, first)
             carried = () if first else steps.structure.carry
             names = (*carried, *keys, *(() if begins is None else (_BEGINS,)), *(start_keys if now_starts else ()))
             given, writes = (carry, now, resets, now_starts), (*steps.structure.carry, *keep)
@@ -168,38 +158,18 @@ def _parameters(steps: Steps) -> dict[str, Tensor]:
 
 def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        call = Call(batch)
-        entries = steps.usable(dict(zip(keys, values, strict=True)), call)
-        written = steps.frames(entries, call)
-        written.update(steps.advance({**entries, **written}, call))
+        written = steps.take(dict(zip(keys, values, strict=True)), Call(batch))
         return tuple(written[key] for key in writes)
 
     return step
 
 
-def _chunk(
-    steps: Steps, keys, shifted: frozenset, start_keys, keep, batch: torch.Size, time: int, cuts: tuple, first: bool
-) -> Callable:
-    def rows(names: tuple, values: tuple[Tensor, ...], count: int) -> list[Entries]:
-        columns = {name: value.unbind(time) for name, value in zip(names, values, strict=True)}
-        if first:  # the second step reads what drives it where the first one, which does not move, could have
-            for name in shifted.intersection(names):
-                columns[name] = (columns[name][0], *columns[name])
-        return [{name: column[t] for name, column in columns.items()} for t in range(count)]
-
+def _chunk(steps: Steps, keys, start_keys, keep, batch: torch.Size, cuts: tuple, first: bool) -> Callable:
     def chunk(carry: tuple, inputs: tuple, resets: Tensor | None, starts: tuple) -> tuple[tuple, tuple]:
-        call, carried = Call(batch), steps.structure.carry
-        now = rows(keys, inputs, first + len(cuts))
-        begins = rows(start_keys, starts, starts[0].shape[time]) if starts else []
-        if first:
-            out = steps.first(now[0], call, begins[0])
-            belief, outputs = {key: out[key] for key in carried}, [{key: out[key] for key in keep}]
-        else:
-            belief, outputs = dict(zip(carried, carry, strict=True)), []
-        anew = None if resets is None else resets.unbind(time)[first:]
-        belief, later = steps.roll(belief, now[first:], call, anew, begins[first:], cuts, keep)
-        outputs += later
-        stacked = tuple(torch.stack([output[key] for output in outputs], time) for key in keep)
-        return tuple(belief[key] for key in carried), stacked
+        carried = steps.structure.carry
+        belief = None if first else dict(zip(carried, carry, strict=True))
+        begins = dict(zip(start_keys, starts, strict=True)) if starts else {}
+        belief, out = steps.scan(belief, dict(zip(keys, inputs, strict=True)), Call(batch), resets, begins, cuts, keep)
+        return tuple(belief[key] for key in carried), tuple(out[key] for key in keep)
 
     return chunk

@@ -46,10 +46,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
             "predict() and step(without=...) leave readings out.",
             "Hide what is missing with a mask instead, which keeps the step compiled.",
         )
-        call, steps, missing = Call(tensordict.batch_size), filter.steps(), set(without)
-        entries = steps.usable({key: value for key, value in entries.items() if key not in missing}, call)
-        written = steps.frames(entries, call, missing)
-        written.update(steps.advance({**entries, **written}, call, missing=missing))
+        written = filter.steps().take(entries, Call(tensordict.batch_size), missing=without)
         lost = [key for key in structure.carry if key in structure.step_keys and key not in written]
         if lost:
             raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
@@ -96,13 +93,10 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     if reset is None:
         written = filter.take_step(entries, tensordict.batch_size)
     else:
-        entries = steps.usable(entries, call)
-        written = steps.frames(entries, call)
-        entries.update(written)
-        start = filter.initial_belief(entries, call)
-        entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
-        written.update(steps.advance(entries, call, reset, start))
+        written = steps.take(entries, call, reset=reset, start_of=lambda now: filter.initial_belief(now, call))
         blank(steps, written, reset)
+        # What went before does not count where an episode begins.
+        entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
     if filter.check_finite and not torch.compiler.is_compiling():
         unread = None if filter.update_at_reset else reset
         refuse_non_finite(structure, entries, written, filter.reject, unread)
@@ -116,21 +110,15 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
 
 def take_step(filter: Filter, entries: Entries, batch_size: torch.Size, reject: bool | None = None) -> Entries:
     """See :meth:`Filter.take_step`."""
-    structure, steps = (
-        filter.structure,
-        filter.steps(reject=reject),
-    )  # in this order: the first sorts replaced modules anew
+    structure = filter.structure  # first: it sorts replaced modules anew
+    steps = filter.steps(reject=reject)
     if filter.compiled is not None:
         drawn = draw_noise(filter, entries, batch_size, structure.modules)
         if drawn is not None:
             written = filter.compiled.step(steps, {**entries, **drawn}, batch_size)
             look_at_ceiling(filter, written)
             return written
-    call = Call(batch_size)
-    entries = steps.usable(entries, call)
-    written = steps.frames(entries, call)
-    written.update(steps.advance({**entries, **written}, call))
-    return written
+    return steps.take(entries, Call(batch_size))
 
 
 def initial_belief(filter: Filter, entries: Entries, call: Call) -> Entries:

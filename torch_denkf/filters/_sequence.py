@@ -39,7 +39,6 @@ class Rows(NamedTuple):
     Attributes:
         size: ``[*B, T]``.
         inputs: entries ``[*B, T, ...]``, with their noise as far as it was drawn.
-        shifted: inputs that are read one step earlier.
         begins: elements that start from ``starts``, ``[*B, T, 1]``; ``None`` for the first alone.
         starts: initial or stored beliefs ``[*B, T]``, or ``[*B, 1]`` where ``begins`` is ``None``.
         resumed: whether the first element, too, is a step, from the belief before it.
@@ -49,7 +48,6 @@ class Rows(NamedTuple):
 
     size: torch.Size
     inputs: Entries
-    shifted: tuple[NestedKey, ...]
     begins: Tensor | None
     starts: Entries
     resumed: bool
@@ -146,9 +144,12 @@ def filter_rows(
     inputs.update(resumes)
     drawn = draw_noise(filter, {**entries, **starts}, size, (structure.transition, *structure.update), time=True)
     inputs.update(drawn or {})
-    shifted = tuple(key for key in structure.controls if previous_key(key) not in entries)
+    for key in structure.controls:  # stored one step earlier than they are read
+        if previous_key(key) not in entries and key in inputs:
+            value = inputs[key]
+            inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
     step_keys = tuple(key for key in keep if key in steps.step_keys)
-    todo = Rows(size, inputs, shifted, begins, starts, resumed, detach_every, step_keys)
+    todo = Rows(size, inputs, begins, starts, resumed, detach_every, step_keys)
     compiled = filter.compiled if drawn is not None and not resumed else None
     with set_recurrent_mode(False):
         outputs = _eagerly(steps, todo) if compiled is None else compiled.sequence(steps, todo)
@@ -176,23 +177,8 @@ def _beginnings(structure: Structure, entries: Entries, new: Tensor | None, size
 
 def _eagerly(steps: Steps, todo: Rows) -> Entries:
     """What steps write on a sequence, ``[*B, T, ...]`` each."""
-    time, count = len(todo.size) - 1, todo.size[-1]
-    columns = {key: value.unbind(time) for key, value in todo.inputs.items()}
-    for key in todo.shifted:
-        columns[key] = (columns[key][0], *columns[key][:-1])
-    rows = [{key: column[t] for key, column in columns.items()} for t in range(count)]
-    columns = {key: value.unbind(time) for key, value in todo.starts.items()}
-    starts = [{key: column[min(t, len(column) - 1)] for key, column in columns.items()} for t in range(count)]
-    resets = None if todo.begins is None else todo.begins.unbind(time)
-    call, cut = Call(torch.Size(todo.size[:-1])), todo.detach_every or 0
-    cuts = [bool(cut) and t > 0 and t % cut == 0 for t in range(count)]
-    if todo.resumed:
-        carry, outputs = {key: starts[0][key] for key in steps.structure.carry}, []
-    else:
-        out = steps.first(rows[0], call, starts[0])
-        carry, outputs = {key: out[key] for key in steps.structure.carry}, [{key: out[key] for key in todo.keep}]
-    done = len(outputs)
-    resets = None if resets is None else resets[done:]
-    _, later = steps.roll(carry, rows[done:], call, resets, starts[done:], cuts[done:], todo.keep)
-    outputs += later
-    return {key: torch.stack([output[key] for output in outputs], time) for key in todo.keep}
+    time, cut = len(todo.size) - 1, todo.detach_every
+    first = {key: todo.starts[key].select(time, 0) for key in steps.structure.carry} if todo.resumed else None
+    cuts = [cut is not None and t > 0 and t % cut == 0 for t in range(todo.size[-1])]
+    call = Call(torch.Size(todo.size[:-1]))
+    return steps.scan(first, todo.inputs, call, todo.begins, todo.starts, cuts, todo.keep)[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -85,6 +85,32 @@ class Steps(NamedTuple):
         """What the modules that read frames alone write."""
         return self.run(self.structure.frames, entries, call, missing)
 
+    def take(
+        self,
+        entries: Entries,
+        call: Call,
+        *,
+        reset: Tensor | None = None,
+        start_of: Callable[[Entries], Entries] | None = None,
+        missing: Collection[NestedKey] = (),
+    ) -> Entries:
+        """A whole step, on ``[*B]``: frames, transition, update.
+
+        Args:
+            entries: the carry, which is the belief at t-1, and the frame of t.
+            call: batch size and whether noise is drawn.
+            reset: rows that start anew; ``None`` for none.
+            start_of: the initial belief from entries, the frame modules' among them; for ``reset``.
+            missing: readings that are not there, see :meth:`run`.
+        """
+        lost = set(missing)
+        entries = self.usable({key: value for key, value in entries.items() if key not in lost}, call)
+        written = self.frames(entries, call, lost)
+        entries = {**entries, **written}
+        start = None if reset is None or start_of is None else start_of(entries)
+        written.update(self.advance(entries, call, reset, start, lost))
+        return written
+
     def advance(
         self,
         entries: Entries,
@@ -158,46 +184,58 @@ class Steps(NamedTuple):
             written[REJECTED] = entries[REJECTED]
         return written
 
-    def roll(
+    def scan(
         self,
-        carry: Entries,
-        rows: Sequence[Entries],
+        carry: Entries | None,
+        inputs: Entries,
         call: Call,
-        resets: Sequence[Tensor] | None,
-        starts: Sequence[Entries],
+        resets: Tensor | None,
+        starts: Entries,
         cuts: Sequence[bool],
         keep: Sequence[NestedKey],
-    ) -> tuple[Entries, list[Entries]]:
-        """Advances through ``rows``, one a step.
+    ) -> tuple[Entries, Entries]:
+        """Takes one step after the other.
 
         Args:
-            carry: the belief before the first of them.
-            rows: what each step reads beside the carry. A carried entry among them is where the step begins in rows
-                that ``("previous", "resumes")`` marks.
-            call: of one step.
-            resets: which rows start anew at each step; ``None`` for none ever.
-            starts: their beliefs, read only with ``resets``.
-            cuts: where the belief is detached before the step.
+            carry: the belief before the first step; ``None`` if the first element is where a sequence starts.
+            inputs: what each step reads beside the carry, ``[*B, T, ...]``. What stands under ``("previous", ...)`` is
+                where the step begins in rows that ``("previous", "resumes")`` marks.
+            call: of one step ``[*B]``.
+            resets: which rows start anew at each step, ``[*B, T, 1]``; ``None`` for none but those of a start.
+            starts: their beliefs, ``[*B, T, ...]``, or without ``resets`` that of the first element, ``[*B, 1, ...]``.
+            cuts: where the belief is detached before the step, T.
             keep: what to return of each step.
 
         Returns:
-            The carry after the last step, and what each step wrote.
+            The carry after the last step, and what the steps wrote, ``[*B, T, ...]``.
         """
-        outputs = []
+        time, outputs = len(call.batch_size), []
+        rows = _unbound(inputs, time, len(cuts))
+        begins = _unbound(starts, time, 1 if resets is None else len(cuts)) if starts else []
+        marks = None if resets is None else resets.unbind(time)
         for t, row in enumerate(rows):
-            if cuts[t]:
-                carry = {key: value.detach() for key, value in carry.items()}
-            row = {**row, **self._resume(carry, row)}
-            out = self.advance(row, call) if resets is None else self.advance(row, call, resets[t], starts[t])
-            carry = {key: out.get(key, row[key]) for key in self.structure.carry}
-            outputs.append({key: out[key] for key in keep})
-        return carry, outputs
+            if carry is None:
+                out = self.first(row, call, begins[0])
+            else:
+                if cuts[t]:
+                    carry = {key: value.detach() for key, value in carry.items()}
+                row = {**row, **self._resume(carry, row)}
+                out = self.advance(row, call) if marks is None else self.advance(row, call, marks[t], begins[t])
+            carry = {key: out[key] if key in out else row[key] for key in self.structure.carry}
+            outputs.append(out)
+        return carry or {}, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
     def _resume(self, carry: Entries, row: Entries) -> Entries:
         resumes = row.get(("previous", "resumes"))
         if resumes is None:
             return carry
         return {key: where_rows(resumes, row[previous_key(key)], value) for key, value in carry.items()}
+
+
+def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
+    """The entries of each time, of entries ``[*B, T, ...]``."""
+    columns = {key: value.unbind(time) for key, value in entries.items()}
+    return [{key: column[t] for key, column in columns.items()} for t in range(count)]
 
 
 def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Sequence[int]) -> None:

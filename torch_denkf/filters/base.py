@@ -85,7 +85,7 @@ class Filter(Checked, TensorDictSequential):
 
     Raises:
         ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
-            before it is read.
+            before it is read; or if ``prefix`` is ``"next"``.
         TypeError: if parameters or constants differ in precision.
 
     Example:
@@ -129,6 +129,8 @@ class Filter(Checked, TensorDictSequential):
         if variance_ceiling is not None:
             check_number("variance_ceiling", variance_ceiling, above=0, cure="None is for no ceiling")
         self.variance_ceiling, self.check_finite, self.reject = variance_ceiling, check_finite, reject
+        if prefix == "next":
+            raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
         self.prefix = prefix
         self.compiled: CompiledSteps | None = None
         self._said: set[str] = set()

@@ -57,7 +57,7 @@ class DEnKF(Filter):
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite`` and ``reject`` of :class:`Filter`.
+            ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if it is not clear where the reading is.

@@ -52,7 +52,7 @@ class ParticleFilter(Filter):
         observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
-            ``check_finite`` and ``reject`` of :class:`Filter`.
+            ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: on an unknown ``resampling``, or if it is not clear where the reading is.

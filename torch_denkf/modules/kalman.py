@@ -181,7 +181,8 @@ class KalmanAnalysis(SubModel):
         inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
             observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
-        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
+        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; in a filter
+            these stand under a key whose last name is ``"ensemble"``.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast.

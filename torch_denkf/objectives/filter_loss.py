@@ -69,7 +69,7 @@ class StateOptions(TypedDict, total=False):
 
 
 class SequenceOptions(ReadingsOptions, StateOptions, total=False):
-    """What every loss of a whole filter takes.
+    """What every loss of a whole filter takes, beside :class:`ReadingsOptions` and :class:`StateOptions`.
 
     Attributes:
         detach_every: truncated back-propagation: steps after which the belief is detached.
