@@ -38,7 +38,7 @@ class ParticleFilter(Filter):
         noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
         resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
             :class:`~torch_denkf.modules.particles.ResampledTransition`; a transition that is one already is left as it
-        is.
+            is.
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
         ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
@@ -164,7 +164,7 @@ class DPF(ParticleFilter):
             :class:`~torch_denkf.modules.NoisyTransition`; ``None`` where ``transition`` is random already.
         noisy_dims: those dimensions. The noise is added before the motion; to have it after, or inside of a
             :class:`~torch_denkf.applications.car.modules.pairs.ClonedTransition`, give a ``transition`` with noise
-        instead.
+            instead.
         initial: the initial belief.
         **kwargs: of :class:`ParticleFilter`.
 

@@ -36,7 +36,7 @@ class NoisyTransition(SubModel):
         dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
         before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
             their noise, such as the pose of a :class:`torch_denkf.applications.car.UnicycleTransition` with its
-        velocities.
+            velocities.
         mean_key: the belief's mean ``[*B, S]``.
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.

@@ -81,7 +81,7 @@ def save_pretrained(
     Args:
         model: one that a function of this library built from settings, such as
             :func:`torch_denkf.applications.car.odometry.filter.car_filter`. For another one pass ``builder`` and
-        ``settings``.
+            ``settings``.
         folder: gets ``weights.safetensors`` and ``config.json``; a filter in it is replaced.
         training: command, seed, data: plain values, for the record alone.
         card: text of ``card.md``, for people: data, command, scores, limits, licence.

@@ -52,7 +52,7 @@ def drive_picture(
         tracked: ``[T]`` with ``"belief"`` (``"mean"`` ``[T, 5]``, ``"var"``, ``"ensemble"`` ``[T, E, 5]``), ``"state"``
             ``[T, 5]``, ``"dead_reckoning"`` ``[T, 3]`` and ``"time"`` ``[T, 1]``, such as
             :func:`torch_denkf.applications.car.odometry.failing_drive.track_failing_drive` returns; the state is a
-        car's [x, y, theta, v, theta_dot].
+            car's [x, y, theta, v, theta_dot].
         images: of the steps, as the camera showed them.
         spans: failures of the camera; at most three are pictured.
         title: headline.

@@ -50,7 +50,7 @@ class KITTIReplayEnv(RowsEnv):
     Args:
         drive: the folder that holds ``sequences`` and ``poses``, or a drive as
             :func:`torch_denkf.applications.car.read_kitti_drive` or :func:`torch_denkf.applications.car.with_motion`
-        gives it.
+            gives it.
         sequence: name of the sequence, if ``drive`` is a folder.
         batch_size: ``*B``.
         start: row of the drive at which episodes start: one, one for each element of the batch (any shape that expands

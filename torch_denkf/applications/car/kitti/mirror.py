@@ -31,7 +31,7 @@ def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDi
     Args:
         drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, or rows of
             :func:`torch_denkf.applications.car.kitti.frames.frames_at`; any batch size. Keys that are not there are
-        left out.
+            left out.
         width: of the images in pixels, for the calibration; by default that of ``image`` or ``pixels``.
 
     Returns:
