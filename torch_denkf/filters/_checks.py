@@ -243,9 +243,7 @@ def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) 
 
 def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
     """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
-    joined = any(
-        getattr(part, "joins_readings", False) for _, module in structure.modules for part in submodels(module)
-    )
+    joined = any(part.joins_readings for _, module in structure.modules for part in submodels(module))
     if joined and without and set(without) != set(structure.readings):
         raise ValueError(
             f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "

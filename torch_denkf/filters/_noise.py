@@ -13,7 +13,7 @@ from torch_denkf.filters._said import say_eager
 from torch_denkf.filters._structure import Placed
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries, flat_noise
-from torch_denkf.modules._running import random_parts
+from torch_denkf.modules._running import declared, random_parts
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
@@ -86,8 +86,8 @@ def _sizes(filter: Filter, entries: Entries) -> tuple[int | None, int | None]:
         if key[-1] == "ensemble" and key in entries:
             members, state_dim = entries[key].shape[-2:]
             return members, state_dim
-    initial = filter.initial
-    return getattr(initial, "ensemble_size", None), getattr(initial, "state_dim", None)
+    initial = declared(filter.initial)
+    return initial.ensemble_size, initial.state_dim
 
 
 def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | None:
@@ -96,11 +96,11 @@ def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | 
     A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
     """
     known = filter._structure.observation_dims
-    key = getattr(part, "noise_variance_key", None)
+    key = part.noise_variance_key
     if key is not None:
         return entries[key].shape[-1] if key in entries else known.get(key)
     found = {known[key] for key in map(unravel_key, part.in_keys) if key in known}
-    found |= {entries[key].shape[-1] for key in map(unravel_key, getattr(part, "reading_keys", ())) if key in entries}
+    found |= {entries[key].shape[-1] for key in map(unravel_key, part.reading_keys) if key in entries}
     return found.pop() if len(found) == 1 else None
 
 

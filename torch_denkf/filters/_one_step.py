@@ -62,7 +62,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
 def step_without_frame(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
     """See :meth:`Filter.predict`."""
     hidden = tensordict.copy()
-    for key in dict.fromkeys(part.mask_key for part in submodels(filter.module) if hasattr(part, "mask_key")):
+    for key in dict.fromkeys(part.mask_key for part in submodels(filter.module) if part.mask_key is not None):
         hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
     out = filter.step(hidden, without=filter.structure.readings)
     written = [key for key in filter.out_keys if out.get(key, None) is not None]

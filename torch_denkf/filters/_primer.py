@@ -12,6 +12,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torch_denkf.filters._structure import KNOWN, previous_key
+from torch_denkf.modules._running import declared
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
@@ -114,7 +115,8 @@ class LastAction(TensorDictPrimer):
 def belief_primer(filter: Filter) -> TensorDictPrimer:
     """The transform behind :meth:`Filter.make_tensordict_primer`."""
     initial = filter.initial
-    size = getattr(initial, "input_dim", getattr(initial, "state_dim", 1))
+    told = declared(initial)
+    size = told.input_dim or told.state_dim or 1
     tensors = chain(filter.parameters(), filter.buffers(), (torch.zeros(()),))
     like = next(tensor for tensor in tensors if tensor.is_floating_point())
     probe = TensorDict({key: torch.zeros(size, dtype=like.dtype, device=like.device) for key in initial.in_keys})

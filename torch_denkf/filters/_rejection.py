@@ -52,8 +52,8 @@ def guards_of(
     """
     readers: dict[NestedKey, list[SubModel]] = {}
     for part in parts:
-        mask = getattr(part, "observed_key", None)
-        if mask is not None and _readings(part):
+        mask = part.observed_key
+        if mask is not None and part.reading_keys:
             mask = unravel_key(mask)
             while mask in made_of:
                 mask = made_of[mask]
@@ -63,8 +63,8 @@ def guards_of(
         whole: dict[NestedKey, None] = {}
         components: dict[NestedKey, None] = {}
         same = len({_direct(part, sources) for part in sharing}) == 1
-        by_component = same and all(getattr(part, "reads_components", False) for part in sharing)
-        for key in (unravel_key(key) for part in sharing for key in _readings(part)):
+        by_component = same and all(part.reads_components for part in sharing)
+        for key in (unravel_key(key) for part in sharing for key in part.reading_keys):
             for source in sources.get(key, ()):
                 (components if by_component and source == key else whole)[source] = None
         whole = {key: None for key in whole if key not in components}
@@ -72,13 +72,9 @@ def guards_of(
     return tuple(guards)
 
 
-def _readings(part: SubModel) -> Sequence[NestedKey]:
-    return getattr(part, "reading_keys", None) or ()
-
-
 def _direct(part: SubModel, sources: Mapping[NestedKey, Sequence[NestedKey]]) -> frozenset[NestedKey]:
     """The readings that come from outside as they are; all readings, where a module makes them."""
-    keys = [unravel_key(key) for key in _readings(part)]
+    keys = [unravel_key(key) for key in part.reading_keys]
     return frozenset([key for key in keys if key in sources.get(key, ())] or keys)
 
 

@@ -158,7 +158,7 @@ class Steps(NamedTuple):
         if structure.beside and in_sequence:  # their shapes follow from a step out of the start
             out = self.run([structure.transition], entries, call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
-        elif structure.beside and hasattr(structure.transition[1], "without_step"):
+        elif structure.beside and isinstance(structure.transition[1], SubModel):
             forecast |= structure.transition[1].without_step(entries)
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
         return self._update(entries, forecast, call, every, start, missing)
@@ -274,9 +274,9 @@ def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
 
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
     """What a module writes where its reading is missing; nothing if it does not know."""
-    readings = set(getattr(module, "reading_keys", ()))
-    if not isinstance(module, SubModel) or not readings or not hasattr(module, "without_reading"):
+    if not isinstance(module, SubModel) or not module.reading_keys:
         return {}
+    readings = set(module.reading_keys)
     values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
-    values += [entries.get(key) for key in module.optional_keys]
-    return module.by_key(module.without_reading(*values), "without_reading")
+    told = module.without_reading(*values, *(entries.get(key) for key in module.optional_keys))
+    return {} if told is None else module.by_key(told, "without_reading")

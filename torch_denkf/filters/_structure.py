@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import in_sequences, marks_of, reads, reads_of, writes
+from torch_denkf.modules._running import declared, in_sequences, marks_of, reads, reads_of, writes
 
 __all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
 
@@ -99,8 +99,8 @@ class Structure(NamedTuple):
     def readers(self, key: NestedKey) -> list[TensorDictModuleBase]:
         """The sub-models of the update that take in a reading that is made of the entry ``key``."""
         parts = [part for _, module in self.update for part in submodels(module)]
-        direct = [part for part in parts if key in map(unravel_key, getattr(part, "reading_keys", ()))]
-        return direct or [part for part in parts if getattr(part, "reading_keys", ())]
+        direct = [part for part in parts if key in map(unravel_key, part.reading_keys)]
+        return direct or [part for part in parts if part.reading_keys]
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
         """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
@@ -280,8 +280,8 @@ def _observation_dims(modules: Sequence[Placed]) -> dict[NestedKey, int]:
     sizes: dict[NestedKey, set[int]] = {}
     for _, module in modules:
         for part in submodels(module):
-            own = [part] if getattr(part, "observation_dim", None) is not None else submodels(part)
-            found = {inner.observation_dim for inner in own if getattr(inner, "observation_dim", None) is not None}
+            own = [part] if part.observation_dim is not None else submodels(part)
+            found = {inner.observation_dim for inner in own if inner.observation_dim is not None}
             for key in map(unravel_key, part.out_keys):
                 sizes.setdefault(key, set()).update(found)
     return {key: found.pop() for key, found in sizes.items() if len(found) == 1}
@@ -292,7 +292,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
     found: dict[NestedKey, None] = {}
     for _, module in update:
         for part in submodels(module):
-            found.update(dict.fromkeys(map(unravel_key, getattr(part, "reading_keys", ()))))
+            found.update(dict.fromkeys(map(unravel_key, part.reading_keys)))
     for _, module in reversed([*frames, *update]):
         if not found.keys().isdisjoint(writes(module)):
             found.update(dict.fromkeys(reads(module)[0]))
@@ -304,7 +304,7 @@ def _plain(update: Sequence[Placed], needed: Sequence[NestedKey]) -> Iterator[Ne
     """The readings that come from outside as they are; of an analysis they stand in front of their noise."""
     for _, module in update:
         for part in submodels(module):
-            first = [unravel_key(key) for key in getattr(part, "reading_keys", ())[:1]]
+            first = [unravel_key(key) for key in part.reading_keys[:1]]
             yield from (key for key in first if key in needed)
 
 
@@ -315,21 +315,21 @@ def _guards(
     parts = [part for module in (*(module for _, module in update), initial) for part in submodels(module)]
     made_by_steps = {key for _, module in update for key in writes(module)}
     sources: dict[NestedKey, list[NestedKey]] = {}
-    for key in {unravel_key(key) for part in parts for key in getattr(part, "reading_keys", ())}:
+    for key in {unravel_key(key) for part in parts for key in part.reading_keys}:
         found = {key: None}
         for _, module in reversed([*frames, *update]):
             if not found.keys().isdisjoint(writes(module)):
-                found.update(dict.fromkeys(getattr(module, "source_keys", None) or reads(module)[0]))
+                found.update(dict.fromkeys(declared(module).source_keys or reads(module)[0]))
         sources[key] = [source for source in found if source in needed and source not in made_by_steps]
     return guards_of(_in_front(parts, sources), sources, _made_of(frames, parts))
 
 
 def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[NestedKey, NestedKey]:
     """The mask that each mask is made of, where a part reads one and writes another: hidden is what the first hides."""
-    masks = {unravel_key(part.observed_key) for part in parts if getattr(part, "observed_key", None) is not None}
+    masks = {unravel_key(part.observed_key) for part in parts if part.observed_key is not None}
     found = {made: given for _, module in frames for made, given in marks_of(module).items()}
     for part in parts:
-        own = getattr(part, "observed_key", None)
+        own = part.observed_key
         if own is not None:
             found.update({key: unravel_key(own) for key in writes(part) if key in masks and key != unravel_key(own)})
     return found
@@ -337,11 +337,11 @@ def _made_of(frames: Sequence[Placed], parts: Sequence[SubModel]) -> dict[Nested
 
 def _in_front(parts: Sequence[SubModel], sources: Mapping[NestedKey, Sequence[NestedKey]]) -> list[SubModel]:
     """The parts but for those whose mask another part makes, if others hide the same entries where they come in."""
-    made = {key for part in parts for key in writes(part) if key != getattr(part, "observed_key", None)}
-    first = [part for part in parts if getattr(part, "observed_key", None) not in made]
+    made = {key for part in parts for key in writes(part) if key != part.observed_key}
+    first = [part for part in parts if part.observed_key not in made]
 
     def hidden(some: Sequence[SubModel]) -> set[NestedKey]:
-        keys = (unravel_key(key) for part in some for key in getattr(part, "reading_keys", ()))
+        keys = (unravel_key(key) for part in some for key in part.reading_keys)
         return {source for key in keys for source in sources[key]}
 
     covered = hidden(first)
@@ -358,14 +358,14 @@ def _unmasked(steps: Sequence[Placed], carry: Sequence[NestedKey]) -> Iterator[P
         for part in in_sequences(module):
             must, may = reads(part)
             updates = not made.issuperset(must) and not set(carry).isdisjoint(writes(part))
-            if not may and (updates or len(getattr(part, "reading_keys", ())) > 0):
+            if not may and (updates or declared(part).reading_keys):
                 yield place, part
 
 
 def _refuse_overwriting(modules: Sequence[Placed]) -> None:
     """Raises where all that a module writes is written again before anybody has read it."""
     for index, (place, module) in enumerate(modules):
-        info = getattr(module, "info_prefix", None)
+        info = declared(module).info_prefix
         unread = {key for key in writes(module) if info is None or key[0] != info}
         used = False
         for other_place, other in modules[index + 1 :]:
@@ -395,7 +395,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):
-            info = getattr(part, "info_prefix", None)
+            info = declared(part).info_prefix
             if info is not None:
                 writers.setdefault(info, []).append((place, part))
     own_info: dict[str, dict[NestedKey, NestedKey]] = {}
@@ -424,6 +424,6 @@ def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) ->
     for place, module in steps:
         for part in in_sequences(module):
             for key in writes(part):
-                if key[0] == getattr(part, "info_prefix", None) and key[-1] == "log_likelihood":
+                if key[0] == declared(part).info_prefix and key[-1] == "log_likelihood":
                     found.append(key if key in totals else own_info.get(place, {}).get(key, key))
     return list(dict.fromkeys(found))

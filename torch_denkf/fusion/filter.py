@@ -28,7 +28,7 @@ from torch_denkf.modules import (
 )
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
-from torch_denkf.modules._running import check_module, writes
+from torch_denkf.modules._running import check_module, declared, writes
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
 
@@ -125,7 +125,7 @@ class FusedFilter(Filter):
             wired[name] = wire(name, sensor)
             modules.update(wired[name].modules)
         age = -1 if kwargs.get("update_at_reset") else 0
-        size = getattr(initial, "state_dim", 0)
+        size = declared(initial).state_dim or 0
         if lag and not size:
             raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
         prefix = "forecast"

@@ -36,6 +36,18 @@ class SubModel(Checked, TensorDictModule):
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
             for one tensor without a name of its own.
         marks: masks that the sub-model makes where it finds readings that are missing, and the masks it makes them of.
+        reading_keys: the entries that it takes a reading from: the reading, and behind it its noise.
+        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
+        source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
+        reads_components: whether each component of a reading counts, and is hidden, by itself.
+        joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
+        noise_variance_key: the variances of its reading, which tell how many components that has.
+        mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
+        info_prefix: prefix of its diagnostics.
+        observation_dim: O of what it writes, where it is known beforehand.
+        state_dim: S of an initial belief.
+        ensemble_size: E of an initial belief.
+        input_dim: size of what an initial belief reads, where that is not S.
 
     Example:
         >>> from tensordict import TensorDict
@@ -59,6 +71,18 @@ class SubModel(Checked, TensorDictModule):
     else:
         noise_names = ()
     marks: Mapping[NestedKey, NestedKey] = MappingProxyType({})
+    reading_keys: Sequence[NestedKey] = ()
+    observed_key: NestedKey | None = None
+    source_keys: Sequence[NestedKey] = ()
+    reads_components: bool = False
+    joins_readings: bool = False
+    noise_variance_key: NestedKey | None = None
+    mask_key: NestedKey | None = None
+    info_prefix: str | None = None
+    observation_dim: int | None = None
+    state_dim: int | None = None
+    ensemble_size: int | None = None
+    input_dim: int | None = None
     _wants: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **kwargs):
@@ -127,6 +151,17 @@ class SubModel(Checked, TensorDictModule):
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
         """The modules inside that may draw noise of their own, by name."""
+        return {}
+
+    def without_reading(self, *values: Any) -> Tensor | tuple[Tensor, ...] | None:
+        """What is written where there is no reading, from the values that :meth:`compute` gets by position.
+
+        Those of readings are ``None``. ``None`` is returned by a sub-model that does not know.
+        """
+        return None
+
+    def without_step(self, entries: Entries) -> Entries:
+        """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
         return {}
 
     def of_carry(self, entries: Entries) -> Entries:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, cast
 
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -15,6 +15,7 @@ from torch_denkf.modules._call import Call, Entries
 __all__ = [
     "check_module",
     "check_network",
+    "declared",
     "in_sequences",
     "marks_of",
     "named_modules_of",
@@ -134,6 +135,11 @@ def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
     """The masks that a module makes where it finds readings that are missing, and of which masks it makes them."""
     parts = [part for part in in_sequences(module) if isinstance(part, SubModel)]
     return {made: given for part in parts for made, given in part.marks.items()}
+
+
+def declared(module: nn.Module) -> SubModel:
+    """What a module says about itself: a sub-model what it declares, any other module what is declared by default."""
+    return module if isinstance(module, SubModel) else cast(SubModel, SubModel)  # the class holds the defaults
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:

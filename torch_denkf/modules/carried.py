@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import check_module, named_modules_of, reads, run_module
+from torch_denkf.modules._running import check_module, declared, named_modules_of, reads, run_module
 
 __all__ = ["AnalysisAround", "Beside", "InPlaceOf", "Stateful", "with_state"]
 
@@ -23,7 +23,7 @@ class InPlaceOf(SubModel):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """Those of the module inside."""
-        return getattr(self.module, "noise_names", ())
+        return declared(self.module).noise_names
 
     def draw_noise(self, batch_size, **sizes):
         """Draws the noise of the module inside."""
@@ -100,8 +100,7 @@ class Beside(InPlaceOf):
         self.keys, self.begin = list(map(unravel_key, keys)), begin
         self.follow_keys, self.follow, self.nested = list(map(unravel_key, follow_keys)), follow, nested
         for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim"):
-            if hasattr(initial, name):
-                setattr(self, name, getattr(initial, name))
+            setattr(self, name, getattr(declared(initial), name))
 
     @property
     def noise_names(self) -> tuple[str, ...]:

@@ -195,12 +195,14 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
         ):
             yield from _moments(name, analysis, case, case.hide(td, observed), tolerance)
         yield from _forecast("where nothing is observed: ", case, td, analysis(case.hide(td, nothing)))
-    if isinstance(analysis, SubModel) and hasattr(analysis, "without_reading"):
-        hidden = set(map(unravel_key, getattr(analysis, "reading_keys", ())))
+    if isinstance(analysis, SubModel):
+        hidden = set(map(unravel_key, analysis.reading_keys))
         names = [*map(unravel_key, analysis.in_keys), *analysis.optional_keys]
         values = [None if key in hidden else td.get(key, None) for key in names]
-        written = analysis.by_key(analysis.without_reading(*values), "without_reading")
-        yield from _forecast("without_reading: ", case, td, TensorDict(written, [2]))
+        told = analysis.without_reading(*values)
+        if told is not None:
+            written = analysis.by_key(told, "without_reading")
+            yield from _forecast("without_reading: ", case, td, TensorDict(written, [2]))
 
 
 def _moments(

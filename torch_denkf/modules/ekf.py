@@ -103,7 +103,7 @@ class EKFAnalysis(GaussianAnalysis):
 def _needed(module, entries: Entries) -> Entries:
     """What the model inside reads, and the mask."""
     needed, optional = reads(module.module)
-    keys = dict.fromkeys([*needed, *optional, getattr(module, "observed_key", None)])
+    keys = dict.fromkeys([*needed, *optional, module.observed_key])
     return {key: entries[key] for key in keys if key in entries}
 
 

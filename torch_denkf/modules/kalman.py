@@ -204,6 +204,7 @@ class KalmanAnalysis(SubModel):
     """
 
     reads_components = True
+    info_prefix: str
 
     def __init__(
         self,

@@ -317,7 +317,7 @@ class ParticleAnalysis(SubModel):
         check_number("tempering", tempering, above=0)
         self.tempering, self.info_prefix = tempering, info_prefix
         self.angles: list[int] = [] if likelihood is None else likelihood.angles
-        self.reading_keys: list[NestedKey] = [] if likelihood is None else likelihood.reading_keys
+        self.reading_keys = [] if likelihood is None else likelihood.reading_keys
 
     def without_reading(self, particles, prior, log_likelihood, predicted, *_):
         """What is written where there is no reading: the likelihood says what the belief is, the innovation is zero."""

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._running import check_module, declared, reads, run_module
 from torch_denkf.modules._tensors import (
     as_floating,
     mean_of_members,
@@ -55,7 +55,7 @@ def as_process_noise(
     """
     if isinstance(noise, nn.Module):
         return noise
-    std, size = as_floating(noise, "process_noise"), getattr(initial, "state_dim", None)
+    std, size = as_floating(noise, "process_noise"), declared(initial).state_dim
     check_values("process_noise, a standard deviation,", std, least=0)
     if std.ndim > 1 or (std.ndim == 1 and size is not None and len(std) != size):
         known = f"[S] = [{size}]" if size is not None else "[S]"

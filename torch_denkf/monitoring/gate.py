@@ -134,6 +134,7 @@ class GatedAnalysis(AnalysisAround):
     limits: Tensor
     usual: Tensor
     claimed: Tensor | None
+    observation_dim: int
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import wrap_angles
+from torch_denkf.modules._running import declared
 
 if TYPE_CHECKING:
     from torch_denkf.objectives.filter_loss import FilterLoss
@@ -184,7 +185,7 @@ class Truth:
         filter = self.loss.filter
         values = (self.out.get(key, None) for key in filter.structure.carry if key[-1] in ("ensemble", "mean"))
         sizes = (value.shape[-1] for value in values if value is not None)
-        return next(sizes, getattr(filter.initial, "state_dim", None))
+        return next(sizes, declared(filter.initial).state_dim)
 
     def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
         known = self._known(name, values, size, dims)

@@ -19,7 +19,7 @@ from torch_denkf.filters import Filter
 from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters._structure import previous_key
 from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import reads, reads_of, run_module, run_modules
+from torch_denkf.modules._running import declared, reads, reads_of, run_module, run_modules
 from torch_denkf.modules._tensors import as_floating
 from torch_denkf.objectives import _terms
 from torch_denkf.objectives._labels import Keys, Truth
@@ -292,7 +292,7 @@ def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
                 f"the filter carries {list(carry)}. Name the prefix of its belief, belief=..."
             )
         return None
-    members = getattr(filter.initial, "ensemble_size", None) if members is None else members
+    members = declared(filter.initial).ensemble_size if members is None else members
     if members is None:
         raise ValueError(
             f"{type(filter.initial).__name__} does not say how many members the belief has; pass members=..."

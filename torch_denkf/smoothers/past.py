@@ -171,8 +171,7 @@ class LaggedAnalysis(InPlaceOf):
         )
         self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
-        if hasattr(analysis, "noise_variance_key"):
-            self.noise_variance_key = analysis.noise_variance_key
+        self.noise_variance_key = analysis.noise_variance_key
 
     def noise_sizes(self, *values):
         """Those of the analysis."""
