@@ -9,7 +9,7 @@ from tensordict import NestedKey
 from torch import nn
 
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_network, declared
+from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -22,7 +22,7 @@ class MemberNetwork(SubModel):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """Those of the network."""
-        return declared(self.module).noise_names
+        return getattr(self.module, "noise_names", ())
 
     def draw_noise(self, batch_size, *, members=None, time=False, device=None, dtype=None, generator=None, **_):
         """Draws the network's noise for ``[*batch_size, E]`` rows."""
