@@ -34,6 +34,8 @@ from tests.transforms.envs_for_tests import (
     base_env,
     filtered_env,
     fixed_filter,
+    forked_env,
+    half_known_filter,
     known_start_filter,
     random_filter,
     random_rollout,
@@ -47,14 +49,15 @@ from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.transforms import DEnKFTransform
 
 
-def make_env(kind, make_filter=known_start_filter):
+def make_env(kind, make_filter=half_known_filter):
     if kind == "[]":
         return filtered_env(make_filter, max_steps=STEPS[0])
     if kind == "[3]":
         return filtered_env(make_filter, batch_size=[3], max_steps=[*STEPS, 30])
-    batched = SerialEnv if "serial" in kind else ParallelEnv
-    if "inside" in kind:
+    if "inside" in kind:  # spawned workers draw noise of their own from the beginning, which forked ones do not
+        batched = SerialEnv if "serial" in kind else ParallelEnv
         return batched(2, [partial(filtered_env, make_filter, max_steps=n, seed=n) for n in STEPS])
+    batched = SerialEnv if "serial" in kind else forked_env
     plain = batched(2, [partial(seeded_env, n, max_steps=n) for n in STEPS])
     return TransformedEnv(plain, DEnKFTransform(make_filter()))
 
@@ -65,7 +68,7 @@ KINDS = ["[]", "[3]", "serial inside", "serial outside", "parallel inside", "par
 @pytest.fixture(scope="module", params=KINDS)
 def env(request):
     env = make_env(request.param)
-    env.first = env.reset()  # before anything was seeded
+    env.first = env.reset()["belief", "ensemble"]  # before anything was seeded
     yield env
     env.close()
 
@@ -79,7 +82,6 @@ def test_specs(env):
 
 
 def test_partial_resets(env):
-    prior = torch.tensor(PRIOR_MEAN)
     rollout = random_rollout(env)
     if not env.batch_size:
         rollout = rollout.unsqueeze(0)
@@ -88,12 +90,15 @@ def test_partial_resets(env):
     # 12 steps of episodes of 3 and 5: resets after steps 3, 6, 9 (12) and 5, 10.
     for row, length in enumerate(STEPS[: len(rollout)]):
         assert (done[row].nonzero().flatten() + 1).tolist() == list(range(length, 13, length))
-    assert (ensemble[:, 0] == prior).all()
+    known, drawn = PRIOR_MEAN  # the prior's first component has no spread, its second that of one standard deviation
     after = done[:, :-1]
-    assert (ensemble[:, 1:][after] == prior).all(), "rows that reset get the prior"
+    for start in (ensemble[:, 0], ensemble[:, 1:][after]):
+        assert (start[..., 0] == known).all(), "rows that reset get the prior"
+        assert ((start[..., 1] - drawn).abs() < 5).all()
+        assert start[..., 1].unique().numel() == start[..., 1].numel(), "drawn anew each time"
     assert ensemble[:, 1:][~after].equal(next_ensemble[:, :-1][~after]), "other rows keep their belief"
     # It is not the prior that they keep: two steps on, every member has moved.
-    assert (next_ensemble[:, 1:][~after] != prior).all()
+    assert (next_ensemble[..., 0] != known).all()
     assert_equal(
         rollout["next", "belief"].exclude("ensemble"),
         {"mean": next_ensemble.mean(-2), "var": next_ensemble.var(-2)},
@@ -266,21 +271,17 @@ def test_same_seed_same_rollout(env):
     assert not first["next", "belief", "mean"].equal(other["next", "belief", "mean"])
 
 
-@pytest.mark.parametrize("kind", ["[3]", "serial inside", "serial outside", "parallel inside", "parallel outside"])
-def test_rows_and_workers_differ(kind):
-    env = make_env(kind, random_filter)
-    try:
-        unseeded = env.reset()["belief", "ensemble"]
-        assert not unseeded[0].equal(unseeded[1]), "also where nothing was seeded"
-        env.set_seed(0)
-        seeded = env.reset()["belief", "ensemble"]
-        assert not seeded[0].equal(seeded[1])
-        assert not seeded.equal(unseeded)
-        rollout = random_rollout(env, 4)
-        noise = rollout["next", "belief", "ensemble"] - rollout["next", "belief", "mean"].unsqueeze(-2)
-        assert not noise[0].allclose(noise[1])
-    finally:
-        env.close()
+@pytest.mark.parametrize("env", KINDS[1:], indirect=True, scope="module")
+def test_rows_and_workers_differ(env):
+    torch.manual_seed(1)  # of the filter, where it runs in this process
+    env.set_seed(1)
+    seeded = env.reset()["belief", "ensemble"]
+    for start in (env.first, seeded):
+        assert not start[0].equal(start[1]), "also where nothing was seeded"
+    assert not seeded.equal(env.first)
+    rollout = random_rollout(env, 4)
+    noise = rollout["next", "belief", "ensemble"] - rollout["next", "belief", "mean"].unsqueeze(-2)
+    assert not noise[0].allclose(noise[1])
 
 
 def test_nothing_on_self():
