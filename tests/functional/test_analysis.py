@@ -9,6 +9,7 @@ from torch.distributions import MultivariateNormal
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.functional import analyse, ensemble_anomalies, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.moments import ensemble_cov
@@ -327,8 +328,7 @@ def test_errors_name_the_argument(change, message):
         "observation": torch.zeros(5, 3),
         "noise": torch.ones(3),
     }
-    with pytest.raises(ValueError, match=message):
-        analyse(**(arguments | change))
+    assert_refused(ValueError, message, analyse, **arguments | change)
 
 
 def test_anomalies_of_the_square_root_sum_to_zero():
@@ -376,8 +376,7 @@ def test_a_taper_of_ones_changes_nothing_and_one_per_batch_is_allowed():
 def test_a_taper_that_does_not_fit_is_refused(scheme, space, shape, message):
     problem = Problem(5, 3, 2)
     taper = torch.ones(shape, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
-    with pytest.raises(ValueError, match=message):
-        problem.analyse(scheme, taper=taper, space=space)
+    assert_refused(ValueError, message, problem.analyse, scheme, taper=taper, space=space)
 
 
 @pytest.mark.parametrize("space", SPACES)

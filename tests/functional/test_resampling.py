@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
@@ -276,12 +277,10 @@ def test_errors():
         systematic_resample(particles, log_weights, torch.rand(2))
     with pytest.raises(ValueError, match=r"log_weights must be \[\*B, E\] = \[6\], got \[3\]"):
         weighted_mean(particles, log_weights[:3])
-    with pytest.raises(ValueError, match=r"between 0 and 1; got 1.5"):
-        soft_resample(particles, log_weights, torch.rand(1), 1.5)
+    assert_refused(ValueError, r"between 0 and 1; got 1.5", soft_resample, particles, log_weights, torch.rand(1), 1.5)
     with pytest.raises(ValueError, match="epsilon and iterations must be positive"):
         transport_resample(particles, log_weights, epsilon=0.0)
-    with pytest.raises(ValueError, match="at least 2"):
-        weighted_var(particles[:1], log_weights[:1])
+    assert_refused(ValueError, "at least 2", weighted_var, particles[:1], log_weights[:1])
 
 
 def test_compiled_equals_eager():
@@ -327,8 +326,7 @@ def test_jitter_is_zero_without_copies_or_factor():
     assert jitter_copies(particles, particles, log_weights, normal).equal(particles)
     copies = particles[:, :1].expand_as(particles)
     assert jitter_copies(copies, particles, log_weights, normal, factor=0.0).equal(copies)
-    with pytest.raises(ValueError, match="0 or more"):
-        jitter_copies(copies, particles, log_weights, normal, factor=-1.0)
+    assert_refused(ValueError, "0 or more", jitter_copies, copies, particles, log_weights, normal, factor=-1.0)
 
 
 def test_gradient_of_jitter_is_that_of_finite_differences():

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.multiprocessing import start_processes
 
+from tests.functional.refusals import assert_refused
 from tests.functional.two_shards import SHARES, analyse_shares, problem
 from torch_denkf.functional import analyse
 from torch_denkf.functional.sharded import analyse_sharded
@@ -60,10 +61,8 @@ def arguments():
 
 
 def test_draws_must_be_given():
-    with pytest.raises(ValueError, match=r"perturbation.*another seed"):
-        analyse_sharded(*arguments(), scheme="perturbed")
-    with pytest.raises(ValueError, match="'perturbed'"):
-        ShardedEnsembleAnalysis("perturbed")
+    assert_refused(ValueError, r"perturbation.*another seed", analyse_sharded, *arguments(), scheme="perturbed")
+    assert_refused(ValueError, "'perturbed'", ShardedEnsembleAnalysis, "perturbed")
 
 
 def test_gradients_are_refused():
@@ -76,8 +75,7 @@ def test_gradients_are_refused():
 
 def test_processes_must_have_begun(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(RuntimeError, match="init_process_group"):
-        analyse_sharded(*arguments(), scheme="etkf")
+    assert_refused(RuntimeError, "init_process_group", analyse_sharded, *arguments(), scheme="etkf")
 
 
 def test_shapes_are_checked():

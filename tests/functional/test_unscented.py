@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.functional import kalman_update, sigma_points, wrap_angles
 from torch_denkf.functional.unscented import unscented_moments, unscented_update, unscented_weights
 
@@ -154,12 +155,9 @@ def test_angles_are_averaged_and_compared_across_pi():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(ValueError, match="Use kappa >= 0"):
-        unscented_weights(3, kappa=-3.0)
-    with pytest.raises(ValueError, match="Use kappa >= 0"):
-        sigma_points(torch.zeros(3), torch.eye(3), kappa=-3.0)
-    with pytest.raises(ValueError, match=r"5 points .* and 7 weights"):
-        unscented_moments(torch.zeros(5, 3), unscented_weights(3))
+    assert_refused(ValueError, "Use kappa >= 0", unscented_weights, 3, kappa=-3.0)
+    assert_refused(ValueError, "Use kappa >= 0", sigma_points, torch.zeros(3), torch.eye(3), kappa=-3.0)
+    assert_refused(ValueError, r"5 points .* and 7 weights", unscented_moments, torch.zeros(5, 3), unscented_weights(3))
     points = torch.zeros(7, 3)
     with pytest.raises(ValueError, match="noise must be variances"):
         unscented_update(points, points, torch.zeros(3), torch.ones(2), unscented_weights(3))

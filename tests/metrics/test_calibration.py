@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.metrics import ensemble_interval_coverage, interval_coverage
 
 
@@ -78,9 +79,6 @@ def test_errors_say_what_to_do():
         ensemble_interval_coverage(torch.zeros(4, 18, 2), mean)
     with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
         ensemble_interval_coverage(torch.zeros(4, 19, 3), mean)
-    with pytest.raises(ValueError, match="cannot be negative"):
-        interval_coverage(mean, mean - 1, mean)
-    with pytest.raises(ValueError, match=r"shape of the mean, \[4, 2\]; got \[2\]"):
-        interval_coverage(mean, torch.ones(2), mean)
-    with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
-        interval_coverage(mean, torch.ones(4, 2), mean, level=90)
+    assert_refused(ValueError, "cannot be negative", interval_coverage, mean, mean - 1, mean)
+    assert_refused(ValueError, r"shape of the mean, \[4, 2\]; got \[2\]", interval_coverage, mean, torch.ones(2), mean)
+    assert_refused(ValueError, r"in \(0, 1\); got 90", interval_coverage, mean, torch.ones(4, 2), mean, level=90)

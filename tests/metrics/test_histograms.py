@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
@@ -105,13 +106,8 @@ def test_interval_is_numpys_quantile():
 
 def test_errors_say_what_to_do():
     ones = torch.ones(4, 2)
-    with pytest.raises(ValueError, match="cannot be negative"):
-        pit(ones, -ones, ones)
-    with pytest.raises(ValueError, match="must be finite"):
-        rank_histogram(torch.full((4, 3, 2), torch.nan), ones)
-    with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
-        rank_histogram(ones, ones)
-    with pytest.raises(ValueError, match="needs samples and bins"):
-        histogram_band(0, 10)
-    with pytest.raises(ValueError, match="5 bins need at least one state each; got 4"):
-        spread_error(ones, ones, ones, bins=5)
+    assert_refused(ValueError, "cannot be negative", pit, ones, -ones, ones)
+    assert_refused(ValueError, "must be finite", rank_histogram, torch.full((4, 3, 2), torch.nan), ones)
+    assert_refused(ValueError, r"ensemble must be \[\*B, E, S\]", rank_histogram, ones, ones)
+    assert_refused(ValueError, "needs samples and bins", histogram_band, 0, 10)
+    assert_refused(ValueError, "5 bins need at least one state each; got 4", spread_error, ones, ones, ones, bins=5)

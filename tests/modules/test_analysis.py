@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.modules import EnsembleAnalysis
@@ -108,10 +109,8 @@ def test_a_single_reading(float64):
 
 
 def test_errors():
-    with pytest.raises(ValueError, match="'enkf'"):
-        EnsembleAnalysis("enkf")
-    with pytest.raises(ValueError, match="rotate"):
-        EnsembleAnalysis("sakov", rotate=True)
+    assert_refused(ValueError, "'enkf'", EnsembleAnalysis, "enkf")
+    assert_refused(ValueError, "rotate", EnsembleAnalysis, "sakov", rotate=True)
 
 
 def test_inflation_multiplies_the_components_that_it_is_told(float64):

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from benchmarks.common.lorenz96 import lorenz96_step
+from tests.functional.refusals import assert_refused
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import neighbours
 from torch_denkf.functional.inflation import relax_to_prior_spread
@@ -222,12 +223,9 @@ def test_gradients_equal_finite_differences(float64):
 
 
 def test_errors_name_what_is_wrong():
-    with pytest.raises(ValueError, match=r"taper must be \[S, O\]"):
-        LocalEnsembleAnalysis(torch.ones(3))
-    with pytest.raises(ValueError, match=r"near\.index"):
-        LocalEnsembleAnalysis(torch.ones(3, S))(inputs())
-    with pytest.raises(KeyError, match="sensor"):
-        LocalEnsembleAnalysis(torch.ones(S, S))(inputs().exclude("sensor"))
+    assert_refused(ValueError, r"taper must be \[S, O\]", LocalEnsembleAnalysis, torch.ones(3))
+    assert_refused(ValueError, r"near\.index", LocalEnsembleAnalysis(torch.ones(3, S)), inputs())
+    assert_refused(KeyError, "sensor", LocalEnsembleAnalysis(torch.ones(S, S)), inputs().exclude("sensor"))
 
 
 def test_what_would_never_be_trained_is_refused_by_name(float64):
@@ -238,10 +236,8 @@ def test_what_would_never_be_trained_is_refused_by_name(float64):
     with torch.no_grad(), pytest.raises(ValueError, match="radius asks"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
     for near in (taper, neighbours_of_taper(taper), neighbours(PLACES.clone().requires_grad_(), PLACES, 2.0)):
-        with pytest.raises(ValueError, match="near asks for a gradient"):
-            LocalEnsembleAnalysis(near)
-    with pytest.raises(ValueError, match="taper asks for a gradient"):
-        EnsembleAnalysis("sakov", taper=(torch.ones(S, S), taper))
+        assert_refused(ValueError, "near asks for a gradient", LocalEnsembleAnalysis, near)
+    assert_refused(ValueError, "taper asks for a gradient", EnsembleAnalysis, "sakov", taper=(torch.ones(S, S), taper))
     td = inputs()
     found = LocalEnsembleAnalysis.around(PLACES, PLACES, radius.detach())(td.clone())["belief", "ensemble"]
     assert found.equal(LocalEnsembleAnalysis.around(PLACES, PLACES, 2.0)(td.clone())["belief", "ensemble"])

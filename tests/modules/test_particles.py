@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
@@ -179,8 +180,7 @@ def test_noise_model_reads_the_weighted_mean(weights):
 
 def test_noise_of_the_wrong_size():
     noisy = NoisyTransition(Shift(), ConstantNoise([1.0, 1.0], in_key=("belief", "ensemble")), [1])
-    with pytest.raises(ValueError, match=r"writes 2 variances .* for 1 dims"):
-        noisy(belief())
+    assert_refused(ValueError, r"writes 2 variances .* for 1 dims", noisy, belief())
 
 
 # -------------------------------------------------------------------------------------------------- resampling
@@ -253,8 +253,7 @@ def test_a_mask_does_not_overrule_the_threshold():
 
 
 def test_unknown_scheme():
-    with pytest.raises(ValueError, match="'multinomial'"):
-        ResampledTransition(Shift(), "multinomial")
+    assert_refused(ValueError, "'multinomial'", ResampledTransition, Shift(), "multinomial")
 
 
 # ----------------------------------------------------------------------------------------------------- update
@@ -299,8 +298,7 @@ def test_analysis_without_an_observation_keeps_the_weights():
 @pytest.mark.parametrize("key", [("forecast", "log_weight"), ("forecast", "log_likelihood")])
 def test_missing_entries_name_themselves(key):
     td = TensorDict({"forecast": belief()["belief"].set("log_likelihood", torch.zeros(E))})
-    with pytest.raises(KeyError, match=f"ParticleAnalysis reads .*{key[1]}"):
-        ParticleAnalysis()(td.exclude(key))
+    assert_refused(KeyError, f"ParticleAnalysis reads .*{key[1]}", ParticleAnalysis(), td.exclude(key))
 
 
 def test_a_tempered_likelihood_is_that_of_more_noise(float64):

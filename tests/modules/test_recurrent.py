@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules import GaussianAround, MomentPrior
@@ -109,16 +110,13 @@ def test_gradients(float64):
     ],
 )
 def test_sizes_and_keys_belong_together(sizes, keys, match):
-    with pytest.raises(ValueError, match=match):
-        LSTMUpdate(2, **sizes, **keys)
+    assert_refused(ValueError, match, LSTMUpdate, 2, **sizes, **keys)
 
 
 def test_errors_name_what_is_wrong():
     update = LSTMUpdate(2, hidden_size=5, **{**SIZES, "features": 3}, **KEYS)
-    with pytest.raises(ValueError, match=r"8 inputs.*\[4, 2, 2, 1\]"):
-        update(frames((3,)))
-    with pytest.raises(KeyError, match="'code'"):
-        update(frames((3,)).exclude("code"))
+    assert_refused(ValueError, r"8 inputs.*\[4, 2, 2, 1\]", update, frames((3,)))
+    assert_refused(KeyError, "'code'", update, frames((3,)).exclude("code"))
 
 
 def test_memory_is_empty_at_reset(float64):

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.functional.refusals import assert_refused
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.modules import LearnedTransition, StochasticMLP
 
@@ -120,8 +121,7 @@ def test_unicycle_gradients(float64):
 
 
 def test_unicycle_needs_five_dimensions():
-    with pytest.raises(ValueError, match="4 state dimensions"):
-        forecast(UnicycleTransition(still, 0.1), torch.zeros(2, 4))
+    assert_refused(ValueError, "4 state dimensions", forecast, UnicycleTransition(still, 0.1), torch.zeros(2, 4))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
@@ -175,8 +175,7 @@ def test_dt_may_be_an_entry_that_varies_over_rows(float64):
     ]
     torch.testing.assert_close(forecast(by_entry, state, dt=DTS), torch.stack(rows), rtol=0, atol=1e-14)
     assert not rows[0].allclose(rows[1])
-    with pytest.raises(KeyError, match="UnicycleTransition reads 'dt', which is missing"):
-        forecast(by_entry, state)
+    assert_refused(KeyError, "UnicycleTransition reads 'dt', which is missing", forecast, by_entry, state)
 
 
 def test_dt_may_be_an_entry_beside_a_history(float64):

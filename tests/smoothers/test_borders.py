@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import directional_check
+from tests.functional.refusals import assert_refused
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.filters import LSTMFilter
@@ -122,18 +123,12 @@ def test_the_path_of_a_car_online_is_that_of_the_recording():
 
 def test_what_is_no_lag_and_what_no_filter():
     for lag in (1.5, True, "2"):
-        with pytest.raises(TypeError, match="lag must be a whole number"):
-            EnRTS(linear_denkf(), lag)
-        with pytest.raises(TypeError, match="lag must be a whole number"):
-            FixedLag(linear_denkf(), lag)
-    with pytest.raises(ValueError, match=r"damping must be .*at most 1; got 1.2"):
-        EnRTS(linear_denkf(), damping=1.2)
-    with pytest.raises(TypeError, match="damping must be a number"):
-        EnRTS(linear_denkf(), damping="0.9")
+        assert_refused(TypeError, "lag must be a whole number", EnRTS, linear_denkf(), lag)
+        assert_refused(TypeError, "lag must be a whole number", FixedLag, linear_denkf(), lag)
+    assert_refused(ValueError, r"damping must be .*at most 1; got 1.2", EnRTS, linear_denkf(), damping=1.2)
+    assert_refused(TypeError, "damping must be a number", EnRTS, linear_denkf(), damping="0.9")
     recurrent = LSTMFilter(None, state_dim=2, observation_dim=2)
     for smoother in (partial(FixedLag, lag=2), RTSSmoother):
-        with pytest.raises(TypeError, match="before and after a step"):
-            smoother(recurrent)
+        assert_refused(TypeError, "before and after a step", smoother, recurrent)
     for smoother in (EnKS, EnRTS):
-        with pytest.raises(TypeError, match="LSTMFilter carries"):
-            smoother(recurrent)
+        assert_refused(TypeError, "LSTMFilter carries", smoother, recurrent)

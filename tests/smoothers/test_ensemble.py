@@ -15,6 +15,7 @@ from tests.filters.factories import (
     toy_frames,
 )
 from tests.filters.gaussian_for_tests import directional_check
+from tests.functional.refusals import assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
@@ -118,8 +119,7 @@ def test_rotations_turn_the_past_as_well(float64):
     assert_close(turned["smoothed", "mean"], plain["smoothed", "mean"], rtol=0, atol=1e-9)
     assert_close(turned["smoothed", "var"], plain["smoothed", "var"], rtol=0, atol=1e-9)
     assert not torch.allclose(turned["smoothed", "ensemble"], plain["smoothed", "ensemble"])
-    with pytest.raises(ValueError, match="rotate=True"):
-        EnRTS(rotated)
+    assert_refused(ValueError, "rotate=True", EnRTS, rotated)
 
 
 def test_several_analyses_each_correct_the_past(float64):
@@ -194,8 +194,7 @@ def test_damping_holds_the_inflation_that_goes_back(float64):
     torch.testing.assert_close(first[0], 1.5**4 * members, rtol=1e-9, atol=0)
     shift = sum(0.5**k * 1.5 ** (k - 1) * 0.5 for k in range(1, 5))  # of each step k, through k damped gains
     torch.testing.assert_close(first[1], (1 + shift) * members, rtol=1e-9, atol=0)
-    with pytest.raises(ValueError, match="above 0 and at most 1"):
-        enrts_step(members, members, members, damping=0.0)
+    assert_refused(ValueError, "above 0 and at most 1", enrts_step, members, members, members, damping=0.0)
 
 
 @pytest.mark.parametrize("lag", [None, 1])
@@ -216,8 +215,7 @@ def test_inflation_needs_a_damping(float64, lag):
     assert_close(unread(first, "smoothed"), unread(first, "belief"), rtol=1e-9, atol=0)
     filter["analysis"].inflation = 1.2
     for make in (lambda: EnRTS(filter, lag), lambda: still(frames.copy())):  # now, and set since it was made
-        with pytest.raises(ValueError, match=r"EnsembleAnalysis has inflation=1.2.*damping=.*EnKS or FixedLag"):
-            make()
+        assert_refused(ValueError, r"EnsembleAnalysis has inflation=1.2.*damping=.*EnKS or FixedLag", make)
     carried = EnRTS(filter, lag, damping=1.0)(frames.copy())
     assert (unread(carried, "smoothed")[:, 1:-1] > 1.19 * unread(carried, "belief")[:, 1:-1]).all()
     EnRTS(filter, lag, damping=0.8)(frames.copy())
@@ -229,8 +227,7 @@ def test_inflation_needs_a_damping(float64, lag):
 
 def test_adapted_inflation_needs_a_damping():
     gated = Gated(linear_denkf("etkf"), adapt_inflation=0.1)
-    with pytest.raises(ValueError, match=r"adapt_inflation=0.1.*damping="):
-        EnRTS(gated)
+    assert_refused(ValueError, r"adapt_inflation=0.1.*damping=", EnRTS, gated)
 
 
 @pytest.mark.parametrize("size", [4, 7])
@@ -278,21 +275,15 @@ def test_compiled_functions_are_the_eager_ones():
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="EnRTS takes a filter with an ensemble"):
-        EnRTS(linear_kalman())
-    with pytest.raises(TypeError, match="EnKS takes a filter with an ensemble"):
-        EnKS(linear_kalman())
+    assert_refused(TypeError, "EnRTS takes a filter with an ensemble", EnRTS, linear_kalman())
+    assert_refused(TypeError, "EnKS takes a filter with an ensemble", EnKS, linear_kalman())
     with pytest.raises(TypeError, match="takes a filter with a mean and a covariance; DEnKF has none"):
         RTSSmoother(linear_denkf())
-    with pytest.raises(ValueError, match="at least 1"):
-        FixedLag(linear_denkf(), 0)
-    with pytest.raises(ValueError, match="lag must be a whole number, at least 0; got -1"):
-        EnRTS(linear_denkf(), -1)
-    with pytest.raises(TypeError, match="carries a past already"):
-        FixedLag(FixedLag(linear_denkf(), 2), 2)
+    assert_refused(ValueError, "at least 1", FixedLag, linear_denkf(), 0)
+    assert_refused(ValueError, "lag must be a whole number, at least 0; got -1", EnRTS, linear_denkf(), -1)
+    assert_refused(TypeError, "carries a past already", FixedLag, FixedLag(linear_denkf(), 2), 2)
     stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
-    with pytest.raises(KeyError, match="stored without a lag"):
-        FixedLag(linear_denkf(), 2).sequence(stored)
+    assert_refused(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)
 
 
 @pytest.mark.parametrize("smoother", [lambda f: FixedLag(f, 2), lambda f: EnKS(f, 2), EnRTS, RTSSmoother])

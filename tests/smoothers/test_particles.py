@@ -7,6 +7,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
+from tests.functional.refusals import assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -126,8 +127,7 @@ def test_each_step_uses_the_action_that_led_into_it(float64, previous):
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="takes a filter with particles"):
-        ParticleSmoother(linear_denkf())
+    assert_refused(TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf())
     F, Q, H, R = linear_system()
     own = ParticleFilter(
         NoisyLinear(F, Q),
@@ -137,8 +137,6 @@ def test_what_cannot_be_smoothed_says_so():
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior(MEAN, [1.0, 1.0], ensemble_size=5),
     )
-    with pytest.raises(TypeError, match="density of the motion"):
-        ParticleSmoother(own)
-    with pytest.raises(ValueError, match="picks none"):
-        FixedLag(particles(5, resampling="transport"), 2)
+    assert_refused(TypeError, "density of the motion", ParticleSmoother, own)
+    assert_refused(ValueError, "picks none", FixedLag, particles(5, resampling="transport"), 2)
     assert FixedLag(own, 2).sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))["smoothed", "mean"].ndim == 2

@@ -14,7 +14,7 @@ STEPS = [3, 5]  # episode lengths of the two (or first two) rows
 
 
 def forked_env(workers, *args, **kwargs):
-    """A ``ParallelEnv`` whose workers need not import anything, which takes seconds: they are copies of this process."""
+    """A ``ParallelEnv`` of copies of this process: workers that need not import anything, which takes seconds."""
     return ParallelEnv(workers, *args, mp_start_method="fork", **kwargs)
 
 

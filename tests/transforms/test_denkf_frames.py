@@ -13,6 +13,7 @@ from torchrl.envs import (
 )
 
 from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
+from tests.functional.refusals import assert_refused
 from tests.transforms.envs_for_tests import (
     BELIEF,
     base_env,
@@ -73,16 +74,14 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
         return TransformedEnv(make_base(batch_size=[3]), transforms)
 
     assert make().rollout(2).shape == (3, 2)
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\].*'observed'"):
-        make().rollout(8)
+    assert_refused(ValueError, r"NaN or infinity in \['observation'\].*'observed'", make().rollout, 8)
     # Without the check such a reading counts as missing: the beliefs are those under a mask that tells the truth.
     assert_equal(make(check_finite=False).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
 def test_nan_at_reset_with_an_update_there():
     env = TransformedEnv(base_env(), Compose(NanAtReset(), DEnKFTransform(fixed_filter(update_at_reset=True))))
-    with pytest.raises(ValueError, match=r"NaN or infinity in \['observation'\]"):
-        env.reset()
+    assert_refused(ValueError, r"NaN or infinity in \['observation'\]", env.reset)
 
 
 class NanAtReset(Transform):
@@ -96,8 +95,7 @@ class NanAtReset(Transform):
 def test_divergence_is_told_apart():
     filter = linear_denkf()
     filter["transition"].matrix.mul_(1e30)
-    with pytest.raises(ValueError, match="the filter diverged"):
-        TransformedEnv(base_env(), DEnKFTransform(filter)).rollout(5)
+    assert_refused(ValueError, "the filter diverged", TransformedEnv(base_env(), DEnKFTransform(filter)).rollout, 5)
 
 
 def test_missing_frames_before_the_filter():
@@ -117,8 +115,7 @@ def test_missing_frames_before_the_filter():
 
 def test_missing_key_names_key_and_environment():
     filter = linear_kalman(observation_key="gps")
-    with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
-        TransformedEnv(base_env(), DEnKFTransform(filter)).reset()
+    assert_refused(KeyError, r"'gps'.*LinearGaussianEnv", TransformedEnv(base_env(), DEnKFTransform(filter)).reset)
     with pytest.raises(KeyError, match=r"'gps'.*LinearGaussianEnv"):
         _ = TransformedEnv(base_env(), DEnKFTransform(filter)).observation_spec
 
@@ -126,8 +123,7 @@ def test_missing_key_names_key_and_environment():
 def test_lost_belief_is_an_error():
     env = filtered_env()
     td = env.rand_action(env.reset()).exclude("belief")
-    with pytest.raises(KeyError, match=r"carries the belief in \('belief', 'ensemble'\)"):
-        env.step(td)
+    assert_refused(KeyError, r"carries the belief in \('belief', 'ensemble'\)", env.step, td)
 
 
 def test_float64_environment_and_float32_filter():
@@ -146,11 +142,8 @@ def test_float64_environment_and_float32_filter():
 
 
 def test_constructor_errors():
-    with pytest.raises(TypeError, match="together with its initial belief"):
-        DEnKFTransform(TensorDictSequential(*fixed_filter()))
-    with pytest.raises(TypeError, match="Linear"):
-        DEnKFTransform(nn.Linear(1, 1))
+    assert_refused(TypeError, "together with its initial belief", DEnKFTransform, TensorDictSequential(*fixed_filter()))
+    assert_refused(TypeError, "Linear", DEnKFTransform, nn.Linear(1, 1))
     with pytest.raises(TypeError, match="has its initial belief already"):
         DEnKFTransform(fixed_filter(), initial=fixed_filter().initial)
-    with pytest.raises(KeyError, match="'info', 'gain'"):
-        DEnKFTransform(fixed_filter(), diagnostics=[("info", "gain")])
+    assert_refused(KeyError, "'info', 'gain'", DEnKFTransform, fixed_filter(), diagnostics=[("info", "gain")])

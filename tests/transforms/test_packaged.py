@@ -4,6 +4,7 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
+from tests.functional.refusals import assert_refused
 from tests.transforms.envs_for_tests import base_env, fixed_filter, random_filter, toy_base_env, toy_filter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.transforms import DEnKFTransform
@@ -95,27 +96,23 @@ def test_what_went_wrong_is_said(packages, tmp_path):
     step = load_step(path)
     with pytest.raises(KeyError, match="log_likelihood"):
         DEnKFTransform(filter, packaged=step, diagnostics=[("info", "log_likelihood")])
-    with pytest.raises(ValueError, match="records no graph"):
-        DEnKFTransform(filter, packaged=step, no_grad=False)
+    assert_refused(ValueError, "records no graph", DEnKFTransform, filter, packaged=step, no_grad=False)
     with pytest.raises(
         ValueError, match=r"must be torch.float32 \[2\], got torch.float32 \[3, 2\]"
     ):  # batch of three, package of one
         TransformedEnv(base_env(seed=0, batch_size=[3]), DEnKFTransform(filter, packaged=step)).rollout(2)
     env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=step))
     start = env.rand_action(env.reset().exclude("belief"))
-    with pytest.raises(KeyError, match="carries the belief"):
-        env.step(start)
+    assert_refused(KeyError, "carries the belief", env.step, start)
 
     blind = export_step(filter, one_step(base_env(seed=0), filter, ["observed"]), tmp_path / "a.pt2", compiled=False)
     env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(blind)))
-    with pytest.raises(ValueError, match="emits 'observed', which the packaged step was exported without"):
-        env.rollout(2)
+    assert_refused(ValueError, "emits 'observed', which the packaged step was exported without", env.rollout, 2)
 
     noisy = random_filter()
     example = noisy.draw_noise(one_step(base_env(seed=0), noisy))
     given = export_step(noisy, example, tmp_path / "b.pt2", compiled=False)
-    with pytest.raises(KeyError, match=r"noise\.transition"):
-        DEnKFTransform(noisy, packaged=load_step(given))
+    assert_refused(KeyError, r"noise\.transition", DEnKFTransform, noisy, packaged=load_step(given))
 
 
 def test_actions_may_be_in_double_precision(packages):
@@ -136,8 +133,7 @@ def test_nan_is_found(packages):
     env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(path)))
     td = env.rand_action(env.reset())
     td["belief", "ensemble"][0, 0] = torch.nan
-    with pytest.raises(ValueError, match="the filter diverged"):
-        env.step(td)
+    assert_refused(ValueError, "the filter diverged", env.step, td)
 
 
 def test_nan_passes_where_nobody_looks_for_it(packages):
