@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, ensemble_anomalies, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.moments import ensemble_cov

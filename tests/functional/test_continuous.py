@@ -3,6 +3,7 @@
 import torch
 from torch.testing import assert_close
 
+from tests.functional.checks import assert_compiled_is_eager
 from torch_denkf.functional.continuous import discretise
 
 DRIFT = [[0.0, 1.0], [0.0, 0.0]]
@@ -33,6 +34,4 @@ def test_gradients_and_compilation(float64):
     drift, root, dt = torch.randn(2, 2), torch.randn(2, 2), torch.rand(3, 1)
     inputs = [value.requires_grad_() for value in (drift, root, dt)]
     assert torch.autograd.gradcheck(lambda a, b, t: discretise(a, b @ b.mT, t), inputs)
-    values = [drift.detach(), torch.eye(2), dt.detach()]
-    compiled = torch.compile(discretise, fullgraph=True, backend="aot_eager")(*values)
-    assert_close(compiled, discretise(*values))
+    assert_compiled_is_eager(discretise, drift.detach(), torch.eye(2), dt.detach())

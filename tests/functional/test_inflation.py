@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, kalman_update, letkf, neighbours
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
 from torch_denkf.functional.moments import ensemble_cov

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_anomalies, ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_cov
 

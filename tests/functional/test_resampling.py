@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
@@ -287,9 +287,7 @@ def test_compiled_equals_eager():
     def everything(x, w, u):
         return [*systematic_resample(x, w, u), *soft_resample(x, w, u), *transport_resample(x, w, iterations=3)]
 
-    inputs = *problem((3,)), torch.rand(3, 1)
-    compiled = torch.compile(everything, fullgraph=True, backend="aot_eager")(*inputs)
-    torch.testing.assert_close(compiled, everything(*inputs))
+    assert_compiled_is_eager(everything, *problem((3,)), torch.rand(3, 1))
 
 
 def test_jitter_moves_the_copies_and_has_the_kernels_covariance():

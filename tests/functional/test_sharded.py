@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.multiprocessing import start_processes
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from tests.functional.two_shards import SHARES, analyse_shares, problem
 from torch_denkf.functional import analyse
 from torch_denkf.functional.sharded import analyse_sharded

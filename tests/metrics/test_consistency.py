@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import nees
 from torch_denkf.metrics.consistency import _chi_square_quantile, gaussian_nll
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import (
     ensemble_interval_coverage,
     interval_coverage,

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 

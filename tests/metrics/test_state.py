@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
 

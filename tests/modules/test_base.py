@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, unravel_key
 from torch import nn
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
 from torch_denkf.filters._steps import _without_reading
 from torch_denkf.modules import (

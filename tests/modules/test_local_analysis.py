@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from benchmarks.common.lorenz96 import lorenz96_step
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import neighbours
 from torch_denkf.functional.inflation import relax_to_prior_spread

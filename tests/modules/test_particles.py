@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.functional import soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.weighted import weighted_mean, weighted_var

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
 from torch_denkf.modules import CholeskyNoise, ConstantNoise, MappedNoise
 

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules import GaussianAround, MomentPrior

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
 from torch_denkf.modules import LearnedTransition, StochasticMLP
 

@@ -14,8 +14,7 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from tests.filters.gaussian_for_tests import directional_check
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional.moments import ensemble_cov
@@ -154,22 +153,10 @@ def test_several_analyses_each_correct_the_past(float64):
 
 
 def test_a_local_analysis_of_everything_is_the_global_one(float64):
-    R = linear_system()[3]
-    frames, filters = drive(2, 6, resets=False), []
-    for analysis in (EnsembleAnalysis("etkf", observation_key="observation"), None):
-        if analysis is None:
-            analysis = LocalEnsembleAnalysis(torch.ones(2, 2), observation_key="observation")
-        plain = linear_denkf("etkf")
-        filters.append(
-            DEnKF(
-                plain["transition"],
-                None,
-                plain["observation"],
-                ConstantNoise(R.sqrt(), in_key="observation"),
-                analysis,
-                initial=plain.initial,
-            )
-        )
+    frames, plain = drive(2, 6, resets=False), linear_denkf("etkf")
+    analysis = LocalEnsembleAnalysis(torch.ones(2, 2), observation_key="observation")
+    parts = [plain["transition"], None, plain["observation"], plain["noise"], analysis]
+    filters = plain, DEnKF(*parts, initial=plain.initial)
     globally, locally = (EnKS(filter, 3)(frames.copy()) for filter in filters)
     assert_close(locally["smoothed", "ensemble"], globally["smoothed", "ensemble"], rtol=0, atol=1e-9)
 
@@ -247,31 +234,12 @@ def test_gradients_of_a_step_are_those_of_finite_differences(float64, size):
     assert torch.autograd.gradcheck(smooth, inputs)
 
 
-@pytest.mark.parametrize("make", [EnRTS, EnKS, lambda f: EnKS(f, 1), lambda f: EnRTS(f, 1), lambda f: FixedLag(f, 2)])
-def test_learned_parts_learn_from_what_they_look_back_at(float64, make):
-    filter = toy_denkf("perturbed", sensor_layer="none", layer="none", ensemble_size=6)
-    frames = toy_frames([2, 5], resets=False)
-    with torch.no_grad():  # the noise network starts at zero, where much of its gradient is zero, too
-        for parameter in filter["noise"].parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    smoother = make(filter)
-    running = smoother if isinstance(smoother, FixedLag) else smoother._filter_for(5)
-    frames = running.draw_noise(frames)
-    directional_check(
-        lambda: smoother.sequence(frames.copy())["smoothed", "ensemble"].square().sum(),
-        list(filter.parameters()),
-        step=1e-6,
-        rtol=1e-4,
-    )
-
-
 def test_compiled_functions_are_the_eager_ones():
     ensemble, forecast = torch.randn(2, 4, 6, 3), torch.randn(2, 4, 6, 3)
     follows = torch.tensor([[False, True, False, True], [False, True, True, True]])
     for lag in (None, 2):
-        eager = enrts_smooth(ensemble, forecast, follows=follows, lag=lag)
-        compiled = torch.compile(enrts_smooth, fullgraph=True, backend="aot_eager")
-        assert_close(compiled(ensemble, forecast, follows=follows, lag=lag), eager, rtol=1e-3, atol=1e-3)
+        options = {"follows": follows, "lag": lag}
+        assert_compiled_is_eager(enrts_smooth, ensemble, forecast, **options, rtol=1e-3, atol=1e-3)
 
 
 def test_what_cannot_be_smoothed_says_so():

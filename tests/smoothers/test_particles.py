@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -93,8 +93,7 @@ def test_gradients_are_those_of_finite_differences(float64):
 def test_compiled_is_eager():
     weights, moves = torch.randn(3, 5, 4).log_softmax(-1), torch.randn(3, 5, 4, 4)
     for lag in (None, 2):
-        compiled = torch.compile(backward_smooth, fullgraph=True, backend="aot_eager")(weights, moves, lag=lag)
-        assert_close(compiled, backward_smooth(weights, moves, lag=lag), rtol=1e-5, atol=1e-5)
+        assert_compiled_is_eager(backward_smooth, weights, moves, lag=lag, rtol=1e-5, atol=1e-5)
 
 
 def test_densities_of_pairs(float64):

@@ -13,7 +13,7 @@ from torchrl.envs import (
 )
 
 from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import (
     BELIEF,
     base_env,

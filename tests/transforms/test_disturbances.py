@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import KITTIReplayEnv, drive_frames, read_kitti_drive, write_drives
 from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames

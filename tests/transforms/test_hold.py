@@ -10,7 +10,7 @@ from torchrl.envs import InitTracker, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.modules import LSTMModule
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import HoldReading, MissingFrames
 

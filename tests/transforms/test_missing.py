@@ -7,7 +7,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from tests.functional.refusals import assert_refused
+from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import MissingFrames
 
