@@ -11,7 +11,6 @@ from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
-    ensemble_mean,
     ensemble_var,
     jitter_copies,
     soft_resample,
@@ -50,14 +49,6 @@ def test_weighted_moments_and_sample_size_by_hand():
     torch.testing.assert_close(weighted_mean(particles, log_weights), mean)
     torch.testing.assert_close(weighted_var(particles, log_weights), square * E / (E - 1))
     torch.testing.assert_close(effective_sample_size(log_weights), 1 / weights.square().sum(-1))
-
-
-def test_equal_weights_give_the_ensembles_moments():
-    particles = torch.randn(3, E, S)
-    equal = torch.full((3, E), -math.log(E))
-    torch.testing.assert_close(weighted_mean(particles, equal), ensemble_mean(particles))
-    torch.testing.assert_close(weighted_var(particles, equal), ensemble_var(particles))
-    torch.testing.assert_close(effective_sample_size(equal), torch.full((3,), float(E)))
 
 
 @pytest.mark.parametrize("batch", BATCHES)

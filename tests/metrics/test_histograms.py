@@ -97,10 +97,11 @@ def test_spread_error_by_hand_and_beside_the_ratio():
     torch.testing.assert_close(whole.spread[:, 0] / whole.error[:, 0], ratio)
 
 
-def test_interval_is_numpys_quantile():
+@pytest.mark.parametrize("level", [0.3, 0.8, 0.9])
+def test_interval_is_numpys_quantile(level):
     ensemble = torch.randn(5, 23, 2, generator=rng(), dtype=torch.float64)
-    low, high = ensemble_interval(ensemble, level=0.8)
-    expected = np.quantile(ensemble.numpy(), [0.1, 0.9], axis=1, method="weibull")
+    low, high = ensemble_interval(ensemble, level=level)
+    expected = np.quantile(ensemble.numpy(), [(1 - level) / 2, (1 + level) / 2], axis=1, method="weibull")
     np.testing.assert_allclose([low.numpy(), high.numpy()], expected, atol=1e-12)
 
 

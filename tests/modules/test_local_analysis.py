@@ -83,14 +83,6 @@ def test_an_observation_far_away_changes_nothing(float64):
     assert ((first - second)[..., 8:].abs().amax((0, 1)) > 1e-6).all()
 
 
-def test_alone_each_component_is_its_own_kalman_update(float64):
-    module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 0.2), inputs()
-    out = module(td.clone())
-    mean, var, r = td["forecast", "ensemble"].mean(-2), td["forecast", "ensemble"].var(-2), td["sensor", "noise"]
-    torch.testing.assert_close(out["belief", "mean"], mean + var / (var + r) * (td["sensor", "ensemble"] - mean))
-    torch.testing.assert_close(out["belief", "var"], var * r / (var + r))
-
-
 def test_diagnostics_take_each_observation_by_itself(float64):
     module, td = LocalEnsembleAnalysis.around(PLACES, PLACES, 1.0), inputs()
     td["observed"] = torch.rand(3, S) < 0.6

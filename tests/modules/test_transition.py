@@ -48,18 +48,6 @@ def test_commands_are_standardised(float64):
     torch.testing.assert_close(forecast(scaled, state, action=drive), expected, rtol=0, atol=1e-13)
 
 
-def test_residual_of_a_zero_network_is_the_identity():
-    net = nn.Linear(3, 3)
-    nn.init.zeros_(net.weight), nn.init.zeros_(net.bias)
-    state = torch.randn(4, 3)
-    assert forecast(LearnedTransition(net, loc=[1.0, 2.0, 3.0], scale=[1.0, 2.0, 3.0]), state).equal(state)
-
-
-def test_missing_action_is_named():
-    with pytest.raises(KeyError, match="'torque'"):
-        forecast(LearnedTransition(nn.Linear(4, 3), action_key="torque"), torch.zeros(2, 3))
-
-
 def still(velocity):
     return torch.zeros_like(velocity)
 
@@ -136,14 +124,6 @@ def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_be
     torch.testing.assert_close(out["ensemble"], expected, rtol=0, atol=1e-14)
     torch.testing.assert_close(out["mean"], expected.mean(-2), rtol=0, atol=1e-14)
     torch.testing.assert_close(out["var"], expected.var(-2), rtol=0, atol=1e-13)
-
-
-def test_motion_of_an_unchanged_forecast_is_the_forecast(float64):
-    # Where the analysis changes nothing, motion and transition agree.
-    state = torch.randn(6, 5)
-    moved = forecast(UnicycleTransition(still, 0.1), state)
-    td = TensorDict({"belief": {"ensemble": state}, "analysis": {"ensemble": moved}})
-    torch.testing.assert_close(UnicycleMotion(0.1)(td)["belief", "ensemble"], moved, rtol=0, atol=1e-15)
 
 
 def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean():

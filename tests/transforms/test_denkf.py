@@ -14,19 +14,18 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import Binary, LazyTensorStorage, ReplayBuffer, SliceSampler
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 from torchrl.envs import (
     Compose,
     InitTracker,
     ParallelEnv,
     SerialEnv,
     StepCounter,
-    Transform,
     TransformedEnv,
     check_env_specs,
 )
 
-from tests.filters.factories import FixedEnsemble, NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms.envs_for_tests import (
     BELIEF,
     PRIOR_MEAN,
@@ -43,8 +42,6 @@ from tests.transforms.envs_for_tests import (
     toy_base_env,
     toy_filter,
 )
-from torch_denkf.filters import DEnKF
-from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation
 from torch_denkf.objectives import DEnKFLoss
 from torch_denkf.transforms import DEnKFTransform
 
@@ -180,12 +177,6 @@ def test_state_dict():
     assert set(first.state_dict()) == {f"filter.{name}" for name in first.filter.state_dict()}
 
 
-def test_float64(float64):
-    rollout = random_rollout(filtered_env(random_filter, batch_size=[3]))
-    assert {rollout["next", key].dtype for key in (("belief", "ensemble"), ("belief", "var"))} == {torch.float64}
-    check_env_specs(filtered_env(random_filter, batch_size=[3]))
-
-
 def test_kalman_filter_in_the_transform(float64):
     kf = linear_kalman()
     env = filtered_env(lambda: kf, batch_size=[3], max_steps=[4, 7, 50], missing=0.2)
@@ -193,21 +184,6 @@ def test_kalman_filter_in_the_transform(float64):
     rollout = random_rollout(TransformedEnv(env, InitTracker()))
     expected = kf.sequence(rollout.select("observation", "observed", "is_init"))
     assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
-
-
-def test_a_large_ensemble_follows_the_kalman_filter(float64):
-    size, rollouts = 20_000, []
-    kf = linear_kalman()
-    env = TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(linear_kalman()))
-    rollouts.append(env.rollout(20))
-    prior_std = kf.initial.cov.diagonal().sqrt()
-    prior = GaussianPrior(kf.initial.mean, prior_std, ensemble_size=size)
-    denkf = linear_denkf("etkf", noisy=True, initial=prior, ensemble_size=size)
-    rollouts.append(TransformedEnv(base_env(batch_size=[3]), DEnKFTransform(denkf)).rollout(20))
-    exact, ours = (rollout["next", "belief"] for rollout in rollouts)
-    # An iid sample has 1 / sqrt(E) = 0.7 % of a standard deviation; 5 of those, and a factor 2 for what accumulates.
-    assert ((ours["mean"] - exact["mean"]) / exact["var"].sqrt()).abs().max() < 10 / size**0.5
-    assert (ours["var"] / exact["var"] - 1).abs().max() < 10 * (2 / size) ** 0.5
 
 
 def test_nothing_observed_is_pure_prediction(float64):
@@ -222,42 +198,6 @@ def test_nothing_observed_is_pure_prediction(float64):
         atol=1e-14,
     )
     assert not rollout["belief", "mean"][:, 0].equal(rollout["belief", "mean"][:, 4])
-
-
-class MaskColumns(Transform):
-    """Only the first reading is observed; the others are NaN."""
-
-    def _call(self, next_tensordict):
-        reading = next_tensordict["observation"]
-        observed = torch.zeros_like(reading, dtype=torch.bool)
-        observed[..., 0] = True
-        next_tensordict["observation"] = torch.where(observed, reading, torch.nan)
-        return next_tensordict.set("both_observed", observed)
-
-    _reset = lambda self, tensordict, tensordict_reset: self._call(tensordict_reset)  # noqa: E731
-
-    def transform_observation_spec(self, observation_spec):
-        shape = observation_spec["observation"].shape
-        observation_spec["both_observed"] = Binary(shape=shape, dtype=torch.bool)
-        return observation_spec
-
-
-def test_partial_mask_is_the_filter_of_the_rest(float64):
-    F, _, H, R = linear_system()
-    start = FixedEnsemble(torch.randn(6, 2))
-
-    def make(rows, **kwargs):
-        analysis = EnsembleAnalysis("etkf", observation_key="observation", **kwargs)
-        noise = ConstantNoise(R[rows].sqrt(), in_key="observation")
-        return DEnKF(NoisyLinear(F), None, LinearObservation(H[rows]), noise, analysis, initial=start)
-
-    masked = TransformedEnv(base_env(batch_size=[3]))
-    masked.append_transform(MaskColumns())
-    masked.append_transform(DEnKFTransform(make([0, 1], observed_key="both_observed")))
-    both = masked.rollout(8)
-    filter = make([0])
-    single = filter.sequence(TensorDict({"observation": both["observation"][..., :1]}, [3, 8]))
-    assert_equal(both, single, BELIEF, atol=1e-12)
 
 
 def test_same_seed_same_rollout(env):

@@ -9,7 +9,6 @@ from torchrl.envs import (
     DoubleToFloat,
     Transform,
     TransformedEnv,
-    check_env_specs,
 )
 
 from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
@@ -23,7 +22,7 @@ from tests.transforms.envs_for_tests import (
     toy_base_env,
     toy_filter,
 )
-from torch_denkf.transforms import DEnKFTransform, MissingFrames
+from torch_denkf.transforms import DEnKFTransform
 
 
 class BreakObservation(Transform):
@@ -96,18 +95,6 @@ def test_divergence_is_told_apart():
     filter = linear_denkf()
     filter["transition"].matrix.mul_(1e30)
     assert_refused(ValueError, "the filter diverged", TransformedEnv(base_env(), DEnKFTransform(filter)).rollout, 5)
-
-
-def test_missing_frames_before_the_filter():
-    env = TransformedEnv(
-        base_env(batch_size=[3]), Compose(MissingFrames(0.5, in_keys=["observation"]), DEnKFTransform(random_filter()))
-    )
-    check_env_specs(env)
-    rollout = env.rollout(20)
-    seen = rollout["observed"].squeeze(-1)
-    assert seen.any()
-    assert (rollout["observation"][~seen] == 0).all()
-    assert not seen.all()
 
 
 # ------------------------------------------------------------------------------------------------------ errors

@@ -25,12 +25,6 @@ def lagged_env(name, **kwargs):
 
 
 @pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("batch", [[], [2]])
-def test_specs(name, batch):
-    check_env_specs(lagged_env(name, batch_size=batch, max_steps=4))
-
-
-@pytest.mark.parametrize("name", FILTERS)
 def test_a_rollout_is_the_recording_smoothed(float64, name):
     """Rows reset at different times; what an environment says later is what the smoother says of the time before."""
     env = lagged_env(name, batch_size=[2], max_steps=[3, 7], seed=0)
