@@ -113,14 +113,3 @@ def test_errors_say_what_is_wrong():
     with pytest.raises(ValueError, match="maps noise of 2 dimensions to 3; ConstantNoise writes"):
         MappedNoise(ConstantNoise([1.0], **FORECAST), torch.ones(3, 2))(belief())
     assert_refused(KeyError, "CholeskyNoise reads", CholeskyNoise(2), TensorDict({}))
-
-
-def test_dt_may_be_an_entry_that_varies_over_rows(float64):
-    inner = ConstantNoise([0.5, 0.1], **FORECAST)
-    td = TensorDict({"belief": {"mean": torch.randn(4, 5)}, "forecast": {"mean": torch.randn(4, 5)}}, [4])
-    td["clock", "dt"] = torch.tensor([[0.1], [0.2], [0.0], [1.5]])
-    model = UnicycleNoise(inner, ("clock", "dt"))
-    assert ("clock", "dt") in model.in_keys
-    rows = [UnicycleNoise(inner, float(row["clock", "dt"]))(row.copy())["forecast", "noise"] for row in td]
-    torch.testing.assert_close(model(td.copy())["forecast", "noise"], torch.stack(rows), rtol=0, atol=1e-15)
-    assert_refused(KeyError, r"UnicycleNoise reads \('clock', 'dt'\)", model, td.exclude("clock"))

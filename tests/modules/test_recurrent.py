@@ -165,17 +165,3 @@ def test_inflation_widens_the_belief_and_leaves_its_mean():
     wide = update(td.copy())["belief"]
     torch.testing.assert_close(wide["var"], 2.25 * plain["var"])
     assert wide["mean"].equal(plain["mean"])
-
-
-def test_dt_of_the_pose_may_be_an_entry_that_varies_over_rows(float64):
-    root, velocity_root = torch.randn(4, 5, 5), torch.randn(4, 2, 2)
-    forecast = {"mean": torch.randn(4, 5), "cov": root @ root.mT}
-    estimate = {"mean": torch.randn(4, 2), "cov": velocity_root @ velocity_root.mT}
-    td = TensorDict({"forecast": forecast, "velocity": estimate}, [4])
-    dts = torch.tensor([[0.1], [0.2], [0.0], [1.5]])
-    model = UnicyclePose("dt")
-    assert "dt" in model.in_keys
-    out = model(td.copy().set("dt", dts))["belief"]
-    rows = torch.stack([UnicyclePose(float(dt))(row.copy())["belief"] for dt, row in zip(dts, td, strict=True)])
-    for name in ("mean", "cov", "var"):
-        torch.testing.assert_close(out[name], rows[name], rtol=0, atol=1e-13)
