@@ -6,10 +6,8 @@ import shutil
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
-from tests.functional.checks import assert_refused
+from tests.functional.checks import Shapes, assert_refused
 from torch_denkf.functional import analyse, ensemble_anomalies, ensemble_mean, kalman_update
 from torch_denkf.functional.inflation import random_rotation
 from torch_denkf.functional.moments import ensemble_cov
@@ -264,28 +262,16 @@ def test_compiled_equals_eager_forward_and_backward(sizes, schemes, backend):
         torch.testing.assert_close(ours, theirs, **EXACT)
 
 
-class LargestTensor(TorchDispatchMode):
-    """Records the most elements that any operation returned."""
-
-    elements = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        tensors = [value for value in tree_leaves(out) if isinstance(value, torch.Tensor)]
-        self.elements = max([self.elements, *(tensor.numel() for tensor in tensors)])
-        return out
-
-
 @pytest.mark.parametrize("sizes", [(8, 400, 300), (300, 400, 8)])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_nothing_is_larger_than_the_inputs(scheme, sizes):
     # Forward and backward: no S x S, no O x O where O > E, no E x E where E > O.
     problem = Problem(*sizes)
     inputs = [tensor.requires_grad_() for tensor in problem.tensors]
-    with LargestTensor() as largest:
+    with Shapes() as shapes:
         result = problem.analyse(scheme)
         torch.autograd.grad(sum(value.square().sum() for value in result), inputs)
-    assert largest.elements == problem.forecast.numel()
+    assert max(shape.numel() for shape in shapes.seen) == problem.forecast.numel()
 
 
 @pytest.mark.parametrize("space", SPACES)

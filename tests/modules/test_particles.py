@@ -78,22 +78,6 @@ def statistics(transition, rows=4000):
     return state, out.mean(0), out.T.cov()
 
 
-@pytest.mark.parametrize("before", [False, True])
-def test_motion_noise_has_its_variance(before):
-    rows = 4000
-    matrix = torch.nn.Linear(S, S)
-    linear = LearnedTransition(matrix, residual=False)
-    noisy = NoisyTransition(linear, ConstantNoise([0.5, 2.0], in_key=("belief", "ensemble")), [2, 0], before=before)
-    state, mean, cov = statistics(noisy, rows)
-    noise = torch.diag(torch.tensor([4.0, 0.0, 0.25]))
-    expected = matrix.weight @ noise @ matrix.weight.T if before else noise
-    sd = expected.diagonal().sqrt()
-    assert ((mean - matrix(state)).abs() <= 4 * sd / rows**0.5 + 1e-12).all()
-    # A sample covariance has a standard error of sqrt((s_ii s_jj + s_ij^2) / N).
-    error = ((sd.outer(sd).square() + expected.square()) / rows).sqrt()
-    assert ((cov - expected).abs() <= 4 * error + 1e-12).all()
-
-
 class Covariance(SubModel):
     """A known Q, the same everywhere."""
 
@@ -225,19 +209,6 @@ def test_no_resampling_in_front_of_a_missing_frame(width):
     for row, seen in enumerate([True, False, True, False]):
         assert (out["forecast", "log_weight"][row].equal(td["belief", "log_weight"][row])) != seen
         assert (out["forecast", "ensemble"][row].equal(td["belief", "ensemble"][row] + 1)) != seen
-
-
-def test_resampling_where_few_particles_are_effective():
-    td = belief((2,))
-    weights = torch.full((2, E), 1e-3)
-    weights[0, :5] = 1.0  # 5 of 7 are effective, and 2 of 7
-    weights[1, :2] = 1.0
-    td["belief", "log_weight"] = weights.log().log_softmax(-1)
-    out = ResampledTransition(Shift(), ess_threshold=0.5)(td.copy())
-    assert out["forecast", "log_weight"][0].equal(td["belief", "log_weight"][0])
-    assert (out["forecast", "log_weight"][1] == -math.log(E)).all()
-    both = ResampledTransition(Shift(), ess_threshold=0.5)(td.set("observed", torch.zeros(2, 1, dtype=torch.bool)))
-    assert both["forecast", "log_weight"].equal(td["belief", "log_weight"])
 
 
 def test_a_mask_does_not_overrule_the_threshold():

@@ -50,19 +50,12 @@ def test_many_members_are_the_exact_smoother(float64, name, scheme, lag):
     std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
     # The error of a mean of E draws is std / sqrt(E), that of a covariance about std std sqrt(2 / E); the gains of all
     # steps have errors of that size, too. Five of them in each of 2 x 8 x (2 + 4) numbers.
-    assert ((out["smoothed", "mean"] - mean).abs() <= 5 * std / MEMBERS**0.5).all()
+    far = {kind: (out[kind, "mean"] - mean).abs() > 5 * std / MEMBERS**0.5 for kind in ("smoothed", "belief")}
+    assert not far["smoothed"].any()
+    assert far["belief"].float().mean() > 0.5, "the bound tells a smoother from a filter"
     tolerance = 5 * (2 / MEMBERS) ** 0.5 * std.unsqueeze(-1) * std.unsqueeze(-2)
     assert ((ensemble_cov(out["smoothed", "ensemble"]) - cov).abs() <= tolerance).all()
     assert_close(out["smoothed", "var"], ensemble_cov(out["smoothed", "ensemble"]).diagonal(dim1=-2, dim2=-1))
-
-
-def test_the_tolerance_tells_a_smoother_from_a_filter(float64):
-    frames = drive(2, 8)
-    mean, cov = joint_beliefs(frames)
-    with torch.no_grad():
-        out = large_filter("etkf").sequence(frames)
-    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert ((out["belief", "mean"] - mean).abs() > 5 * std / MEMBERS**0.5).float().mean() > 0.5
 
 
 def test_members_with_the_exact_moments_give_the_exact_means(float64):
