@@ -131,36 +131,6 @@ def test_log_likelihood_is_that_of_the_innovation(sizes, space):
 
 
 @pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_masked_components_are_as_if_absent(scheme, space):
-    problem = Problem(6, 4, 5)
-    keep = torch.tensor([True, False, True, False, True])
-    reference = analyse(
-        problem.forecast,
-        problem.predicted[..., keep],
-        problem.samples[..., keep],
-        problem.noise[keep],
-        scheme=scheme,
-        perturbation=problem.perturbation[..., keep] if scheme == "perturbed" else None,
-        space=space,
-    )
-    problem.samples[..., 1], problem.samples[..., 3] = torch.nan, torch.inf
-    problem.noise[1], problem.noise[3] = torch.inf, torch.nan
-    for tensor in problem.tensors:
-        tensor.requires_grad_()
-    result = problem.analyse(scheme, observed=keep, space=space)
-    torch.testing.assert_close(result.innovation[keep], reference.innovation, **EXACT)
-    assert (result.innovation[~keep] == 0).all()
-    for name in ("ensemble", "nis", "log_likelihood"):
-        torch.testing.assert_close(getattr(result, name), getattr(reference, name), **EXACT)
-    total = sum(value.square().sum() for value in result)
-    gradients = torch.autograd.grad(total, problem.tensors)
-    assert all(gradient.isfinite().all() for gradient in gradients)
-    assert (gradients[2][..., ~keep] == 0).all()
-    assert (gradients[3][~keep] == 0).all()
-
-
-@pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize(("scheme", "rotated"), [*((scheme, False) for scheme in SCHEMES), ("etkf", True)])
 def test_unobserved_rows_come_back_bit_for_bit(scheme, rotated, space):
     problem = Problem(6, 4, 3, (2,), dtype=torch.float32)
