@@ -50,16 +50,6 @@ def test_a_radius_must_be_positive():
     assert_refused(ValueError, "positive, got 0", gaspari_cohn, torch.ones(1), 0)
 
 
-def test_neighbours_are_those_within_reach_also_across_the_seam():
-    places = torch.arange(40.0).unsqueeze(-1)
-    found = neighbours(places, places[::2], 2.0, period=torch.tensor([40.0]), tile=7)
-    distance = (places - places[::2].T).abs()
-    taper = gaspari_cohn(torch.minimum(distance, 40 - distance), 2.0)
-    dense = torch.zeros(40, 20).scatter_add_(1, found.index, found.taper)
-    torch.testing.assert_close(dense, taper)
-    assert found.index.shape[1] == int((taper > 0).sum(1).max())
-
-
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 @pytest.mark.parametrize("sizes", [(6, 5, 3), (5, 4, 4)])
 @pytest.mark.parametrize("tile", [1, 2, 4096])

@@ -88,10 +88,10 @@ def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
 
 
 def test_compiled_functions_are_the_eager_ones():
-    frames = RTSSmoother(linear_kalman())(drive(2, 5))
+    frames = RTSSmoother(linear_kalman())(drive(2, 5))[:, :3]
     values = [frames["belief", "mean"], frames["belief", "cov"], frames["forecast", "mean"], frames["forecast", "cov"]]
     values.append(frames["belief", "cov"])
-    for lag in (None, 2):
+    for lag in (None, 1):
         assert_compiled_is_eager(rts_smooth, *values, lag=lag, rtol=1e-4, atol=1e-4)
 
 

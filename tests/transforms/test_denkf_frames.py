@@ -7,7 +7,6 @@ from torch import nn
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
-    Transform,
     TransformedEnv,
 )
 
@@ -15,6 +14,7 @@ from tests.filters.factories import assert_equal, linear_denkf, linear_kalman
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import (
     BELIEF,
+    Changed,
     base_env,
     filtered_env,
     fixed_filter,
@@ -25,35 +25,25 @@ from tests.transforms.envs_for_tests import (
 from torch_denkf.transforms import DEnKFTransform
 
 
-class BreakObservation(Transform):
+def break_observation(honest):
     """NaN in the reading from the third step on; ``observed`` says so, or lies."""
 
-    def __init__(self, honest):
-        super().__init__()
-        self.honest = honest
+    def change(td):
+        bad = td["step"] >= 3
+        td["observed"] = ~bad if honest else torch.ones_like(bad)
+        return td.set("observation", torch.where(bad, torch.nan, td["observation"]))
 
-    def _call(self, next_tensordict):
-        bad = next_tensordict["step"] >= 3
-        next_tensordict["observation"] = torch.where(bad, torch.nan, next_tensordict["observation"])
-        next_tensordict["observed"] = ~bad if self.honest else torch.ones_like(bad)
-        return next_tensordict
-
-    _reset = lambda self, tensordict, tensordict_reset: self._call(tensordict_reset)  # noqa: E731
+    return Changed(change)
 
 
-class ZeroUnobserved(Transform):
-    def _call(self, next_tensordict):
-        reading = next_tensordict["observation"]
-        next_tensordict["observation"] = torch.where(next_tensordict["observed"], reading, 0.0)
-        return next_tensordict
-
-    _reset = lambda self, tensordict, tensordict_reset: self._call(tensordict_reset)  # noqa: E731
+def zero_unobserved(td):
+    return td.set("observation", torch.where(td["observed"], td["observation"], 0.0))
 
 
 @pytest.mark.parametrize(("make_base", "make_filter"), [(base_env, random_filter), (toy_base_env, toy_filter)])
 def test_unobserved_nan_changes_nothing(make_base, make_filter):
     filter, rollouts = make_filter(), []
-    for transforms in ([BreakObservation(True)], [BreakObservation(True), ZeroUnobserved()]):
+    for transforms in ([break_observation(True)], [break_observation(True), Changed(zero_unobserved)]):
         env = TransformedEnv(make_base(batch_size=[3]), Compose(*transforms, DEnKFTransform(filter)))
         torch.manual_seed(1)
         rollouts.append(env.rollout(8))
@@ -68,7 +58,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     filter = make_filter()
 
     def make(honest=False, **kwargs):
-        transforms = Compose(BreakObservation(honest), DEnKFTransform(filter, **kwargs))
+        transforms = Compose(break_observation(honest), DEnKFTransform(filter, **kwargs))
         torch.manual_seed(1)
         return TransformedEnv(make_base(batch_size=[3]), transforms)
 
@@ -79,16 +69,9 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
 
 
 def test_nan_at_reset_with_an_update_there():
-    env = TransformedEnv(base_env(), Compose(NanAtReset(), DEnKFTransform(fixed_filter(update_at_reset=True))))
+    broken = Changed(lambda td: td.set("observation", torch.full_like(td["observation"], torch.nan)))
+    env = TransformedEnv(base_env(), Compose(broken, DEnKFTransform(fixed_filter(update_at_reset=True))))
     assert_refused(ValueError, r"NaN or infinity in \['observation'\]", env.reset)
-
-
-class NanAtReset(Transform):
-    def _call(self, next_tensordict):
-        return next_tensordict
-
-    def _reset(self, tensordict, tensordict_reset):
-        return tensordict_reset.set("observation", torch.full_like(tensordict_reset["observation"], torch.nan))
 
 
 def test_divergence_is_told_apart():

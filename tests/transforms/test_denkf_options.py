@@ -12,7 +12,6 @@ from torchrl.envs import (
     Compose,
     RenameTransform,
     SerialEnv,
-    Transform,
     TransformedEnv,
     check_env_specs,
 )
@@ -235,18 +234,12 @@ def test_in_a_replay_buffer(float64):
     assert_equal(sample, expected, envs.BELIEF, atol=1e-14)
 
 
-class Doubled(Transform):
+class Doubled(envs.Changed):
     """Twice the observation; it declares what it writes, unless it is told not to."""
 
     def __init__(self, declares=True):
-        super().__init__()
+        super().__init__(lambda td: td.set("doubled", 2 * td["observation"]))
         self.declares = declares
-
-    def _call(self, next_tensordict):
-        return next_tensordict.set("doubled", 2 * next_tensordict["observation"])
-
-    def _reset(self, tensordict, tensordict_reset):
-        return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec):
         if self.declares:
