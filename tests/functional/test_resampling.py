@@ -20,6 +20,8 @@ from torch_denkf.functional import (
 from torch_denkf.functional.resampling import effective_sample_size
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
 
+pytestmark = pytest.mark.usefixtures("float64")
+
 E, S = 6, 2
 BATCHES = [(), (3,), (2, 2)]
 SCHEMES = {
@@ -27,11 +29,6 @@ SCHEMES = {
     "soft": lambda x, w, u: soft_resample(x, w, u, alpha=0.3),
     "transport": lambda x, w, u: transport_resample(x, w, epsilon=0.3),
 }
-
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
 
 
 def problem(batch=(), size=E, dim=S, spread=1.0):

@@ -131,17 +131,10 @@ def test_a_mask_of_one_entry_stands_for_all(float64):
     assert one[1].equal(td["forecast", "ensemble"][1])
 
 
-class Lorenz96(nn.Module):
-    """One step of the true system."""
-
-    def forward(self, state):
-        return lorenz96_step(state)
-
-
 def lorenz_filter(variables, members, **noise):
     places = torch.arange(float(variables)).unsqueeze(-1)
     return DEnKF(
-        LearnedTransition(Lorenz96(), residual=False),
+        LearnedTransition(lorenz96_step, residual=False),
         None,
         Select(range(variables)),
         ConstantNoise(torch.ones(variables), in_key="reading", **noise),

@@ -23,13 +23,10 @@ from torch_denkf.modules import (
 )
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 
+pytestmark = pytest.mark.usefixtures("float64")
+
 E, S, OBS = 7, 3, 2
 BATCHES = [(), (4,), (2, 3)]
-
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
 
 
 class Shift(SubModel):

@@ -51,6 +51,13 @@ def test_commands_are_standardised(float64):
     torch.testing.assert_close(forecast(scaled, state, action=drive), expected, rtol=0, atol=1e-13)
 
 
+def moved(pose, velocity, dt):
+    """The vehicle's state after a step with these velocities."""
+    (x, y, theta), (v, w) = pose.unbind(-1), velocity.unbind(-1)
+    angle = theta + w * dt / 2
+    return torch.stack([x + v * dt * angle.cos(), y + v * dt * angle.sin(), theta + w * dt, v, w], -1)
+
+
 def still(velocity):
     return torch.zeros_like(velocity)
 
@@ -82,11 +89,7 @@ def test_unicycle_velocity_changes_before_the_pose_moves(float64):
     state = torch.randn(6, 5)
     out = forecast(UnicycleTransition(net, 0.5, loc=loc, scale=scale), state)
     velocity = state[:, 3:] + scale * net((state[:, 3:] - loc) / scale)
-    v, w = velocity.unbind(-1)
-    x, y, theta = state[:, :3].unbind(-1)
-    angle = theta + 0.25 * w
-    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
-    torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
+    torch.testing.assert_close(out, moved(state[:, :3], velocity, 0.5), rtol=0, atol=1e-13)
 
 
 class Forecast(nn.Module):
@@ -120,10 +123,7 @@ def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_be
     before, analysis = torch.randn(*batch, 6, 5), torch.randn(*batch, 6, 5)
     td = TensorDict({"belief": {"ensemble": before}, "analysis": {"ensemble": analysis}}, batch)
     out = UnicycleMotion(0.5)(td)["belief"]
-    v, w = analysis[..., 3], analysis[..., 4]
-    x, y, theta = before[..., :3].unbind(-1)
-    angle = theta + 0.25 * w
-    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
+    expected = moved(before[..., :3], analysis[..., 3:], 0.5)
     torch.testing.assert_close(out["ensemble"], expected, rtol=0, atol=1e-14)
     torch.testing.assert_close(out["mean"], expected.mean(-2), rtol=0, atol=1e-14)
     torch.testing.assert_close(out["var"], expected.var(-2), rtol=0, atol=1e-13)

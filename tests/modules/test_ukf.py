@@ -26,18 +26,14 @@ def constant_noise(size, r=0.3):
     return ConstantNoise([r] * size, in_key=("belief", "mean"), out_key=("forecast", "noise"))
 
 
-class Bend(nn.Module):
+def bend(x):
     """A nonlinear map of three dimensions."""
-
-    def forward(self, x):
-        return torch.stack([x[..., 0] + x[..., 1].sin(), x[..., 1] * x[..., 2], x[..., 2].exp()], -1)
+    return torch.stack([x[..., 0] + x[..., 1].sin(), x[..., 1] * x[..., 2], x[..., 2].exp()], -1)
 
 
-class RangeBearing(nn.Module):
+def range_bearing(x):
     """Distance and direction of the origin."""
-
-    def forward(self, x):
-        return torch.stack([x[..., :2].norm(dim=-1), torch.atan2(x[..., 1], x[..., 0])], -1)
+    return torch.stack([x[..., :2].norm(dim=-1), torch.atan2(x[..., 1], x[..., 0])], -1)
 
 
 def loops(mean, cov, function, alpha, beta, kappa):
@@ -58,18 +54,18 @@ def test_a_step_equals_the_textbook(float64, parameters):
     root = 0.3 * torch.randn(2, 3, 3)
     cov = root @ root.mT
     td = TensorDict({"belief": {"mean": mean, "cov": cov}, "reading": torch.randn(2, 2), "R": torch.rand(2, 2)}, [2])
-    out = UKFTransition(LearnedTransition(Bend(), residual=False), constant_noise(3), **keys)(td)
+    out = UKFTransition(LearnedTransition(bend, residual=False), constant_noise(3), **keys)(td)
     analysis = UKFAnalysis(
-        LearnedObservation(RangeBearing()), **keys, observation_key="reading", noise_variance_key="R", angles=[1]
+        LearnedObservation(range_bearing), **keys, observation_key="reading", noise_variance_key="R", angles=[1]
     )
     out = analysis(out)
     for row in range(2):
-        _, images, w_mean, w_cov = loops(mean[row].numpy(), cov[row].numpy(), Bend(), *parameters)
+        _, images, w_mean, w_cov = loops(mean[row].numpy(), cov[row].numpy(), bend, *parameters)
         m = sum(w * y for w, y in zip(w_mean, images, strict=True))
         P = sum(w * np.outer(y - m, y - m) for w, y in zip(w_cov, images, strict=True)) + 0.09 * np.eye(3)
         np.testing.assert_allclose(out["forecast", "mean"][row], m, rtol=0, atol=1e-11)
         np.testing.assert_allclose(out["forecast", "cov"][row], P, rtol=0, atol=1e-11)
-        points, seen, w_mean, w_cov = loops(m, P, RangeBearing(), *parameters)
+        points, seen, w_mean, w_cov = loops(m, P, range_bearing, *parameters)
         assert max(abs(y[1] - seen[0][1]) for y in seen) < np.pi, "no point is across the cut"
         z = sum(w * y for w, y in zip(w_mean, seen, strict=True))
         S = sum(w * np.outer(y - z, y - z) for w, y in zip(w_cov, seen, strict=True)) + np.diag(td["R"][row])

@@ -5,11 +5,9 @@ import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from tests.functional.checks import assert_refused
-from tests.transforms.envs_for_tests import base_env, fixed_filter, random_filter, toy_base_env, toy_filter
+from tests.transforms.envs_for_tests import BELIEF, base_env, fixed_filter, random_filter, toy_base_env, toy_filter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.transforms import DEnKFTransform
-
-BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
 
 
 def one_step(env, filter, without=()):
