@@ -64,11 +64,6 @@ def test_energy_score_is_the_double_sum(batch, fair):
     torch.testing.assert_close(energy_score(ensemble, target, fair=fair), expected, **EXACT)
 
 
-def test_energy_score_in_one_dimension_is_the_crps():
-    ensemble, target = problem((3,), dim=1)
-    torch.testing.assert_close(energy_score(ensemble, target), crps_ensemble(ensemble, target)[..., 0], **EXACT)
-
-
 @pytest.mark.parametrize("score", [crps_ensemble, energy_score])
 def test_gradients(score):
     ensemble, target = problem((2,))

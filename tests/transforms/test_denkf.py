@@ -25,7 +25,7 @@ from torchrl.envs import (
     check_env_specs,
 )
 
-from tests.filters.factories import assert_equal, linear_kalman, linear_system
+from tests.filters.factories import assert_equal, linear_kalman
 from tests.transforms.envs_for_tests import (
     BELIEF,
     PRIOR_MEAN,
@@ -184,20 +184,6 @@ def test_kalman_filter_in_the_transform(float64):
     rollout = random_rollout(TransformedEnv(env, InitTracker()))
     expected = kf.sequence(rollout.select("observation", "observed", "is_init"))
     assert_equal(rollout, expected, [("belief", "mean"), ("belief", "cov"), ("belief", "var")], atol=1e-13)
-
-
-def test_nothing_observed_is_pure_prediction(float64):
-    env = filtered_env(fixed_filter, batch_size=[3], missing=1.0)
-    rollout = env.rollout(5)
-    assert rollout["observation"].isnan().all()
-    F = linear_system()[0]
-    assert_equal(
-        {"belief": rollout["next", "belief", "ensemble"]},
-        {"belief": rollout["belief", "ensemble"] @ F.mT},
-        ["belief"],
-        atol=1e-14,
-    )
-    assert not rollout["belief", "mean"][:, 0].equal(rollout["belief", "mean"][:, 4])
 
 
 def test_same_seed_same_rollout(env):
