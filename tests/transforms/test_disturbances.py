@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
 from tests.functional.checks import assert_refused
+from tests.transforms.envs_for_tests import Changed, base_env
 from torch_denkf.applications.car import KITTIReplayEnv, drive_frames, read_kitti_drive, write_drives
 from torch_denkf.data.cache_entry import CachedTensor
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper, _frames
@@ -18,41 +19,26 @@ from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, 
 ALL = [SaltAndPepper, Blur, Brightness, BlackFrames, OccludingBox]
 
 
-class Pictures(EnvBase):
-    """Shows one striped picture per step, whose brightness counts the steps; rows end after 3 + row steps."""
+class Striped(Changed):
+    """Adds a striped picture to each frame, whose brightness counts the steps."""
 
-    def __init__(self, dtype=torch.uint8, batch_size=()):
-        super().__init__(batch_size=torch.Size(batch_size))
-        shape = self.batch_size
-        self.white = 255 if dtype == torch.uint8 else 1
-        self.observation_spec = Composite(
-            pixels=Bounded(0, self.white, (*shape, 3, 8, 12), dtype=dtype),
-            clock=Bounded(0, 100, (*shape, 1), dtype=torch.int64),
-            shape=shape,
-        )
-        self.action_spec = Unbounded((*shape, 1))
-        self.reward_spec = Unbounded((*shape, 1))
-        self.limit = 3 + torch.arange(shape.numel()).reshape(*shape, 1)
+    def __init__(self, dtype):
+        super().__init__(self.paint)
+        self.dtype, self.white = dtype, 255 if dtype == torch.uint8 else 1
 
-    def _show(self, clock, **more):
-        spec = self.observation_spec["pixels"]
-        value = ((clock + 1).float() / 10 * self.white)[..., None, None] * torch.tensor([1.0, 0.5] * 6)
-        return TensorDict({"pixels": value.expand(spec.shape).to(spec.dtype), "clock": clock, **more}, self.batch_size)
+    def paint(self, td):
+        value = ((td["step"] + 1).float() / 10 * self.white)[..., None, None] * torch.tensor([1.0, 0.5] * 6)
+        return td.set("pixels", value.expand(*td.batch_size, 3, 8, 12).to(self.dtype))
 
-    def _reset(self, tensordict):
-        clock = torch.zeros(*self.batch_size, 1, dtype=torch.int64)
-        if tensordict is not None and "_reset" in tensordict:
-            clock = torch.where(tensordict["_reset"].reshape(clock.shape), clock, self.clock)
-        self.clock = clock
-        return self._show(clock, done=torch.zeros_like(clock, dtype=torch.bool))
+    def transform_observation_spec(self, observation_spec):
+        shape = (*observation_spec.shape, 3, 8, 12)
+        observation_spec["pixels"] = Bounded(0, self.white, shape, dtype=self.dtype)
+        return observation_spec
 
-    def _step(self, tensordict):
-        clock = self.clock = self.clock + 1
-        done = clock >= self.limit
-        return self._show(clock, done=done, terminated=done.clone(), reward=torch.zeros_like(clock).float())
 
-    def _set_seed(self, seed):
-        pass
+def pictures_env(dtype=torch.uint8, batch=()):
+    """Rows end after three steps and after four."""
+    return TransformedEnv(base_env(batch_size=batch, max_steps=[3, 4] if batch else 3), Striped(dtype))
 
 
 def rng(seed=0):
@@ -252,29 +238,29 @@ def test_in_chunks(kind, monkeypatch):
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 @pytest.mark.parametrize("batch", [(), (2,)])
 def test_in_an_environment(kind, dtype, batch):
-    base = Pictures(dtype, batch)
+    base = pictures_env(dtype, batch)
     env = TransformedEnv(base, kind(p=1.0))
     check_env_specs(env)
     assert env.observation_spec == base.observation_spec
     plain, rollout = base.rollout(3), env.rollout(3)
-    assert rollout["clock"].equal(plain["clock"])
+    assert rollout["step"].equal(plain["step"])
     for shown, before in ((rollout, plain), (rollout["next"], plain["next"])):  # resets and steps
         assert (shown["pixels"] != before["pixels"]).flatten(-3).any(-1).all()
 
 
 def test_a_partial_reset_leaves_the_other_rows():
-    env = TransformedEnv(Pictures(batch_size=(2,)), SaltAndPepper(0.2))
+    env = TransformedEnv(pictures_env(batch=(2,)), SaltAndPepper(0.2))
     td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
     assert td["done"].flatten().tolist() == [True, False]
     before = td["pixels"].clone()
     after = env.reset(td.set("_reset", td["done"].clone()))
     assert after["pixels"][1].equal(before[1])
-    assert after["clock"].flatten().tolist() == [0, 3]
+    assert after["step"].flatten().tolist() == [0, 3]
     assert ((after["pixels"] == 255).sum((-1, -2)) == 19).all()  # 0.2 x 96
 
 
 def test_in_batched_environments_and_copies():
-    env = SerialEnv(2, lambda: TransformedEnv(Pictures(), SaltAndPepper(0.1)))
+    env = SerialEnv(2, lambda: TransformedEnv(pictures_env(), SaltAndPepper(0.1)))
     check_env_specs(env)
     assert ((env.rollout(2)["next", "pixels"] == 255).sum((-1, -2)) == 10).all()
     copy = OccludingBox((0.5, 0.5), (0.0, 0.0)).clone()
