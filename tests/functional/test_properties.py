@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.properties_for_tests import BATCHES, DIMS, DTYPES, FIXED, MEMBERS, SCALES, SCHEMES, SEEDS, Draw, close
-from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import (
     analyse,
     crps_ensemble,
@@ -24,7 +23,7 @@ from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.inflation import inflate, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.unscented import unscented_moments, unscented_weights
-from torch_denkf.functional.weighted import weighted_mean, weighted_var
+from torch_denkf.functional.weighted import weighted_mean
 
 SPACES = st.sampled_from(["observation", "ensemble"])
 
@@ -217,29 +216,3 @@ def test_transported_particles_keep_the_mean(seed, batch, size, states, scale, s
     torch.testing.assert_close(weights.logsumexp(-1), torch.zeros(batch, dtype=torch.float64), rtol=0, atol=1e-9)
     close(transport_resample(particles * units, log_weights)[0] / units, moved, atol=1e-6)
     close(transport_resample(particles[..., order, :], log_weights[..., order])[0], moved[..., order, :], atol=1e-6)
-
-
-@FIXED
-@given(SEEDS, BATCHES, st.integers(2, 20), DIMS, SCALES, st.floats(-300.0, 300.0))
-def test_weighted_moments(seed, batch, size, states, scale, shift):
-    draw = Draw(seed)
-    particles, raw = draw.normal(*batch, size, states), draw.normal(*batch, size)
-    log_weights, order = torch.log_softmax(raw, -1), draw.order(size)
-    mean, variance = weighted_mean(particles, log_weights), weighted_var(particles, log_weights)
-    close(weighted_mean(particles[..., order, :], log_weights[..., order]), mean)
-    close(weighted_mean(scale * particles, log_weights), scale * mean)
-    close(weighted_var(scale * particles, log_weights), scale**2 * variance)
-    close(weighted_mean(particles, torch.log_softmax(raw + shift, -1)), mean)
-    assert (variance >= 0).all()
-
-
-@FIXED
-@given(SEEDS, BATCHES, SCALES, st.floats(1e-3, 10.0))
-def test_a_vehicle_in_other_units(seed, batch, scale, dt):
-    draw = Draw(seed)
-    pose, velocity = draw.normal(*batch, 3), draw.normal(*batch, 2)
-    lengths, speeds = torch.tensor([scale, scale, 1.0]), torch.tensor([scale, 1.0])
-    plain, other = unicycle_move(pose, velocity, dt), unicycle_move(pose * lengths, velocity * speeds, dt)
-    torch.testing.assert_close(other / lengths, plain, rtol=1e-9, atol=1e-9)
-    there = unicycle_move(unicycle_move(pose, velocity, dt / 2), velocity, dt / 2)
-    torch.testing.assert_close(there[..., 2], plain[..., 2], rtol=1e-9, atol=1e-9)
