@@ -94,7 +94,6 @@ def test_gaussian_filters_are_the_augmented_kalman_filter(kind):
 
 def test_an_ensemble_comes_close_to_it():
     _, transition, q, observation, r = parts()
-    torch.manual_seed(0)
     initial = GaussianPrior(
         torch.zeros(4, dtype=torch.double), torch.tensor(START, dtype=torch.double), ensemble_size=20000
     )

@@ -157,7 +157,6 @@ def test_pose_moves_as_the_unicycle_and_its_covariance_by_jacobians(float64, bat
 
 
 def test_inflation_widens_the_belief_and_leaves_its_mean():
-    torch.manual_seed(0)
     update = LSTMUpdate(2, features=3, hidden_size=4, encoding_key="x", scale=[2.0, 0.5])
     td = TensorDict({"x": torch.randn(5, 3), "forecast": {k: torch.randn(5, 1, 4) for k in ("hidden", "cell")}}, [5])
     plain = update(td.copy())["belief"]

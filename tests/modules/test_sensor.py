@@ -160,7 +160,6 @@ def test_vector_sensor_unobserved_nan():
 
 def test_pixels_are_standardised_channel_by_channel():
     """(x - loc) / scale in front of the trunk: the same as a sensor without it on pixels standardised by hand."""
-    torch.manual_seed(0)
     loc, scale = torch.tensor([0.5, 0.0]), torch.tensor([0.2, 0.1])
     plain = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4)
     standard = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4, pixel_loc=loc, pixel_scale=scale)

@@ -130,7 +130,6 @@ def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_be
 
 
 def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean():
-    torch.manual_seed(0)
     network = StochasticMLP(2, 2)  # untrained: its mean change is anything
     state = torch.randn(3, 16, 5) + torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1])
     outs = {}

@@ -112,7 +112,6 @@ def test_gradients_are_those_of_finite_differences(float64):
 
 
 def test_a_learned_motion_learns(float64):
-    torch.manual_seed(0)
     smoother = IEnKS(
         LearnedTransition(StochasticMLP(2, 2, (8,), layer="none", output_gain=0.5)),
         None,

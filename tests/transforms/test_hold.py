@@ -129,7 +129,6 @@ def test_behind_missing_frames():
 @pytest.mark.parametrize(("key", "spoiled"), [("observation", True), ("held", False)])
 def test_an_lstm_needs_it(key, spoiled):
     """A missing reading makes all that an LSTM writes NaN until the episode ends, without an error."""
-    torch.manual_seed(0)
     width = base_env().observation_spec["observation"].shape[-1]
     memory = LSTMModule(input_size=width, hidden_size=4, in_key=key, out_key="features")
     env = held_env(seed=0).append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
