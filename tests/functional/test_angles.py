@@ -8,10 +8,7 @@ import torch
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.angles import align_angles, mean_observation
 
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def test_wrapped_differences_point_the_same_way_and_lie_within_half_a_turn():

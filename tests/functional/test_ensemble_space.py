@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
+from tests.functional.checks import Shapes
 from torch_denkf.functional import _ensemble_space, analyse
 from torch_denkf.functional.inflation import random_rotation
 
@@ -107,32 +106,16 @@ def test_single_precision_keeps_its_digits(scheme, count, noise):
     assert (found - expected).norm() / expected.norm() < 1.5e-6
 
 
-class _Sizes(TorchDispatchMode):
-    """Remembers the shapes of all tensors that operations return with storage of their own."""
-
-    def __init__(self):
-        super().__init__()
-        self.shapes = []
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        out = function(*args, **(kwargs or {}))
-        known = {t.untyped_storage().data_ptr() for t in tree_leaves((args, kwargs)) if torch.is_tensor(t)}
-        for tensor in tree_leaves(out):
-            if torch.is_tensor(tensor) and tensor.untyped_storage().data_ptr() not in known:
-                self.shapes.append(tuple(tensor.shape))
-        return out
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_nothing_of_the_square_of_the_state_is_formed(scheme, gradient):
     size, dim = 8, 40_000
     arguments = problem(scheme, size, dim, dim, dtype=torch.float32)
     arguments["forecast"].requires_grad_(gradient)
-    with _Sizes() as seen:
+    with Shapes() as shapes:
         analyse(**arguments)
-    elements = [torch.Size(shape).numel() for shape in seen.shapes]
+    elements = [shape.numel() for shape in shapes.seen]
     assert max(elements) == size * dim  # not dim * dim
     if not gradient:  # the result alone is as large as the ensemble
         assert sum(count > _ensemble_space.TILE_ELEMENTS for count in elements) == 1
-        assert [shape for shape in seen.shapes if torch.Size(shape).numel() == size * dim] == [(size, dim)]
+        assert [shape for shape in shapes.seen if shape.numel() == size * dim] == [(size, dim)]

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov
@@ -72,9 +73,6 @@ def test_rotations_are_uniform():
 
 
 def test_errors():
-    with pytest.raises(ValueError, match="ensemble_size must be at least 2"):
-        random_rotation(1)
-    with pytest.raises(ValueError, match="forecast must be"):
-        relax_to_prior_spread(torch.zeros(3, 2), torch.zeros(4, 2), 0.5)
-    with pytest.raises(ValueError, match="ensemble must be"):
-        inflate(torch.zeros(3), 1.1)
+    assert_refused(ValueError, "ensemble_size must be at least 2", random_rotation, 1)
+    assert_refused(ValueError, "forecast must be", relax_to_prior_spread, torch.zeros(3, 2), torch.zeros(4, 2), 0.5)
+    assert_refused(ValueError, "ensemble must be", inflate, torch.zeros(3), 1.1)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse, kalman_update, letkf, neighbours
 from torch_denkf.functional.localisation import Neighbours, gaspari_cohn, neighbours_of_taper
 from torch_denkf.functional.moments import ensemble_cov
@@ -46,18 +47,7 @@ def test_taper_is_a_correlation():
 
 
 def test_a_radius_must_be_positive():
-    with pytest.raises(ValueError, match="positive, got 0"):
-        gaspari_cohn(torch.ones(1), 0)
-
-
-def test_neighbours_are_those_within_reach_also_across_the_seam():
-    places = torch.arange(40.0).unsqueeze(-1)
-    found = neighbours(places, places[::2], 2.0, period=torch.tensor([40.0]), tile=7)
-    distance = (places - places[::2].T).abs()
-    taper = gaspari_cohn(torch.minimum(distance, 40 - distance), 2.0)
-    dense = torch.zeros(40, 20).scatter_add_(1, found.index, found.taper)
-    torch.testing.assert_close(dense, taper)
-    assert found.index.shape[1] == int((taper > 0).sum(1).max())
+    assert_refused(ValueError, "positive, got 0", gaspari_cohn, torch.ones(1), 0)
 
 
 @pytest.mark.parametrize("batch", [(), (2, 3)])
@@ -115,10 +105,8 @@ def test_single_precision_follows_double():
 
 def test_shapes_that_do_not_fit_are_named():
     forecast, predicted, observation, noise = problem(4, 3, 2)
-    with pytest.raises(ValueError, match=r"near\.index"):
-        letkf(forecast, predicted, observation, noise, everywhere(5, 2))
-    with pytest.raises(ValueError, match="noise"):
-        letkf(forecast, predicted, observation, noise[:1], everywhere(3, 2))
+    assert_refused(ValueError, r"near\.index", letkf, forecast, predicted, observation, noise, everywhere(5, 2))
+    assert_refused(ValueError, "noise", letkf, forecast, predicted, observation, noise[:1], everywhere(3, 2))
 
 
 def test_neighbours_of_a_taper_are_its_positive_entries():
@@ -126,8 +114,7 @@ def test_neighbours_of_a_taper_are_its_positive_entries():
     found = neighbours_of_taper(taper, tile=2)
     torch.testing.assert_close(torch.zeros(3, 4).scatter_add_(1, found.index, found.taper), taper)
     assert found.index.shape == (3, 3)
-    with pytest.raises(ValueError, match=r"\[S, O\]"):
-        neighbours_of_taper(taper[0])
+    assert_refused(ValueError, r"\[S, O\]", neighbours_of_taper, taper[0])
 
 
 @pytest.mark.parametrize("period", [None, (10.0, math.inf), (10.0, 7.0)])

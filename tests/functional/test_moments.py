@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import ensemble_anomalies, ensemble_mean, ensemble_var
 from torch_denkf.functional.moments import ensemble_cov
 
@@ -22,11 +23,9 @@ def test_moments_are_numpys(batch):
 
 @pytest.mark.parametrize("function", [ensemble_mean, ensemble_anomalies, ensemble_var, ensemble_cov])
 def test_a_vector_is_no_ensemble(function):
-    with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
-        function(torch.zeros(3))
+    assert_refused(ValueError, r"ensemble must be \[\*B, E, S\]", function, torch.zeros(3))
 
 
 @pytest.mark.parametrize("function", [ensemble_var, ensemble_cov])
 def test_one_member_has_no_variance(function):
-    with pytest.raises(ValueError, match="at least 2 are needed"):
-        function(torch.zeros(1, 3))
+    assert_refused(ValueError, "at least 2 are needed", function, torch.zeros(1, 3))

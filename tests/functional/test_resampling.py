@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
+from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from torch_denkf.functional import (
     crps_ensemble,
     crps_weighted,
-    ensemble_mean,
     ensemble_var,
     jitter_copies,
     soft_resample,
@@ -20,6 +20,8 @@ from torch_denkf.functional import (
 from torch_denkf.functional.resampling import effective_sample_size
 from torch_denkf.functional.weighted import weighted_mean, weighted_median, weighted_var
 
+pytestmark = pytest.mark.usefixtures("float64")
+
 E, S = 6, 2
 BATCHES = [(), (3,), (2, 2)]
 SCHEMES = {
@@ -27,11 +29,6 @@ SCHEMES = {
     "soft": lambda x, w, u: soft_resample(x, w, u, alpha=0.3),
     "transport": lambda x, w, u: transport_resample(x, w, epsilon=0.3),
 }
-
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
 
 
 def problem(batch=(), size=E, dim=S, spread=1.0):
@@ -49,14 +46,6 @@ def test_weighted_moments_and_sample_size_by_hand():
     torch.testing.assert_close(weighted_mean(particles, log_weights), mean)
     torch.testing.assert_close(weighted_var(particles, log_weights), square * E / (E - 1))
     torch.testing.assert_close(effective_sample_size(log_weights), 1 / weights.square().sum(-1))
-
-
-def test_equal_weights_give_the_ensembles_moments():
-    particles = torch.randn(3, E, S)
-    equal = torch.full((3, E), -math.log(E))
-    torch.testing.assert_close(weighted_mean(particles, equal), ensemble_mean(particles))
-    torch.testing.assert_close(weighted_var(particles, equal), ensemble_var(particles))
-    torch.testing.assert_close(effective_sample_size(equal), torch.full((3,), float(E)))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
@@ -276,21 +265,17 @@ def test_errors():
         systematic_resample(particles, log_weights, torch.rand(2))
     with pytest.raises(ValueError, match=r"log_weights must be \[\*B, E\] = \[6\], got \[3\]"):
         weighted_mean(particles, log_weights[:3])
-    with pytest.raises(ValueError, match=r"between 0 and 1; got 1.5"):
-        soft_resample(particles, log_weights, torch.rand(1), 1.5)
+    assert_refused(ValueError, r"between 0 and 1; got 1.5", soft_resample, particles, log_weights, torch.rand(1), 1.5)
     with pytest.raises(ValueError, match="epsilon and iterations must be positive"):
         transport_resample(particles, log_weights, epsilon=0.0)
-    with pytest.raises(ValueError, match="at least 2"):
-        weighted_var(particles[:1], log_weights[:1])
+    assert_refused(ValueError, "at least 2", weighted_var, particles[:1], log_weights[:1])
 
 
 def test_compiled_equals_eager():
     def everything(x, w, u):
         return [*systematic_resample(x, w, u), *soft_resample(x, w, u), *transport_resample(x, w, iterations=3)]
 
-    inputs = *problem((3,)), torch.rand(3, 1)
-    compiled = torch.compile(everything, fullgraph=True, backend="aot_eager")(*inputs)
-    torch.testing.assert_close(compiled, everything(*inputs))
+    assert_compiled_is_eager(everything, *problem((3,)), torch.rand(3, 1))
 
 
 def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
@@ -327,8 +312,7 @@ def test_jitter_is_zero_without_copies_or_factor():
     assert jitter_copies(particles, particles, log_weights, normal).equal(particles)
     copies = particles[:, :1].expand_as(particles)
     assert jitter_copies(copies, particles, log_weights, normal, factor=0.0).equal(copies)
-    with pytest.raises(ValueError, match="0 or more"):
-        jitter_copies(copies, particles, log_weights, normal, factor=-1.0)
+    assert_refused(ValueError, "0 or more", jitter_copies, copies, particles, log_weights, normal, factor=-1.0)
 
 
 def test_gradient_of_jitter_is_that_of_finite_differences():

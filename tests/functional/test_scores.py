@@ -16,15 +16,20 @@ def problem(batch=(), size=9, dim=4, seed=0):
     return ensemble, torch.randn(*batch, dim, generator=generator, dtype=torch.float64)
 
 
+#: Each score, and the distance of two points that it is made of: of every component, or of all together.
+SCORES = [(crps_ensemble, torch.abs), (energy_score, lambda offset: torch.linalg.vector_norm(offset, dim=-1))]
+
+
+@pytest.mark.parametrize(("score", "distance"), SCORES)
 @pytest.mark.parametrize("fair", [False, True])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_crps_is_the_double_sum(batch, fair):
+def test_a_score_is_the_double_sum(score, distance, batch, fair):
     ensemble, target = problem(batch)
-    size = ensemble.shape[-2]
-    pairs = (ensemble.unsqueeze(-2) - ensemble.unsqueeze(-3)).abs().sum((-2, -3))
-    expected = (ensemble - target.unsqueeze(-2)).abs().mean(-2)
+    size, members = ensemble.shape[-2], len(batch)
+    pairs = distance(ensemble.unsqueeze(-2) - ensemble.unsqueeze(-3)).sum((members, members + 1))
+    expected = distance(ensemble - target.unsqueeze(-2)).mean(members)
     expected = expected - pairs / (2 * size * (size - 1 if fair else size))
-    torch.testing.assert_close(crps_ensemble(ensemble, target, fair=fair), expected, **EXACT)
+    torch.testing.assert_close(score(ensemble, target, fair=fair), expected, **EXACT)
 
 
 def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
@@ -51,22 +56,6 @@ def test_fair_score_does_not_depend_on_the_ensemble_size(score):
         unfair = score(ensemble, y.expand(40_000, 1), fair=False).mean().item()
         # Counting the pairs i = j, whose distance is 0, costs 1/(2E) E|x - x'| = 1 / (E sqrt(π)).
         assert abs(unfair - expected.item() - 1 / size / torch.pi**0.5) < 3 * standard_error
-
-
-@pytest.mark.parametrize("fair", [False, True])
-@pytest.mark.parametrize("batch", BATCHES)
-def test_energy_score_is_the_double_sum(batch, fair):
-    ensemble, target = problem(batch)
-    size = ensemble.shape[-2]
-    pairs = (ensemble.unsqueeze(-2) - ensemble.unsqueeze(-3)).square().sum(-1).sqrt().sum((-1, -2))
-    expected = (ensemble - target.unsqueeze(-2)).square().sum(-1).sqrt().mean(-1)
-    expected = expected - pairs / (2 * size * (size - 1 if fair else size))
-    torch.testing.assert_close(energy_score(ensemble, target, fair=fair), expected, **EXACT)
-
-
-def test_energy_score_in_one_dimension_is_the_crps():
-    ensemble, target = problem((3,), dim=1)
-    torch.testing.assert_close(energy_score(ensemble, target), crps_ensemble(ensemble, target)[..., 0], **EXACT)
 
 
 @pytest.mark.parametrize("score", [crps_ensemble, energy_score])

@@ -1,14 +1,11 @@
 """Two processes that hold half of the columns each, against one that holds all of them."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
+from torch.multiprocessing import start_processes
 
-from tests.functional.two_shards import SHARES, problem
+from tests.functional.checks import assert_refused
+from tests.functional.two_shards import SHARES, analyse_shares, problem
 from torch_denkf.functional import analyse
 from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.modules import EnsembleAnalysis, ShardedEnsembleAnalysis
@@ -20,13 +17,7 @@ TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory):
     out = tmp_path_factory.mktemp("shards")
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    command = [*launcher, "-m", "tests.functional.two_shards", str(out)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        command, cwd=Path(__file__).parents[2], env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+    start_processes(analyse_shares, (out,), nprocs=2, start_method="fork")
     return [torch.load(out / f"rank_{rank}.pt", weights_only=False) for rank in (0, 1)]
 
 
@@ -70,10 +61,8 @@ def arguments():
 
 
 def test_draws_must_be_given():
-    with pytest.raises(ValueError, match=r"perturbation.*another seed"):
-        analyse_sharded(*arguments(), scheme="perturbed")
-    with pytest.raises(ValueError, match="'perturbed'"):
-        ShardedEnsembleAnalysis("perturbed")
+    assert_refused(ValueError, r"perturbation.*another seed", analyse_sharded, *arguments(), scheme="perturbed")
+    assert_refused(ValueError, "'perturbed'", ShardedEnsembleAnalysis, "perturbed")
 
 
 def test_gradients_are_refused():
@@ -86,8 +75,7 @@ def test_gradients_are_refused():
 
 def test_processes_must_have_begun(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(RuntimeError, match="init_process_group"):
-        analyse_sharded(*arguments(), scheme="etkf")
+    assert_refused(RuntimeError, "init_process_group", analyse_sharded, *arguments(), scheme="etkf")
 
 
 def test_shapes_are_checked():

@@ -1,6 +1,5 @@
-"""What ``torchrun`` starts in test_sharded: each process analyses its components, and leaves the results."""
+"""What two processes of test_sharded do: each analyses its components, and leaves the results."""
 
-import sys
 from pathlib import Path
 
 import torch
@@ -9,12 +8,12 @@ import torch.distributed as dist
 from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.modules import ShardedEnsembleAnalysis
 
-SHARES = {"uneven": (70_000, 30_000), "blind": (100_000, 0)}  # of the observations
-STATES = (60_000, 40_000)
+SHARES = {"uneven": (17_500, 7_500), "blind": (25_000, 0)}  # of the observations
+STATES = (15_000, 10_000)  # several tiles in each process
 MEMBERS = 8
 
 
-def problem(dtype=torch.float64, observations=100_000, batch=2):
+def problem(dtype=torch.float64, observations=25_000, batch=2):
     """All components of a forecast, readings of noise and mask; and draws for the schemes that need any."""
     generator = torch.Generator().manual_seed(0)
 
@@ -35,9 +34,10 @@ def share(sizes, rank):
     return slice(sum(sizes[:rank]), sum(sizes[: rank + 1]))
 
 
-def main(out: Path) -> None:
-    dist.init_process_group("gloo")
-    rank, results = dist.get_rank(), {}
+def analyse_shares(rank: int, out: Path) -> None:
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{out}/meeting", rank=rank, world_size=2)
+    results = {}
     for dtype in (torch.float64, torch.float32):
         forecast, predicted, given, noise, perturbation, observed = problem(dtype)
         for name, sizes in SHARES.items():
@@ -61,7 +61,3 @@ def main(out: Path) -> None:
     results["module"] = dict(zip(names, module.compute(*parts, noise=None), strict=True))
     torch.save(results, out / f"rank_{rank}.pt")
     dist.destroy_process_group()
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

@@ -1,19 +1,28 @@
-"""Golden values of filters, smoothers, losses, monitors and shipped weights, under fixed seeds."""
+"""Golden values of filters, smoothers, losses, monitors, shipped weights and studies, under fixed seeds."""
 
 from __future__ import annotations
 
 import tempfile
+from contextlib import redirect_stdout
+from os import devnull
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.lorenz96 import lorenz96_step
+from benchmarks.fusion import study as fusion
+from benchmarks.lorenz96 import schemes
+from benchmarks.odometry.__main__ import Study as Odometry
+from benchmarks.odometry.__main__ import track
+from benchmarks.smoothing import ours as smoothing
+from benchmarks.smoothing.cases import CASES
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf, toy_frames
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.test_contract import FILTERS, particles, readings
 from tests.pretrained.beliefs import all_beliefs
-from torch_denkf.applications.car import read_kitti_drive
+from torch_denkf.applications.car import read_kitti_drive, write_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.car.odometry.failing_drive import track_failing_drive, usual_failures
 from torch_denkf.filters import ParticleFilter
@@ -45,7 +54,7 @@ def values() -> dict[str, list[float]]:
         found = {**of_filters(), **of_smoothers(), **of_losses(), **of_monitors()}
     finally:
         torch.set_default_dtype(before)
-    return {**found, **of_weights()}
+    return {**found, **of_weights(), **of_studies()}
 
 
 def numbers(*parts: Tensor) -> list[float]:
@@ -168,3 +177,50 @@ def of_weights() -> dict[str, list[float]]:
         tracked = track_failing_drive(from_pretrained("car-odometry"), drive, usual_failures(len(drive)))
     out["weights: the car on a drive"] = numbers(tracked[MEAN][-1], tracked[VAR][-1])
     return out
+
+
+def of_studies() -> dict[str, list[float]]:
+    """What studies compute on their smoke settings, by their own code; those named so in single precision."""
+    before = torch.get_default_dtype()
+    try:
+        found = {**of_chaotic_systems(), **of_fusion_and_odometry()}
+    finally:
+        torch.set_default_dtype(before)
+    return {f"study: {name}": values for name, values in found.items()}
+
+
+def of_chaotic_systems() -> dict[str, list[float]]:
+    """Errors of smoothers, and of the schemes on a truth of few cycles: chaos would make rounding visible."""
+    out = {}
+    for case in CASES:
+        rows = smoothing.rows(case, [0, 1], cycles=26)
+        scored = [row[f"rmse_{case.scored}"] for row in rows]
+        out[f"smoothing, {case.name}"] = numbers(torch.tensor(scored))
+    random = schemes.Random(2, stream=0)
+    states = [8 + random.randn(schemes.VARIABLES)]
+    for _ in range(20):
+        states.append(lorenz96_step(states[-1]))
+    truth = torch.stack(states)
+    readings = torch.stack([state + random.randn(schemes.VARIABLES) for state in states])
+    for case in schemes.CASES:
+        errors, spreads = schemes.assimilate(case, truth, readings)
+        out[f"lorenz96, {case.name}"] = numbers(errors.mean(0), spreads.mean(0))
+    return out
+
+
+def of_fusion_and_odometry() -> dict[str, list[float]]:
+    """Errors of fused sensors before any training, and of the path of a rendered drive."""
+    torch.set_default_dtype(torch.float32)
+    torch.manual_seed(11)
+    task = fusion.arm_task(demos=(2, 2), steps=3)
+    rows = [row for row in fusion.rows(task, fusion.make_weights(task, 0)) if row["method"] == "plain"]
+    with tempfile.TemporaryDirectory() as folder, open(devnull, "w") as nowhere, redirect_stdout(nowhere):
+        root = Path(folder)
+        write_drives(root, ["town"], frames=12, size=(100, 300))
+        study = Odometry(root=root, out=root / "out")
+        found = track(study, root, "town", study.heights[0])
+    measures = ("translation_m_per_m", "rotation_deg_per_m", "scale")
+    return {
+        "single: fusion": numbers(torch.tensor([row["error"] for row in rows])),
+        "single: odometry": numbers(torch.tensor([found[name] for name in measures])),
+    }

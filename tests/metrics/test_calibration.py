@@ -2,10 +2,10 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import ensemble_interval_coverage, interval_coverage
 
 
@@ -41,25 +41,12 @@ def test_gaussian_interval_of_angles():
 def test_ensemble_interval_of_a_calibrated_ensemble(members, level):
     n = 40_000
     draws = torch.distributions.Exponential(1.0)  # skewed: no Gaussian interval fits
-    torch.manual_seed(0)
     ensemble, truth = draws.sample((n, members, 1)), draws.sample((n, 1))
     share = ensemble_interval_coverage(ensemble, truth, level=level).item()
     # Ranks that are whole numbers make it exact: (19 + 1) x 0.05 = 1, (9 + 1) x 0.1 = 1. Others interpolate.
     exact = (1 - level) / 2 * (members + 1)
     slack = 0.0 if abs(exact - round(exact)) < 1e-9 else 0.005
     assert abs(share - level) < 5 * (level * (1 - level) / n) ** 0.5 + slack
-
-
-@pytest.mark.parametrize("level", [0.3, 0.8, 0.9])
-def test_ensemble_interval_is_that_of_numpy(level):
-    ensemble = torch.randn(200, 23, 2, generator=rng(), dtype=torch.float64)
-    truth = 1.5 * torch.randn(200, 2, generator=rng(1), dtype=torch.float64)
-    p = (1 - level) / 2
-    low, high = np.quantile(ensemble.numpy(), [p, 1 - p], axis=1, method="weibull")
-    expected = ((low <= truth.numpy()) & (truth.numpy() <= high)).mean(0)
-    np.testing.assert_allclose(ensemble_interval_coverage(ensemble, truth, level=level), expected, atol=1e-6)
-    assert (expected > 0.05).all()
-    assert (expected < 0.95).all()
 
 
 def test_ensemble_interval_of_angles():
@@ -78,9 +65,6 @@ def test_errors_say_what_to_do():
         ensemble_interval_coverage(torch.zeros(4, 18, 2), mean)
     with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
         ensemble_interval_coverage(torch.zeros(4, 19, 3), mean)
-    with pytest.raises(ValueError, match="cannot be negative"):
-        interval_coverage(mean, mean - 1, mean)
-    with pytest.raises(ValueError, match=r"shape of the mean, \[4, 2\]; got \[2\]"):
-        interval_coverage(mean, torch.ones(2), mean)
-    with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
-        interval_coverage(mean, torch.ones(4, 2), mean, level=90)
+    assert_refused(ValueError, "cannot be negative", interval_coverage, mean, mean - 1, mean)
+    assert_refused(ValueError, r"shape of the mean, \[4, 2\]; got \[2\]", interval_coverage, mean, torch.ones(2), mean)
+    assert_refused(ValueError, r"in \(0, 1\); got 90", interval_coverage, mean, torch.ones(4, 2), mean, level=90)

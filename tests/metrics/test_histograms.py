@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
@@ -96,22 +97,18 @@ def test_spread_error_by_hand_and_beside_the_ratio():
     torch.testing.assert_close(whole.spread[:, 0] / whole.error[:, 0], ratio)
 
 
-def test_interval_is_numpys_quantile():
+@pytest.mark.parametrize("level", [0.3, 0.8, 0.9])
+def test_interval_is_numpys_quantile(level):
     ensemble = torch.randn(5, 23, 2, generator=rng(), dtype=torch.float64)
-    low, high = ensemble_interval(ensemble, level=0.8)
-    expected = np.quantile(ensemble.numpy(), [0.1, 0.9], axis=1, method="weibull")
+    low, high = ensemble_interval(ensemble, level=level)
+    expected = np.quantile(ensemble.numpy(), [(1 - level) / 2, (1 + level) / 2], axis=1, method="weibull")
     np.testing.assert_allclose([low.numpy(), high.numpy()], expected, atol=1e-12)
 
 
 def test_errors_say_what_to_do():
     ones = torch.ones(4, 2)
-    with pytest.raises(ValueError, match="cannot be negative"):
-        pit(ones, -ones, ones)
-    with pytest.raises(ValueError, match="must be finite"):
-        rank_histogram(torch.full((4, 3, 2), torch.nan), ones)
-    with pytest.raises(ValueError, match=r"ensemble must be \[\*B, E, S\]"):
-        rank_histogram(ones, ones)
-    with pytest.raises(ValueError, match="needs samples and bins"):
-        histogram_band(0, 10)
-    with pytest.raises(ValueError, match="5 bins need at least one state each; got 4"):
-        spread_error(ones, ones, ones, bins=5)
+    assert_refused(ValueError, "cannot be negative", pit, ones, -ones, ones)
+    assert_refused(ValueError, "must be finite", rank_histogram, torch.full((4, 3, 2), torch.nan), ones)
+    assert_refused(ValueError, r"ensemble must be \[\*B, E, S\]", rank_histogram, ones, ones)
+    assert_refused(ValueError, "needs samples and bins", histogram_band, 0, 10)
+    assert_refused(ValueError, "5 bins need at least one state each; got 4", spread_error, ones, ones, ones, bins=5)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.functional.checks import assert_refused
 from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
 
@@ -43,9 +44,7 @@ def test_gradients_go_through_wrapped_angles():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(ValueError, match="for ensembles pass the mean"):
-        state_errors(torch.zeros(4, 8, 3), torch.zeros(4, 3))
+    assert_refused(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
     with pytest.raises(IndexError, match="dimension 3 of a state of 3"):
         state_errors(torch.zeros(4, 3), torch.zeros(4, 3), angles=(3,))
-    with pytest.raises(ValueError, match="no states"):
-        state_errors(torch.zeros(0, 3), torch.zeros(0, 3))
+    assert_refused(ValueError, "no states", state_errors, torch.zeros(0, 3), torch.zeros(0, 3))

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.functional.checks import assert_refused
 from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.modules import EnsembleAnalysis
@@ -108,38 +109,24 @@ def test_a_single_reading(float64):
 
 
 def test_errors():
-    with pytest.raises(ValueError, match="'enkf'"):
-        EnsembleAnalysis("enkf")
-    with pytest.raises(ValueError, match="rotate"):
-        EnsembleAnalysis("sakov", rotate=True)
+    assert_refused(ValueError, "'enkf'", EnsembleAnalysis, "enkf")
+    assert_refused(ValueError, "rotate", EnsembleAnalysis, "sakov", rotate=True)
 
 
 def test_inflation_multiplies_the_components_that_it_is_told(float64):
-    td = TensorDict(
-        {
-            "forecast": {"ensemble": torch.randn(8, 4), "observation": torch.randn(8, 2)},
-            "sensor": {"ensemble": torch.randn(8, 2), "noise": torch.ones(2)},
-        }
-    )
+    td = inputs()
     plain = EnsembleAnalysis("sensor")(td.clone())["belief"]
     some = EnsembleAnalysis("sensor", inflation=1.5, inflated=[1, 2])(td.clone())["belief"]
     torch.testing.assert_close(some["mean"], plain["mean"])
     factors = torch.tensor([1.0, 1.5, 1.5, 1.0])
     torch.testing.assert_close(some["var"], plain["var"] * factors**2)
-    torch.testing.assert_close(some["ensemble"] - some["mean"], (plain["ensemble"] - plain["mean"]) * factors)
+    anomalies = [belief["ensemble"] - belief["mean"].unsqueeze(-2) for belief in (some, plain)]
+    torch.testing.assert_close(anomalies[0], anomalies[1] * factors)
 
 
-def test_inflation_leaves_an_ensemble_without_observation_as_it_is():
-    torch.manual_seed(0)
-    td = TensorDict(
-        {
-            "forecast": {"ensemble": torch.randn(2, 8, 3), "observation": torch.randn(2, 8, 2)},
-            "sensor": {"ensemble": torch.randn(2, 8, 2), "noise": torch.ones(2, 2)},
-            "observed": torch.tensor([[True], [False]]),
-        },
-        [2],
-    )
+def test_inflation_leaves_an_ensemble_without_observation_as_it_is(float64):
+    td = inputs((2,)).set("observed", torch.tensor([[True], [False]]))
     plain = EnsembleAnalysis("sensor")(td.clone())["belief", "ensemble"]
     inflated = EnsembleAnalysis("sensor", inflation=1.5)(td.clone())["belief", "ensemble"]
-    torch.testing.assert_close(inflated[0] - inflated[0].mean(0), 1.5 * (plain[0] - plain[0].mean(0)))
-    torch.testing.assert_close(inflated[1], td["forecast", "ensemble"][1])
+    torch.testing.assert_close(inflated[0], inflate(plain[0], 1.5))
+    assert inflated[1].equal(td["forecast", "ensemble"][1])

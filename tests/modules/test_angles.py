@@ -15,15 +15,12 @@ from torch_denkf.modules import (
     LocalEnsembleAnalysis,
 )
 
+pytestmark = pytest.mark.usefixtures("float64")
+
 E, S, OBS = 12, 3, 2
 SCHEMES = ["sensor", "perturbed", "etkf", "sakov"]
 INFO = [("info", name) for name in ("innovation", "nis", "log_likelihood")]
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
-
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
 
 
 def wrapped(value):

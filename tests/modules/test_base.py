@@ -1,13 +1,15 @@
 """What holds for every sub-model: missing keys are named, keys may be renamed and nested, copies compute the same."""
 
+import inspect
 import pickle
 from copy import deepcopy
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, unravel_key
 from torch import nn
 
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
 from torch_denkf.filters._steps import _without_reading
 from torch_denkf.modules import (
@@ -33,127 +35,86 @@ from torch_denkf.modules import (
 E, S, OBS = 4, 5, 2
 EYE, H = torch.eye(S), torch.eye(OBS, S)
 
-#: name: (constructor, keyword arguments that rename every key, {the renamed input: its shape})
+#: name: (class, arguments, further options, the shapes of what it reads)
 CASES = {
     "learned transition": (
-        lambda **k: LearnedTransition(StochasticMLP(S + 2, S, (8,)), **{"action_key": "action", **k}),
-        {"in_key": ("a", "b", "x"), "out_key": ("c", "f"), "action_key": ("a", "u")},
-        {("a", "b", "x"): (E, S), ("a", "u"): (2,)},
+        LearnedTransition,
+        lambda: [StochasticMLP(S + 2, S, (8,))],
+        {"action_key": "action"},
+        [(E, S), (2,)],
     ),
-    "flipout transition": (
-        lambda **k: LearnedTransition(StochasticMLP(S, S, (8,), layer="flipout"), **k),
-        {"in_key": ("a", "x"), "out_key": "f"},
-        {("a", "x"): (E, S)},
-    ),
-    "unicycle": (
-        lambda **k: UnicycleTransition(StochasticMLP(2, 2, (8,)), 0.1, **k),
-        {"in_key": ("a", "x"), "out_key": "f"},
-        {("a", "x"): (E, S)},
-    ),
-    "unicycle motion": (
-        lambda **k: UnicycleMotion(0.1, **k),
-        {"before_key": ("a", "x"), "analysis_key": "z", "belief_prefix": "b"},
-        {("a", "x"): (E, S), "z": (E, S)},
-    ),
+    "flipout transition": (LearnedTransition, lambda: [StochasticMLP(S, S, (8,), layer="flipout")], {}, [(E, S)]),
+    "unicycle": (UnicycleTransition, lambda: [StochasticMLP(2, 2, (8,)), 0.1], {}, [(E, S)]),
+    "unicycle motion": (UnicycleMotion, lambda: [0.1], {}, [(E, S), (E, S)]),
     "pair observation": (
-        lambda **k: PairObservation([50.0, 1.0], **k),
-        {
-            "in_key": "x",
-            "history_key": ("a", "h"),
-            "steps_key": "n",
-            "observed_key": "ok",
-            "out_key": "y",
-            "clone_key": "z",
-            "out_observed_key": ("p", "ok"),
-        },
-        {"x": (E, S), ("a", "h"): (E, 2, 2)},
+        PairObservation,
+        lambda: [[50.0, 1.0]],
+        {"clone_key": "clone", "history_key": ("forecast", "history")},
+        [(E, S), (E, 2, 2)],
     ),
-    "select": (lambda **k: Select([3, 4], **k), {"in_key": "x", "out_key": ("p", "q")}, {"x": (E, S)}),
-    "linear observation": (
-        lambda **k: LinearObservation(H, **k),
-        {"in_key": ("a", "x"), "out_key": "y"},
-        {("a", "x"): (E, S)},
-    ),
-    "learned observation": (
-        lambda **k: LearnedObservation(nn.Linear(S, OBS), **k),
-        {"in_key": ("a", "x"), "out_key": "y"},
-        {("a", "x"): (E, S)},
-    ),
-    "diagonal noise": (
-        lambda **k: DiagonalNoise(OBS, **k),
-        {"in_key": ("s", "y"), "out_key": ("s", "r")},
-        {("s", "y"): (E, OBS)},
-    ),
-    "constant noise": (lambda **k: ConstantNoise([0.1, 0.2], **k), {"in_key": "y", "out_key": "r"}, {"y": (OBS,)}),
+    "select": (Select, lambda: [[3, 4]], {}, [(E, S)]),
+    "linear observation": (LinearObservation, lambda: [H], {}, [(E, S)]),
+    "learned observation": (LearnedObservation, lambda: [nn.Linear(S, OBS)], {}, [(E, S)]),
+    "diagonal noise": (DiagonalNoise, lambda: [OBS], {}, [(E, OBS)]),
+    "constant noise": (ConstantNoise, lambda: [[0.1, 0.2]], {}, [(OBS,)]),
     "image sensor": (
-        lambda **k: ImageSensor(OBS, image_shape=(1, 8, 8), ensemble_size=E, **k),
-        {"in_key": ("camera", "rgb"), "out_key": "y", "encoding_key": "code", "observed_key": "ok"},
-        {("camera", "rgb"): (1, 8, 8)},
+        ImageSensor,
+        lambda: [OBS],
+        {"image_shape": (1, 8, 8), "ensemble_size": E, "encoding_key": "code"},
+        [(1, 8, 8)],
     ),
-    "vector sensor": (
-        lambda **k: VectorSensor(3, OBS, ensemble_size=E, **k),
-        {"in_key": ("arm", "q"), "out_key": "y", "observed_key": "ok"},
-        {("arm", "q"): (3,)},
-    ),
-    "gaussian prior": (
-        lambda **k: GaussianPrior(torch.zeros(S), torch.ones(S), ensemble_size=E, **k),
-        {"out_keys": [("b", "e"), ("b", "m"), "v"]},
-        {},
-    ),
-    "around state": (
-        lambda **k: AroundState(torch.ones(S), ensemble_size=E, **k),
-        {"state_key": ("truth", "x"), "out_keys": [("b", "e"), ("b", "m"), "v"]},
-        {("truth", "x"): (S,)},
-    ),
+    "vector sensor": (VectorSensor, lambda: [3, OBS], {"ensemble_size": E}, [(3,)]),
+    "gaussian prior": (GaussianPrior, lambda: [torch.zeros(S), torch.ones(S)], {"ensemble_size": E}, []),
+    "around state": (AroundState, lambda: [torch.ones(S)], {"ensemble_size": E}, [(S,)]),
     "from sensor": (
-        lambda **k: FromSensor([3, 4], torch.zeros(S), torch.ones(S), ensemble_size=E, **k),
-        {
-            "observation_key": ("s", "y"),
-            "noise_variance_key": ("s", "r"),
-            "observed_key": "ok",
-            "out_keys": [("b", "e"), ("b", "m"), "v"],
-        },
-        {("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
+        FromSensor,
+        lambda: [[3, 4], torch.zeros(S), torch.ones(S)],
+        {"ensemble_size": E},
+        [(E, OBS), (OBS,)],
     ),
-    "analysis": (
-        lambda **k: EnsembleAnalysis("perturbed", **k),
-        {
-            "forecast_key": "f",
-            "predicted_key": ("p", "y"),
-            "observation_key": ("s", "y"),
-            "noise_variance_key": ("s", "r"),
-            "observed_key": "ok",
-            "belief_prefix": "b",
-            "info_prefix": "i",
-        },
-        {"f": (E, S), ("p", "y"): (E, OBS), ("s", "y"): (E, OBS), ("s", "r"): (OBS,)},
-    ),
-    "moment prior": (lambda **k: MomentPrior(torch.zeros(S), EYE, **k), {"belief_prefix": "b"}, {}),
-    "linear transition": (
-        lambda **k: LinearTransition(2 * EYE, EYE, **k),
-        {"belief_prefix": "b", "forecast_prefix": "f"},
-        {("b", "mean"): (S,), ("b", "cov"): (S, S)},
-    ),
-    "kalman analysis": (
-        lambda **k: KalmanAnalysis(H, torch.ones(OBS), **k),
-        {
-            "observation_key": ("r", "y"),
-            "observed_key": "ok",
-            "forecast_prefix": "f",
-            "belief_prefix": "b",
-            "info_prefix": "i",
-        },
-        {("f", "mean"): (S,), ("f", "cov"): (S, S), ("r", "y"): (OBS,)},
-    ),
+    "analysis": (EnsembleAnalysis, lambda: ["perturbed"], {}, [(E, S), (E, OBS), (E, OBS), (OBS,)]),
+    "moment prior": (MomentPrior, lambda: [torch.zeros(S), EYE], {}, []),
+    "linear transition": (LinearTransition, lambda: [2 * EYE, EYE], {}, [(S,), (S, S)]),
+    "kalman analysis": (KalmanAnalysis, lambda: [H, torch.ones(OBS)], {}, [(S,), (S, S), (OBS,)]),
 }
 every_sub_model = pytest.mark.parametrize("name", CASES)
 
 
+def plain(name):
+    """The sub-model with the keys that it has by default."""
+    kind, arguments, options, _ = CASES[name]
+    return kind(*arguments(), **options)
+
+
+def names_of_keys(name):
+    """Every parameter that names an entry, and what it names by default."""
+    kind, _, options, _ = CASES[name]
+    parameters = dict(inspect.signature(kind).parameters)
+    if "keys" in parameters:  # **keys go to the class that it is made of
+        parameters |= inspect.signature(kind.__base__).parameters
+    defaults = {key: value.default for key, value in parameters.items() if key != "keys"} | options
+    keys = {key: value for key, value in defaults.items() if key.endswith(("_key", "_keys", "_prefix"))}
+    return {key: value for key, value in keys.items() if value is not None and value is not inspect.Parameter.empty}
+
+
+def other(parameter, value):
+    """Another name, of another depth: nested twice where it is an entry, plain where it is a prefix."""
+    if parameter.endswith("_keys"):
+        return [("other", parameter, str(i)) for i in range(len(value))]
+    return f"other {parameter}" if parameter.endswith("_prefix") else ("other", "one", parameter)
+
+
+def renamed(name):
+    """The sub-model with other names for all that it reads and writes."""
+    kind, arguments, options, _ = CASES[name]
+    names = {key: other(key, value) for key, value in names_of_keys(name).items()}
+    return kind(*arguments(), **{**options, **names})
+
+
 def make(name, batch=(3,)):
-    constructor, keys, shapes = CASES[name]
-    module = constructor(**keys)
+    module = renamed(name)
     td = TensorDict({}, batch)
-    for key, shape in shapes.items():
+    for key, shape in zip(module.in_keys, CASES[name][3], strict=True):
         value = torch.rand(*batch, *shape) + 0.1
         td[key] = torch.eye(S).expand(*batch, S, S) if "cov" in key else value
     return module, td
@@ -168,39 +129,51 @@ def run(module, td, noise=None):
 
 
 @every_sub_model
+def test_every_name_is_that_of_its_parameter(name):
+    before, after = plain(name), renamed(name)
+    expected = {}
+    for parameter, value in names_of_keys(name).items():
+        new = other(parameter, value)
+        pairs = zip(value, new, strict=True) if parameter.endswith("_keys") else [(value, new)]
+        expected |= {unravel_key(one): another for one, another in pairs}
+    for keys, found in ((before.in_keys, after.in_keys), (before.out_keys, after.out_keys)):
+        for key, key_found in zip(keys, found, strict=True):
+            by_prefix = (expected.get(key[0]), *key[1:]) if isinstance(key, tuple) else None
+            assert unravel_key(key_found) in {expected.get(unravel_key(key)), by_prefix} - {None}
+
+
+@every_sub_model
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_renamed_and_nested_keys(name, batch):
+def test_it_writes_what_it_says_and_nothing_else(name, batch):
     module, td = make(name, batch)
     before = td.copy()
     out = module(td)
-    assert list(module.in_keys) == list(CASES[name][2])
     assert set(out.keys(True, True)) == {*before.keys(True, True), *module.out_keys}
-    assert all(td[key] is before[key] for key in CASES[name][2])
+    assert all(td[key] is before[key] for key in module.in_keys)
     assert all(out[key].shape[: len(batch)] == batch and out[key].isfinite().all() for key in module.out_keys)
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case[2]])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case[3]])
 def test_default_and_renamed_keys_compute_the_same(name):
     module, td = make(name)
-    kwargs = {"encoding_key": "code"} if "image" in name else {}
-    plain = CASES[name][0](**kwargs)
-    plain.load_state_dict(module.state_dict())
-    renamed = TensorDict({p: td[m] for p, m in zip(plain.in_keys, module.in_keys, strict=True)}, td.batch_size)
-    outputs, expected = run(plain, renamed), run(module, td)
-    for ours, theirs in zip(plain.out_keys, module.out_keys, strict=True):
+    default = plain(name)
+    default.load_state_dict(module.state_dict())
+    entries = {p: td[m] for p, m in zip(default.in_keys, module.in_keys, strict=True)}
+    outputs, expected = run(default, TensorDict(entries, td.batch_size)), run(module, td)
+    for ours, theirs in zip(default.out_keys, module.out_keys, strict=True):
         assert outputs[ours].equal(expected[theirs])
 
 
 @every_sub_model
 def test_missing_key_is_named(name):
     module, td = make(name)
-    for key in CASES[name][2]:
+    for key in module.in_keys:
         with pytest.raises(KeyError) as error:
             module(td.exclude(key))
         assert repr(key) in str(error.value)
         assert type(module).__name__ in str(error.value)
-        for other in CASES[name][2]:
-            assert other == key or str(other) in str(error.value), "the message lists what is there"
+        for entry in module.in_keys:
+            assert entry == key or str(entry) in str(error.value), "the message lists what is there"
 
 
 NO_NOISE = {
@@ -223,9 +196,9 @@ def test_copies_compute_the_same(name):
     noise = module.draw_noise(td.batch_size, members=E, state_dim=S, observation_dim=OBS)
     assert (noise is None) == (name in NO_NOISE)
     expected = run(module, td, noise)
-    other = CASES[name][0](**CASES[name][1])
-    other.load_state_dict(module.state_dict())
-    for copy in (other, pickle.loads(pickle.dumps(module)), deepcopy(module)):
+    loaded = renamed(name)
+    loaded.load_state_dict(module.state_dict())
+    for copy in (loaded, pickle.loads(pickle.dumps(module)), deepcopy(module)):
         out = run(copy, td, noise)
         assert all(out[key].equal(expected[key]) for key in module.out_keys)
 
@@ -300,7 +273,5 @@ class Returns(SubModel):
 )
 def test_too_few_or_too_many_values_name_the_module_and_its_keys(out, got):
     keys = r"\[\('belief', 'mean'\), \('belief', 'var'\)\], 2 values; it returned "
-    with pytest.raises(ValueError, match=r"Returns.compute\(\) .*" + keys + got):
-        Returns(out)(TensorDict({"x": torch.zeros(2)}))
-    with pytest.raises(ValueError, match=r"Returns.without_reading\(\) .*" + keys + got):
-        _without_reading(Returns(out), {})
+    assert_refused(ValueError, r"Returns.compute\(\) .*" + keys + got, Returns(out), TensorDict({"x": torch.zeros(2)}))
+    assert_refused(ValueError, r"Returns.without_reading\(\) .*" + keys + got, _without_reading, Returns(out), {})

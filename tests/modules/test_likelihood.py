@@ -9,13 +9,10 @@ from torch.distributions import Normal
 
 from torch_denkf.modules import GaussianLikelihood, LearnedLikelihood
 
+pytestmark = pytest.mark.usefixtures("float64")
+
 E, OBS, F = 7, 2, 5
 BATCHES = [(), (4,), (2, 3)]
-
-
-@pytest.fixture(autouse=True)
-def _double(float64):
-    return
 
 
 def reading(batch=(), members=None):

@@ -39,11 +39,6 @@ def test_learned(float64, scaled):
     torch.testing.assert_close(model.observe(state[:, 0]), expected[:, 0], rtol=0, atol=1e-15)
 
 
-def test_double_moves_a_known_matrix():
-    model = LinearObservation(torch.eye(2)).double()
-    assert observe(model, torch.ones(1, 2, dtype=torch.float64)).dtype == torch.float64
-
-
 def test_a_network_may_have_attributes_that_are_named_like_our_buffers():
     class Affine(torch.nn.Module):
         def __init__(self):

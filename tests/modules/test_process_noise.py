@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleNoise, UnicycleTransition
 from torch_denkf.modules import CholeskyNoise, ConstantNoise, MappedNoise
 
@@ -106,23 +107,9 @@ def test_unicycle_noise_is_the_effect_of_the_new_velocities(float64, clones):
 
 
 def test_errors_say_what_is_wrong():
-    with pytest.raises(ValueError, match=r"(r|floor) of CholeskyNoise.* must be finite and above 0"):
-        CholeskyNoise(2, r=0.0)
+    assert_refused(ValueError, r"(r|floor) of CholeskyNoise.* must be finite and above 0", CholeskyNoise, 2, r=0.0)
     with pytest.raises(ValueError, match=r"(r|floor) of CholeskyNoise.* must be finite and above 0"):
         CholeskyNoise(2, r=0.1, floor=0.02)
     with pytest.raises(ValueError, match="maps noise of 2 dimensions to 3; ConstantNoise writes"):
         MappedNoise(ConstantNoise([1.0], **FORECAST), torch.ones(3, 2))(belief())
-    with pytest.raises(KeyError, match="CholeskyNoise reads"):
-        CholeskyNoise(2)(TensorDict({}))
-
-
-def test_dt_may_be_an_entry_that_varies_over_rows(float64):
-    inner = ConstantNoise([0.5, 0.1], **FORECAST)
-    td = TensorDict({"belief": {"mean": torch.randn(4, 5)}, "forecast": {"mean": torch.randn(4, 5)}}, [4])
-    td["clock", "dt"] = torch.tensor([[0.1], [0.2], [0.0], [1.5]])
-    model = UnicycleNoise(inner, ("clock", "dt"))
-    assert ("clock", "dt") in model.in_keys
-    rows = [UnicycleNoise(inner, float(row["clock", "dt"]))(row.copy())["forecast", "noise"] for row in td]
-    torch.testing.assert_close(model(td.copy())["forecast", "noise"], torch.stack(rows), rtol=0, atol=1e-15)
-    with pytest.raises(KeyError, match=r"UnicycleNoise reads \('clock', 'dt'\)"):
-        model(td.exclude("clock"))
+    assert_refused(KeyError, "CholeskyNoise reads", CholeskyNoise(2), TensorDict({}))

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional as F
 
+from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.modules import GaussianAround, MomentPrior
@@ -109,16 +110,13 @@ def test_gradients(float64):
     ],
 )
 def test_sizes_and_keys_belong_together(sizes, keys, match):
-    with pytest.raises(ValueError, match=match):
-        LSTMUpdate(2, **sizes, **keys)
+    assert_refused(ValueError, match, LSTMUpdate, 2, **sizes, **keys)
 
 
 def test_errors_name_what_is_wrong():
     update = LSTMUpdate(2, hidden_size=5, **{**SIZES, "features": 3}, **KEYS)
-    with pytest.raises(ValueError, match=r"8 inputs.*\[4, 2, 2, 1\]"):
-        update(frames((3,)))
-    with pytest.raises(KeyError, match="'code'"):
-        update(frames((3,)).exclude("code"))
+    assert_refused(ValueError, r"8 inputs.*\[4, 2, 2, 1\]", update, frames((3,)))
+    assert_refused(KeyError, "'code'", update, frames((3,)).exclude("code"))
 
 
 def test_memory_is_empty_at_reset(float64):
@@ -159,7 +157,6 @@ def test_pose_moves_as_the_unicycle_and_its_covariance_by_jacobians(float64, bat
 
 
 def test_inflation_widens_the_belief_and_leaves_its_mean():
-    torch.manual_seed(0)
     update = LSTMUpdate(2, features=3, hidden_size=4, encoding_key="x", scale=[2.0, 0.5])
     td = TensorDict({"x": torch.randn(5, 3), "forecast": {k: torch.randn(5, 1, 4) for k in ("hidden", "cell")}}, [5])
     plain = update(td.copy())["belief"]
@@ -167,17 +164,3 @@ def test_inflation_widens_the_belief_and_leaves_its_mean():
     wide = update(td.copy())["belief"]
     torch.testing.assert_close(wide["var"], 2.25 * plain["var"])
     assert wide["mean"].equal(plain["mean"])
-
-
-def test_dt_of_the_pose_may_be_an_entry_that_varies_over_rows(float64):
-    root, velocity_root = torch.randn(4, 5, 5), torch.randn(4, 2, 2)
-    forecast = {"mean": torch.randn(4, 5), "cov": root @ root.mT}
-    estimate = {"mean": torch.randn(4, 2), "cov": velocity_root @ velocity_root.mT}
-    td = TensorDict({"forecast": forecast, "velocity": estimate}, [4])
-    dts = torch.tensor([[0.1], [0.2], [0.0], [1.5]])
-    model = UnicyclePose("dt")
-    assert "dt" in model.in_keys
-    out = model(td.copy().set("dt", dts))["belief"]
-    rows = torch.stack([UnicyclePose(float(dt))(row.copy())["belief"] for dt, row in zip(dts, td, strict=True)])
-    for name in ("mean", "cov", "var"):
-        torch.testing.assert_close(out[name], rows[name], rtol=0, atol=1e-13)

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounter
 
-from torch_denkf.modules import ImageSensor, VectorSensor, convolutional_trunk
+from torch_denkf.modules import ImageSensor, VectorSensor
 
 SHAPE = (2, 9, 12)
 BATCHES = [(), (3,), (2, 3)]
@@ -135,18 +135,6 @@ def test_encoding_is_the_mean_hidden_layer(float64, layer):
     torch.testing.assert_close(td["sensor", "code"], hidden.mean(0), rtol=0, atol=1e-13)
 
 
-def test_paper_trunk():
-    trunk = convolutional_trunk(6)
-    convolutions = [part for part in trunk if isinstance(part, torch.nn.Conv2d)]
-    assert [(c.out_channels, *c.kernel_size, *c.stride) for c in convolutions] == [
-        (64, 7, 7, 2, 2),
-        (32, 3, 3, 2, 2),
-        (16, 3, 3, 2, 2),
-    ]
-    # 50 x 150 -> 25 x 75 -> 13 x 38 -> 7 x 19, 16 channels.
-    assert trunk(torch.zeros(1, 6, 50, 150)).shape == (1, 16 * 7 * 19)
-
-
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_vector_sensor(float64, layer, batch):
@@ -172,7 +160,6 @@ def test_vector_sensor_unobserved_nan():
 
 def test_pixels_are_standardised_channel_by_channel():
     """(x - loc) / scale in front of the trunk: the same as a sensor without it on pixels standardised by hand."""
-    torch.manual_seed(0)
     loc, scale = torch.tensor([0.5, 0.0]), torch.tensor([0.2, 0.1])
     plain = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4)
     standard = ImageSensor(2, image_shape=(2, 12, 16), ensemble_size=4, pixel_loc=loc, pixel_scale=scale)

@@ -1,12 +1,16 @@
 """Oracles: the formula with linear networks, the exact circular arc, finite differences."""
 
+import re
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.applications.car import UnicycleMotion, UnicycleTransition
-from torch_denkf.modules import LearnedTransition, StochasticMLP
+from tests.functional.checks import assert_refused
+from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
+from torch_denkf.modules import ConstantNoise, LearnedTransition, StochasticMLP
 
 BATCHES = [(), (3,), (2, 3)]
 
@@ -47,16 +51,11 @@ def test_commands_are_standardised(float64):
     torch.testing.assert_close(forecast(scaled, state, action=drive), expected, rtol=0, atol=1e-13)
 
 
-def test_residual_of_a_zero_network_is_the_identity():
-    net = nn.Linear(3, 3)
-    nn.init.zeros_(net.weight), nn.init.zeros_(net.bias)
-    state = torch.randn(4, 3)
-    assert forecast(LearnedTransition(net, loc=[1.0, 2.0, 3.0], scale=[1.0, 2.0, 3.0]), state).equal(state)
-
-
-def test_missing_action_is_named():
-    with pytest.raises(KeyError, match="'torque'"):
-        forecast(LearnedTransition(nn.Linear(4, 3), action_key="torque"), torch.zeros(2, 3))
+def moved(pose, velocity, dt):
+    """The vehicle's state after a step with these velocities."""
+    (x, y, theta), (v, w) = pose.unbind(-1), velocity.unbind(-1)
+    angle = theta + w * dt / 2
+    return torch.stack([x + v * dt * angle.cos(), y + v * dt * angle.sin(), theta + w * dt, v, w], -1)
 
 
 def still(velocity):
@@ -90,11 +89,7 @@ def test_unicycle_velocity_changes_before_the_pose_moves(float64):
     state = torch.randn(6, 5)
     out = forecast(UnicycleTransition(net, 0.5, loc=loc, scale=scale), state)
     velocity = state[:, 3:] + scale * net((state[:, 3:] - loc) / scale)
-    v, w = velocity.unbind(-1)
-    x, y, theta = state[:, :3].unbind(-1)
-    angle = theta + 0.25 * w
-    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
-    torch.testing.assert_close(out, expected, rtol=0, atol=1e-13)
+    torch.testing.assert_close(out, moved(state[:, :3], velocity, 0.5), rtol=0, atol=1e-13)
 
 
 class Forecast(nn.Module):
@@ -120,8 +115,7 @@ def test_unicycle_gradients(float64):
 
 
 def test_unicycle_needs_five_dimensions():
-    with pytest.raises(ValueError, match="4 state dimensions"):
-        forecast(UnicycleTransition(still, 0.1), torch.zeros(2, 4))
+    assert_refused(ValueError, "4 state dimensions", forecast, UnicycleTransition(still, 0.1), torch.zeros(2, 4))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
@@ -129,25 +123,13 @@ def test_motion_takes_the_velocities_of_the_analysis_and_the_pose_of_the_last_be
     before, analysis = torch.randn(*batch, 6, 5), torch.randn(*batch, 6, 5)
     td = TensorDict({"belief": {"ensemble": before}, "analysis": {"ensemble": analysis}}, batch)
     out = UnicycleMotion(0.5)(td)["belief"]
-    v, w = analysis[..., 3], analysis[..., 4]
-    x, y, theta = before[..., :3].unbind(-1)
-    angle = theta + 0.25 * w
-    expected = torch.stack([x + 0.5 * v * angle.cos(), y + 0.5 * v * angle.sin(), theta + 0.5 * w, v, w], -1)
+    expected = moved(before[..., :3], analysis[..., 3:], 0.5)
     torch.testing.assert_close(out["ensemble"], expected, rtol=0, atol=1e-14)
     torch.testing.assert_close(out["mean"], expected.mean(-2), rtol=0, atol=1e-14)
     torch.testing.assert_close(out["var"], expected.var(-2), rtol=0, atol=1e-13)
 
 
-def test_motion_of_an_unchanged_forecast_is_the_forecast(float64):
-    # Where the analysis changes nothing, motion and transition agree.
-    state = torch.randn(6, 5)
-    moved = forecast(UnicycleTransition(still, 0.1), state)
-    td = TensorDict({"belief": {"ensemble": state}, "analysis": {"ensemble": moved}})
-    torch.testing.assert_close(UnicycleMotion(0.1)(td)["belief", "ensemble"], moved, rtol=0, atol=1e-15)
-
-
 def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean():
-    torch.manual_seed(0)
     network = StochasticMLP(2, 2)  # untrained: its mean change is anything
     state = torch.randn(3, 16, 5) + torch.tensor([0.0, 0.0, 0.0, 8.0, 0.1])
     outs = {}
@@ -163,40 +145,53 @@ def test_a_transition_without_drift_spreads_the_velocities_and_leaves_their_mean
 
 # -------------------------------------------------------------------------------------- a time step that varies
 
-DTS = torch.tensor([[0.1], [0.2], [0.0], [1.5]], dtype=torch.float64)
+
+def states(**shapes):
+    return TensorDict({name: torch.randn(4, 6, *shape) for name, shape in shapes.items()}, [4])
 
 
-def test_dt_may_be_an_entry_that_varies_over_rows(float64):
-    network, state = nn.Linear(2, 2), torch.randn(4, 6, 5)
-    by_entry = UnicycleTransition(network, "dt", scale=[2.0, 0.1])
-    assert by_entry.in_keys == [("belief", "ensemble"), "dt"]
-    rows = [
-        forecast(UnicycleTransition(network, float(dt), scale=[2.0, 0.1]), x) for dt, x in zip(DTS, state, strict=True)
-    ]
-    torch.testing.assert_close(forecast(by_entry, state, dt=DTS), torch.stack(rows), rtol=0, atol=1e-14)
-    assert not rows[0].allclose(rows[1])
-    with pytest.raises(KeyError, match="UnicycleTransition reads 'dt', which is missing"):
-        forecast(by_entry, state)
+def gaussian(size):
+    root = torch.randn(4, size, size)
+    return {"mean": torch.randn(4, size), "cov": root @ root.mT}
 
 
-def test_dt_may_be_an_entry_beside_a_history(float64):
-    keys = {"history_key": ("belief", "history")}
-    by_entry, state, history = UnicycleTransition(still, "dt", **keys), torch.randn(4, 6, 5), torch.randn(4, 6, 2, 2)
-    rows = [
-        UnicycleTransition(still, float(dt), **keys)(TensorDict({"belief": {"ensemble": x, "history": h}}))[
-            "forecast", "ensemble"
-        ]
-        for dt, x, h in zip(DTS, state, history, strict=True)
-    ]
-    out = by_entry(TensorDict({"belief": {"ensemble": state, "history": history}, "dt": DTS}, [4]))
-    torch.testing.assert_close(out["forecast", "ensemble"], torch.stack(rows), rtol=0, atol=1e-14)
+#: name: (the module for a time step, a number or an entry; what it reads)
+MOVING = {
+    "transition": (
+        lambda dt: UnicycleTransition(nn.Linear(2, 2), dt, scale=[2.0, 0.1]),
+        lambda: {"belief": states(ensemble=[5])},
+    ),
+    "transition with a history": (
+        lambda dt: UnicycleTransition(still, dt, history_key=("belief", "history")),
+        lambda: {"belief": states(ensemble=[5], history=[2, 2])},
+    ),
+    "motion": (UnicycleMotion, lambda: {"belief": states(ensemble=[5]), "analysis": states(ensemble=[5])}),
+    "noise": (
+        lambda dt: UnicycleNoise(ConstantNoise([0.5, 0.1], in_key=("belief", "mean"), out_key=("q", "r")), dt),
+        lambda: {"belief": {"mean": torch.randn(4, 5)}, "forecast": {"mean": torch.randn(4, 5)}},
+    ),
+    "pose": (UnicyclePose, lambda: {"forecast": gaussian(5), "velocity": gaussian(2)}),
+}
 
 
-def test_motion_takes_dt_from_an_entry_that_varies_over_rows(float64):
-    td = TensorDict({"belief": {"ensemble": torch.randn(4, 6, 5)}, "analysis": {"ensemble": torch.randn(4, 6, 5)}}, [4])
-    out = UnicycleMotion("dt")(td.copy().set("dt", DTS))["belief"]
-    rows = torch.stack([UnicycleMotion(float(dt))(row.copy())["belief"] for dt, row in zip(DTS, td, strict=True)])
-    for name in ("ensemble", "mean", "var"):
-        torch.testing.assert_close(out[name], rows[name], rtol=0, atol=1e-14)
-    with pytest.raises(ValueError, match="steps of one length; got dt='dt'"):
-        UnicycleMotion("dt", history_key=("belief", "history"))
+@pytest.mark.parametrize("name", MOVING)
+@pytest.mark.parametrize("key", ["dt", ("clock", "dt")])
+def test_dt_may_be_an_entry_that_varies_over_rows(float64, name, key):
+    make, entries = MOVING[name]
+    td, dts = TensorDict(entries(), [4]), torch.tensor([[0.1], [0.2], [0.0], [1.5]])
+    module = make(key)
+    assert key in module.in_keys
+    out, rows = module(td.copy().set(key, dts)), []
+    for dt, row in zip(dts, td, strict=True):
+        alone = make(float(dt))
+        alone.load_state_dict(module.state_dict())
+        rows.append(alone(row.copy()).select(*module.out_keys))
+    for entry in module.out_keys:
+        torch.testing.assert_close(out[entry], torch.stack(rows)[entry], rtol=0, atol=1e-13)
+    words = f"{type(module).__name__} reads {key!r}, which is missing"
+    assert_refused(KeyError, re.escape(words), module, td)
+
+
+def test_motion_with_a_history_needs_steps_of_one_length():
+    words = "steps of one length; got dt='dt'"
+    assert_refused(ValueError, words, UnicycleMotion, "dt", history_key=("belief", "history"))

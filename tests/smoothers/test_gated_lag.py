@@ -99,7 +99,6 @@ def test_a_gate_of_late_readings_is_as_good_as_a_mask(float64):
 
 
 def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
-    torch.manual_seed(0)
     clean = TensorDict({"observation": torch.randn(4, 200, 2)}, [4, 200])
     options = {"response": "huber", "window": 2, "rate": 2e-3, "freedom": 5.0, "patience": 7, "by_component": True}
     options |= {"adapt_noise": 0.01, "adapt_inflation": 0.02, "gate_prefix": "door"}

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system, stepwise
 from tests.filters.gaussian_for_tests import directional_check, known_process_noise
+from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import COV, MEAN, drive
 from torch_denkf.functional import analyse
 from torch_denkf.functional.smoothing_iterated import iterated_smoothing
@@ -111,7 +112,6 @@ def test_gradients_are_those_of_finite_differences(float64):
 
 
 def test_a_learned_motion_learns(float64):
-    torch.manual_seed(0)
     smoother = IEnKS(
         LearnedTransition(StochasticMLP(2, 2, (8,), layer="none", output_gain=0.5)),
         None,
@@ -153,8 +153,7 @@ def test_compiled_is_eager():
     def smooth(ensemble, reading, noise):
         return iterated_smoothing(ensemble, torch.sin, reading, noise, iterations=2)
 
-    compiled = torch.compile(smooth, fullgraph=True, backend="aot_eager")(*values)
-    assert_close(compiled, smooth(*values), rtol=1e-4, atol=1e-4)
+    assert_compiled_is_eager(smooth, *values, rtol=1e-4, atol=1e-4)
 
 
 def test_what_it_cannot_do_it_says():

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
 from tests.filters.gaussian_for_tests import known_process_noise
+from tests.functional.checks import assert_compiled_is_eager, assert_refused
 from tests.smoothers.joint import COV, MEAN, drive, joint_beliefs
 from torch_denkf.filters import ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -32,24 +33,34 @@ def particles(size, *, control=None, **kwargs):
 
 @pytest.mark.parametrize("lag", [None, 2])
 def test_many_particles_are_the_exact_smoother(float64, lag):
-    """Within five standard errors of as many draws as the fewest particles that ever counted."""
-    frames, size = drive(2, 7), 2000
+    """Within 3.5 standard errors of as many draws as the fewest particles that ever counted."""
+    frames, size = drive(2, 7), 1000
     mean, cov = joint_beliefs(frames, lag)
     with torch.no_grad():
         out = ParticleSmoother(particles(size), lag)(frames.copy())
-        online = FixedLag(particles(size), 2).sequence(frames.copy())
-    std = cov.diagonal(dim1=-2, dim2=-1).sqrt()
-    count = torch.where(out["info", "ess"] > 0, out["info", "ess"], size).amin(1, keepdim=True)  # 0 at a start
-    bound = 5 * std / count.sqrt()
-    assert ((out["smoothed", "mean"] - mean).abs() < bound).all()
-    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 5 * (2 / count).sqrt()).all()
+    std, count = cov.diagonal(dim1=-2, dim2=-1).sqrt(), fewest(out, size)
+    assert ((out["smoothed", "mean"] - mean).abs() < 3.5 * std / count.sqrt()).all()
+    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 3.5 * (2 / count).sqrt()).all()
     far = [((out[kind, "mean"] - mean) / std).square().mean().sqrt() for kind in ("smoothed", "belief")]
     assert far[0] < 0.15 < 0.3 < far[1]
     assert_close(out["smoothed", "log_weight"].exp().sum(-1), torch.ones(2, 7))
-    if lag == 2:  # the ancestors say the same, two steps later
-        age = online["smoothed", "age"].squeeze(-1) == 2
-        now, then = online["smoothed", "mean"][:, 2:][age[:, 2:]], mean[:, :-2][age[:, 2:]]
-        assert ((now - then).abs() < 2 * bound[:, :-2][age[:, 2:]]).all()
+
+
+def test_ancestors_of_many_particles_say_the_same_later(float64):
+    frames, size = drive(2, 7), 2000
+    mean, cov = joint_beliefs(frames, 2)
+    with torch.no_grad():
+        out = FixedLag(particles(size), 2).sequence(frames.copy())
+    bound = 2 * 5 * cov.diagonal(dim1=-2, dim2=-1).sqrt() / fewest(out, size).sqrt()
+    late = out["smoothed", "age"].squeeze(-1)[:, 2:] == 2
+    assert late.any()
+    assert ((out["smoothed", "mean"][:, 2:] - mean[:, :-2]).abs() < bound[:, :-2])[late].all()
+
+
+def fewest(out, size):
+    """How many particles counted at least, in each row."""
+    ess = out["info", "ess"]
+    return torch.where(ess > 0, ess, size).amin(1, keepdim=True)  # 0 at a start
 
 
 def test_backward_weights_are_bayes_rule_on_a_chain(float64):
@@ -58,19 +69,20 @@ def test_backward_weights_are_bayes_rule_on_a_chain(float64):
     moves = torch.randn(2, 3, 3, generator=generator)  # log p(to | from), up to a factor for each destination's place
     first = torch.randn(3, generator=generator).log_softmax(-1)
     likelihood = torch.randn(2, 3, generator=generator)
-    log_weights, prior = [first], first
+    beliefs = [first]
     for move, reading in zip(moves, likelihood, strict=True):
-        prior = (torch.logsumexp(prior.unsqueeze(-1) + move, 0) + reading).log_softmax(-1)
-        log_weights.append(prior)
+        beliefs.append((torch.logsumexp(beliefs[-1].unsqueeze(-1) + move, 0) + reading).log_softmax(-1))
+    log_weights, densities = torch.stack(beliefs), torch.cat([torch.zeros(1, 3, 3), moves])
+    two = (first[:, None] + moves[0] + likelihood[0]).flatten().softmax(0).reshape(3, 3)
     paths = first[:, None, None] + (moves[0] + likelihood[0])[:, :, None] + (moves[1] + likelihood[1])[None]
-    paths = (paths - torch.logsumexp(paths.flatten(), 0)).exp()
+    paths = paths.flatten().softmax(0).reshape(3, 3, 3)
     expected = torch.stack([paths.sum((1, 2)), paths.sum((0, 2)), paths.sum((0, 1))])
-    densities = torch.cat([torch.zeros(1, 3, 3), moves])
-    assert_close(backward_smooth(torch.stack(log_weights), densities).exp(), expected, rtol=0, atol=1e-12)
-    follows = torch.tensor([False, True, False])
-    cut = backward_smooth(torch.stack(log_weights), densities, follows=follows)
-    assert_close(cut[1:], torch.stack(log_weights[1:]), rtol=0, atol=0)
-    assert_close(cut[0], backward_smooth(torch.stack(log_weights[:2]), densities[:2])[0], rtol=0, atol=0)
+    assert_close(backward_smooth(log_weights, densities).exp(), expected, rtol=0, atol=1e-12)
+    of_one = backward_smooth(log_weights, densities, lag=1).exp()
+    assert_close(of_one, torch.stack([two.sum(1), expected[1], expected[2]]), rtol=0, atol=1e-12)
+    cut = backward_smooth(log_weights, densities, follows=torch.tensor([False, True, False]))
+    assert_close(cut[1:], log_weights[1:], rtol=0, atol=0)
+    assert_close(cut[0].exp(), two.sum(1), rtol=0, atol=1e-12)
 
 
 def test_gradients_are_those_of_finite_differences(float64):
@@ -79,10 +91,9 @@ def test_gradients_are_those_of_finite_differences(float64):
 
 
 def test_compiled_is_eager():
-    weights, moves = torch.randn(3, 5, 4).log_softmax(-1), torch.randn(3, 5, 4, 4)
-    for lag in (None, 2):
-        compiled = torch.compile(backward_smooth, fullgraph=True, backend="aot_eager")(weights, moves, lag=lag)
-        assert_close(compiled, backward_smooth(weights, moves, lag=lag), rtol=1e-5, atol=1e-5)
+    weights, moves = torch.randn(3, 3, 4).log_softmax(-1), torch.randn(3, 3, 4, 4)
+    for lag in (None, 1):
+        assert_compiled_is_eager(backward_smooth, weights, moves, lag=lag, rtol=1e-5, atol=1e-5)
 
 
 def test_densities_of_pairs(float64):
@@ -115,8 +126,7 @@ def test_each_step_uses_the_action_that_led_into_it(float64, previous):
 
 
 def test_what_cannot_be_smoothed_says_so():
-    with pytest.raises(TypeError, match="takes a filter with particles"):
-        ParticleSmoother(linear_denkf())
+    assert_refused(TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf())
     F, Q, H, R = linear_system()
     own = ParticleFilter(
         NoisyLinear(F, Q),
@@ -126,8 +136,6 @@ def test_what_cannot_be_smoothed_says_so():
         noise=ConstantNoise(R.sqrt(), in_key="observation"),
         initial=GaussianPrior(MEAN, [1.0, 1.0], ensemble_size=5),
     )
-    with pytest.raises(TypeError, match="density of the motion"):
-        ParticleSmoother(own)
-    with pytest.raises(ValueError, match="picks none"):
-        FixedLag(particles(5, resampling="transport"), 2)
+    assert_refused(TypeError, "density of the motion", ParticleSmoother, own)
+    assert_refused(ValueError, "picks none", FixedLag, particles(5, resampling="transport"), 2)
     assert FixedLag(own, 2).sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))["smoothed", "mean"].ndim == 2

@@ -6,11 +6,12 @@ from torch.testing import assert_close
 
 from tests.filters.factories import linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check, learned_filter, learned_frames, linear_filter
+from tests.functional.checks import assert_compiled_is_eager
 from tests.smoothers.joint import drive, joint_beliefs
 from torch_denkf.functional.smoothing import rts_smooth
 from torch_denkf.smoothers import FixedLag, RTSSmoother
 
-FILTERS = {"Kalman": linear_kalman, **{name: name for name in ("EKF", "UKF", "BackpropKF")}}
+FILTERS = ["Kalman", "EKF", "UKF", "BackpropKF"]
 
 
 def make(name):
@@ -87,13 +88,11 @@ def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
 
 
 def test_compiled_functions_are_the_eager_ones():
-    frames = RTSSmoother(linear_kalman())(drive(2, 5))
+    frames = RTSSmoother(linear_kalman())(drive(2, 5))[:, :3]
     values = [frames["belief", "mean"], frames["belief", "cov"], frames["forecast", "mean"], frames["forecast", "cov"]]
     values.append(frames["belief", "cov"])
-    for lag in (None, 2):
-        eager = rts_smooth(*values, lag=lag)
-        compiled = torch.compile(rts_smooth, fullgraph=True, backend="aot_eager")(*values, lag=lag)
-        assert_close(compiled, eager, rtol=1e-4, atol=1e-4)
+    for lag in (None, 1):
+        assert_compiled_is_eager(rts_smooth, *values, lag=lag, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("batch", [(), (2, 3)])

@@ -1,7 +1,7 @@
 """Environments for tests; importable, so that worker processes find them."""
 
 import torch
-from torchrl.envs import TransformedEnv
+from torchrl.envs import ParallelEnv, Transform, TransformedEnv
 
 from tests.filters.factories import A, M, S, linear_denkf, linear_system, toy_denkf
 from torch_denkf.envs.linear import LinearGaussianEnv
@@ -13,6 +13,25 @@ BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
 STEPS = [3, 5]  # episode lengths of the two (or first two) rows
 
 
+def forked_env(workers, *args, **kwargs):
+    """A ``ParallelEnv`` of copies of this process: workers that need not import anything, which takes seconds."""
+    return ParallelEnv(workers, *args, mp_start_method="fork", **kwargs)
+
+
+class Changed(Transform):
+    """What a function makes of each frame, that of a reset and those of steps."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def _call(self, next_tensordict):
+        return self.change(next_tensordict)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self.change(tensordict_reset)
+
+
 def base_env(**kwargs):
     """The system of :func:`linear_system` as an environment; emits "observation", "observed" and "state"."""
     F, Q, H, R = linear_system()
@@ -22,6 +41,12 @@ def base_env(**kwargs):
 def known_start_filter(**kwargs):
     """A noisy ensemble filter whose prior has no spread: the belief after a reset is known exactly."""
     prior = GaussianPrior(PRIOR_MEAN, [0.0, 0.0], ensemble_size=6)
+    return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
+
+
+def half_known_filter(**kwargs):
+    """An ensemble filter whose prior has a spread in the second component alone."""
+    prior = GaussianPrior(PRIOR_MEAN, [0.0, 1.0], ensemble_size=6)
     return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
 
 

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv, check_env_specs
+from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 
 from tests.filters.factories import assert_equal, linear_kalman, linear_system
 from tests.transforms import envs_for_tests as envs
@@ -22,12 +22,6 @@ FILTERS = {"ensemble": envs.fixed_filter, "Kalman": linear_kalman}
 def lagged_env(name, **kwargs):
     env = TransformedEnv(envs.base_env(**kwargs), DEnKFTransform(FixedLag(FILTERS[name](), LAG)))
     return TransformedEnv(env, InitTracker())
-
-
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("batch", [[], [2]])
-def test_specs(name, batch):
-    check_env_specs(lagged_env(name, batch_size=batch, max_steps=4))
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -51,19 +45,11 @@ def test_a_rollout_is_the_recording_smoothed(float64, name):
     assert (age == LAG).sum() > 5
 
 
-def test_in_workers_and_in_a_collector():
-    make = partial(lagged_env, "ensemble", max_steps=4)
-    parallel = ParallelEnv(2, make)
-    try:
-        check_env_specs(parallel)
-        rollout = parallel.rollout(6, break_when_any_done=False)
-        assert rollout["next", "smoothed", "mean"].shape == (2, 6, 2)
-        assert rollout["smoothed", "age"][0, :, 0].tolist() == [0, 1, 2, 2, 0, 1]
-    finally:
-        parallel.close()
-    collector = Collector(make, frames_per_batch=8, total_frames=8)
+def test_in_a_collector():
+    collector = Collector(partial(lagged_env, "ensemble", max_steps=4), frames_per_batch=8, total_frames=8)
     for data in collector:
         assert data["next", "smoothed", "mean"].isfinite().all()
+        assert data["smoothed", "age"].flatten().tolist() == [0, 1, 2, 2, 0, 1, 2, 2]
     collector.shutdown()
 
 
@@ -86,13 +72,17 @@ def controlled_env(**kwargs):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_past_knows_the_actions_that_led_to_it(workers):
     if workers:
-        env = ParallelEnv(workers, controlled_env, create_env_kwargs=[{"max_steps": 4}, {"max_steps": 7, "seed": 1}])
+        env = envs.forked_env(
+            workers, controlled_env, create_env_kwargs=[{"max_steps": 4}, {"max_steps": 7, "seed": 1}]
+        )
     else:
         env = controlled_env(batch_size=[2], max_steps=[4, 7])
     try:
+        check_env_specs(env)
         rollout = TransformedEnv(env, InitTracker()).rollout(12, break_when_any_done=False)
     finally:
         env.close()
+    assert rollout["smoothed", "age"][0, :6, 0].tolist() == [0, 1, 2, 2, 0, 1]
     frames = rollout.select("observation", "observed", "is_init", "action")
     online = FixedLag(linear_kalman(control=CONTROL), LAG).sequence(frames.copy())
     assert_equal(rollout, online, [*KEYS, ("smoothed", "cov")], atol=1e-4)

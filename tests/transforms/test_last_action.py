@@ -34,7 +34,6 @@ def test_workers_have_their_own():
         return lambda: TransformedEnv(base_env(seed=seed), LastAction())
 
     env = SerialEnv(2, [make(0), make(1)])
-    torch.manual_seed(0)
     rollout = env.rollout(4)
     assert rollout["previous", "action"][:, 1:].equal(rollout["action"][:, :-1])
     assert (rollout["previous", "action"][:, 0] == 0).all()

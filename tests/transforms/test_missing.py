@@ -7,6 +7,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
+from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import MissingFrames
 
@@ -101,10 +102,8 @@ def test_in_a_replay_buffer():
 
 @pytest.mark.parametrize("p", [-0.1, 1.1])
 def test_no_probability(p):
-    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
-        MissingFrames(p)
+    assert_refused(ValueError, r"in \[0, 1\]", MissingFrames, p)
 
 
 def test_missing_key_is_named():
-    with pytest.raises(KeyError, match="'pixels'"):
-        MissingFrames(0.5)(TensorDict({"gps": torch.ones(2)}))
+    assert_refused(KeyError, "'pixels'", MissingFrames(0.5), TensorDict({"gps": torch.ones(2)}))

@@ -1,14 +1,15 @@
 """DEnKFTransform with a packaged step; oracle: the same transform without."""
 
+from functools import partial
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
-from tests.transforms.envs_for_tests import base_env, fixed_filter, random_filter, toy_base_env, toy_filter
+from tests.functional.checks import assert_refused
+from tests.transforms.envs_for_tests import BELIEF, base_env, fixed_filter, random_filter, toy_base_env, toy_filter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.transforms import DEnKFTransform
-
-BELIEF = [("belief", "ensemble"), ("belief", "mean"), ("belief", "var")]
 
 
 def one_step(env, filter, without=()):
@@ -22,10 +23,10 @@ def one_step(env, filter, without=()):
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """Steps of a filter without randomness (for batches [] and [3]) and of one with an action; not compiled: fast."""
+    """Steps of a filter without randomness in a batch and of one with an action alone; not compiled: fast."""
     folder, out = tmp_path_factory.mktemp("packages"), {}
-    cases = {"[]": (base_env, fixed_filter, []), "[3]": (base_env, fixed_filter, [3]), "action": None}
-    cases["action"] = (toy_base_env, lambda: toy_filter(sensor_layer="none", layer="none"), [])
+    plain_toy = partial(toy_filter, sensor_layer="none", layer="none")
+    cases = {"[3]": (base_env, fixed_filter, [3]), "action": (toy_base_env, plain_toy, [])}
     for name, (make_env, make_filter, batch) in cases.items():
         torch.manual_seed(0)
         filter = make_filter()
@@ -48,7 +49,7 @@ def envs(packages, name, **options):
     return out
 
 
-@pytest.mark.parametrize("name", ["[]", "[3]"])
+@pytest.mark.parametrize("name", ["[3]", "action"])
 @pytest.mark.parametrize("store_ensemble", [True, False])
 def test_rollouts_over_resets_are_the_same(packages, name, store_ensemble):
     plain, packaged = envs(packages, name, store_ensemble=store_ensemble)
@@ -85,37 +86,35 @@ def test_the_package_is_what_runs(packages):
     assert not changed["next", "belief", "mean"].allclose(expected["next", "belief", "mean"], atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["[]", "[3]", "action"])
+@pytest.mark.parametrize("name", ["[3]", "action"])
 def test_specs(packages, name):
     check_env_specs(envs(packages, name)[1])
 
 
+def packaged_env(filter, step, batch_size=(), **options):
+    return TransformedEnv(base_env(seed=0, batch_size=batch_size), DEnKFTransform(filter, packaged=step, **options))
+
+
 def test_what_went_wrong_is_said(packages, tmp_path):
-    filter, path, _, _ = packages["[]"]
+    filter, path, _, _ = packages["[3]"]
     step = load_step(path)
     with pytest.raises(KeyError, match="log_likelihood"):
         DEnKFTransform(filter, packaged=step, diagnostics=[("info", "log_likelihood")])
-    with pytest.raises(ValueError, match="records no graph"):
-        DEnKFTransform(filter, packaged=step, no_grad=False)
-    with pytest.raises(
-        ValueError, match=r"must be torch.float32 \[2\], got torch.float32 \[3, 2\]"
-    ):  # batch of three, package of one
-        TransformedEnv(base_env(seed=0, batch_size=[3]), DEnKFTransform(filter, packaged=step)).rollout(2)
-    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=step))
-    start = env.rand_action(env.reset().exclude("belief"))
-    with pytest.raises(KeyError, match="carries the belief"):
-        env.step(start)
+    assert_refused(ValueError, "records no graph", DEnKFTransform, filter, packaged=step, no_grad=False)
+    alone, three = (packaged_env(filter, step, batch_size=batch) for batch in ([], [3]))
+    words = r"must be torch.float32 \[3, 2\], got torch.float32 \[2\]"
+    assert_refused(ValueError, words, alone.rollout, 2)
+    start = three.rand_action(three.reset().exclude("belief"))
+    assert_refused(KeyError, "carries the belief", three.step, start)
 
     blind = export_step(filter, one_step(base_env(seed=0), filter, ["observed"]), tmp_path / "a.pt2", compiled=False)
-    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(blind)))
-    with pytest.raises(ValueError, match="emits 'observed', which the packaged step was exported without"):
-        env.rollout(2)
+    env = packaged_env(filter, load_step(blind))
+    assert_refused(ValueError, "emits 'observed', which the packaged step was exported without", env.rollout, 2)
 
     noisy = random_filter()
     example = noisy.draw_noise(one_step(base_env(seed=0), noisy))
     given = export_step(noisy, example, tmp_path / "b.pt2", compiled=False)
-    with pytest.raises(KeyError, match=r"noise\.transition"):
-        DEnKFTransform(noisy, packaged=load_step(given))
+    assert_refused(KeyError, r"noise\.transition", DEnKFTransform, noisy, packaged=load_step(given))
 
 
 def test_actions_may_be_in_double_precision(packages):
@@ -131,19 +130,13 @@ def test_actions_may_be_in_double_precision(packages):
     torch.testing.assert_close(beliefs[1], beliefs[0], rtol=1e-5, atol=1e-6)
 
 
-def test_nan_is_found(packages):
-    filter, path, _, _ = packages["[]"]
-    env = TransformedEnv(base_env(seed=0), DEnKFTransform(filter, packaged=load_step(path)))
+@pytest.mark.parametrize("check", [True, False])
+def test_nan_is_found_unless_nobody_looks_for_it(packages, check):
+    filter, path, _, _ = packages["[3]"]
+    env = packaged_env(filter, load_step(path), batch_size=[3], check_finite=check)
     td = env.rand_action(env.reset())
     td["belief", "ensemble"][0, 0] = torch.nan
-    with pytest.raises(ValueError, match="the filter diverged"):
-        env.step(td)
-
-
-def test_nan_passes_where_nobody_looks_for_it(packages):
-    filter, path, _, _ = packages["[]"]
-    transform = DEnKFTransform(filter, packaged=load_step(path), check_finite=False)
-    env = TransformedEnv(base_env(seed=0), transform)
-    td = env.rand_action(env.reset())
-    td["belief", "ensemble"][0, 0] = torch.nan
-    assert env.step(td)["next", "belief", "mean"].isnan().any()
+    if check:
+        assert_refused(ValueError, "the filter diverged", env.step, td)
+    else:
+        assert env.step(td)["next", "belief", "mean"].isnan().any()
