@@ -11,10 +11,7 @@ from torchrl.modules.utils import get_env_transforms_from_module
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, KalmanFilter
-from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import LinearTransition, MomentPrior, Select
+from torch_denkf.filters import KalmanFilter
 from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
@@ -165,37 +162,6 @@ def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
     named_loss, plain_loss = (loss(smoother.filter, nll=1.0)(frames) for smoother in (other, plain))
     assert dict(named_loss.items()) == dict(plain_loss.items())
     assert named_loss["loss_nll"] != 0
-
-
-def test_fused_filter_and_a_packaged_step_with_a_prefix(float64, tmp_path):
-    def make(**kwargs):
-        sensors = {"gps": FusedSensor(Select([0]), [0.5], delay=2), "wheel": FusedSensor(Select([1]), [0.3])}
-        motion = LinearTransition(torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2))
-        return FusedFilter(motion, sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)), **kwargs)
-
-    frames = TensorDict({"gps": torch.randn(3, 6, 1), "wheel": torch.randn(3, 6, 1)}, [3, 6])
-    plain, other = make(), make(prefix="base")
-    expected, out = plain.sequence(frames.copy()), other.sequence(frames.copy())
-    for key in plain.out_keys:
-        assert torch.equal(out["base", *key], expected[key])
-    example = other.initialise(frames[:, 0].copy())
-    step = load_step(export_step(other, example, tmp_path / "step.pt2", compiled=False))
-    entries = {".".join(key): example["base", *key] for key in plain.carry_keys}
-    got = step({**entries, "gps": frames["gps"][:, 1], "wheel": frames["wheel"][:, 1]})
-    # A late reading of before the episode: the second element of the sequence is this step.
-    torch.testing.assert_close(got["belief.mean"], expected["belief", "mean"][:, 1])
-
-
-def test_an_ekf_with_a_prefix_compiles(float64):
-    from tests.filters.gaussian_for_tests import linear_filter
-
-    plain, other = linear_filter("EKF"), linear_filter("EKF", prefix="imu")
-    assert isinstance(other, EKF)
-    frames = readings(3, 5)
-    expected = plain.sequence(frames.copy())
-    out = other.compile(chunk=2, backend="eager").sequence(frames.copy())
-    for key in plain.out_keys:
-        torch.testing.assert_close(out["imu", *key], expected[key], rtol=0, atol=1e-12)
 
 
 def test_a_prefix_is_a_name():
