@@ -5,8 +5,6 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 
 from tests.filters.factories import assert_equal, linear_kalman, linear_system, stepwise
 from tests.filters.gaussian_for_tests import (
@@ -21,7 +19,6 @@ from tests.filters.gaussian_for_tests import (
     linear_frames,
     prior,
 )
-from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import (
     AroundState,
@@ -30,7 +27,6 @@ from torch_denkf.modules import (
     GaussianPrior,
 )
 from torch_denkf.objectives import GaussianLoss
-from torch_denkf.transforms import DEnKFTransform
 
 ALL = pytest.mark.parametrize("name", FILTERS)
 
@@ -177,66 +173,7 @@ def test_the_likelihood_finds_the_true_noise(name):
     torch.testing.assert_close(learned[0, 1], Q[0, 1], rtol=0, atol=0.1 * Q.diagonal().prod().sqrt().item())
 
 
-# --------------------------------------------------------------------------------------------- in an environment
-
-
-def base_env(**kwargs):
-    F, Q, H, R = linear_system()
-    control = torch.tensor(CONTROL)
-    return LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), control=control, missing=0.3, **kwargs)
-
-
-@ALL
-def test_in_the_transform(float64, name):
-    filter = linear_filter(name, control=True)
-    env = TransformedEnv(base_env(batch_size=[3], max_steps=[3, 5, 30]), DEnKFTransform(filter, diagnostics=INFO))
-    env.append_transform(InitTracker())
-    check_env_specs(env)
-    rollout = env.rollout(12, break_when_any_done=False)
-    assert rollout["is_init"].sum() > 3, "resets on the way"
-    frames = rollout.select("observation", "observed", "is_init", "action")
-    expected = filter.sequence(frames.copy())
-    assert_equal(rollout, expected, BELIEF, atol=1e-11)
-    # At a reset the belief is the prior, and the other rows keep theirs.
-    start = rollout["is_init"].squeeze(-1)
-    assert (rollout["belief", "mean"][start] == filter.initial.mean).all()
-    assert (rollout["belief", "cov"][start] == filter.initial.cov).all()
-
-
-@ALL
-def test_as_part_of_a_policy(float64, name):
-    filter = linear_filter(name, control=True)
-    gain = TensorDictModule(lambda mean: -0.3 * mean[..., :1], [("belief", "mean")], ["action"])
-    env = TransformedEnv(base_env(batch_size=[2], max_steps=[4, 30]), InitTracker())
-    env.append_transform(filter.make_tensordict_primer())
-    # The action of this step is not known when the filter runs: here it moves the state of the *next* belief.
-    policy = TensorDictSequential(linear_filter(name), gain)
-    rollout = env.rollout(9, policy, break_when_any_done=False)
-    frames = rollout.select("observation", "observed", "is_init")
-    assert_equal(rollout, linear_filter(name).sequence(frames), BELIEF, atol=1e-11)
-
-
-@pytest.mark.parametrize("name", ["EKF", "UKF"])
-def test_copies_and_state_dicts(float64, name, tmp_path):
-    filter, other = learned_filter(name), learned_filter(name)
-    frames = learned_frames(2, 5)
-    expected = filter.sequence(frames.copy())
-    torch.save(filter.state_dict(), tmp_path / "filter.pt")
-    other.load_state_dict(torch.load(tmp_path / "filter.pt"))
-    assert_equal(other.sequence(frames.copy()), expected, BELIEF)
-    torch.save(filter, tmp_path / "whole.pt")
-    whole = torch.load(tmp_path / "whole.pt", weights_only=False)
-    assert_equal(whole.sequence(frames.copy()), expected, BELIEF)
-
-
-@ALL
-def test_compiled_step_equals_eager(name):
-    filter = linear_filter(name, control=True)
-    td = filter.initialise(linear_frames(3, resets=False))
-    eager = filter.step(td.copy())
-    torch.compiler.reset()
-    compiled = torch.compile(filter.step, backend="aot_eager")(td.copy())
-    assert_equal(compiled, eager, BELIEF, atol=1e-5)
+# ---------------------------------------------------------------------------------------------------------- keys
 
 
 @ALL
