@@ -8,7 +8,6 @@ from tests.filters.factories import A, M, S, linear_kalman, toy_denkf
 from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
 from tests.objectives.problem_for_tests import only, problem, stepped
 from torch_denkf.filters import LSTMFilter
-from torch_denkf.modules import Select
 from torch_denkf.objectives import DEnKFLoss, MixtureLoss, SensorLoss, TransitionLoss
 
 
@@ -20,18 +19,6 @@ def test_paper_preset(float64):
     expected = (out["belief", "mean"] - frames["state"]).square().mean(-1)[stepped(frames)].mean()
     torch.testing.assert_close(losses["loss_state"], expected, **CLOSE)
     assert set(DEnKFLoss.paper(filter, sensor=0.0)(frames).keys()) == {"loss_state", "loss_transition"}
-
-
-def test_known_observation_model_gives_the_target(float64):
-    filter = toy_denkf()
-    filter = type(filter)(
-        filter["transition"], filter["sensor"], Select([2, 0]), filter["noise"], initial=filter.initial
-    )
-    frames, out = problem(filter)
-    frames = frames.exclude("target_observation")
-    expected = score_by_hand("crps", out["sensor", "ensemble"], frames["state"][..., [2, 0]])
-    observed = frames["observed"].all(-1)
-    torch.testing.assert_close(DEnKFLoss(filter)(frames)["loss_sensor"], expected[observed].mean(), **CLOSE)
 
 
 def test_set_keys(float64):
@@ -98,16 +85,6 @@ def test_parameters_and_state_are_the_filters():
     assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
     assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
     assert "state_scale" in loss.state_dict()
-
-
-def test_flat_slices(float64):
-    # What a SliceSampler gives: [B * T], is_init at the start of every slice.
-    filter = toy_denkf()
-    frames, _ = problem(filter, batch=(3, 5))
-    loss = DEnKFLoss(filter)
-    expected, out = loss(frames), loss(frames.reshape(15))
-    for key in list(expected.keys()):
-        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-12)
 
 
 def test_errors():

@@ -39,52 +39,6 @@ def mixture_by_hand(out, prefix, truth, std, dims):
     return torch.from_numpy(values)
 
 
-@pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize("dims", [None, [2, 0]])
-def test_mixture_by_hand(learned, dims):
-    filter = toy_filter("soft", learned)
-    frames, out = problem(filter)
-    chosen = range(S) if dims is None else dims
-    std = [0.3, 0.7, 2.0][: len(chosen)]
-    losses = MixtureLoss(filter, component_std=std, transition=0.5, dims=dims)(frames)
-    assert sorted(losses.keys()) == ["loss_state", "loss_transition"]
-    steps = stepped(frames)
-    assert 0 < steps.sum() < steps[..., 1:].numel()
-    for name, prefix, weight in (("state", "belief", 1.0), ("transition", "forecast", 0.5)):
-        expected = mixture_by_hand(out, prefix, frames["state"], std, chosen)[steps].mean()
-        torch.testing.assert_close(losses[f"loss_{name}"], weight * expected, **CLOSE)
-
-
-def test_scales_are_units_of_the_width():
-    filter = toy_filter()
-    frames, out = problem(filter)
-    loss = MixtureLoss(filter, component_std=0.5, state_scale=[0.5, math.inf, 4.0])
-    expected = mixture_by_hand(out, "belief", frames["state"], [0.25, 2.0], [0, 2])[stepped(frames)].mean()
-    torch.testing.assert_close(loss(frames)["loss_state"], expected, **CLOSE)
-    loss = MixtureLoss(filter, component_std=[0.5, 1.0, 0.2], state_scale=[0.5, math.inf, 4.0])
-    expected = mixture_by_hand(out, "belief", frames["state"], [0.25, 0.8], [0, 2])[stepped(frames)].mean()
-    torch.testing.assert_close(loss(frames)["loss_state"], expected, **CLOSE)
-
-
-def test_weighted_crps_is_the_integral_of_the_squared_difference_of_distributions():
-    filter = toy_filter()
-    frames, out = problem(filter, batch=(2, 4))
-    value = MixtureLoss(filter, score="crps", reduction="none")(frames)["loss_state"]
-    grid = torch.linspace(-12, 12, 240_001)
-    steps = stepped(frames)
-    for b, t in steps.nonzero().tolist():
-        particles, weights = out["belief", "ensemble"][b, t], out["belief", "log_weight"][b, t].exp()
-        truth = frames["state"][b, t]
-        assert max(particles.abs().max(), truth.abs().max()) < 12
-        total = 0.0
-        for d in range(S):
-            below = (weights.unsqueeze(-1) * (particles[:, d].unsqueeze(-1) <= grid)).sum(0)
-            total += torch.trapezoid((below - (truth[d] <= grid).double()).square(), grid)
-        # E + 1 jumps, each misplaced by at most half a step of 1e-4.
-        torch.testing.assert_close(value[b, t], total / S, rtol=0, atol=5e-4)
-    assert (value[~steps] == 0).all()
-
-
 def test_members_without_weights_count_alike():
     filter = toy_denkf()
     frames, out = problem(filter)
@@ -151,40 +105,7 @@ def test_angles_wrap(score):
     assert MixtureLoss(filter, score=score, dims=[2, 1], angles=[2])(turned)["loss_state"] > plain + 0.5
 
 
-def test_a_truth_of_fewer_dimensions():
-    filter = toy_filter()
-    frames, _ = problem(filter)
-    expected = MixtureLoss(filter, dims=[0, 1])(frames)["loss_state"]
-    short = frames.copy().set("state", frames["state"][..., :2])
-    assert MixtureLoss(filter)(short)["loss_state"].equal(expected)
-
-
-@pytest.mark.parametrize("reduction", ["none", "sum", "mean"])
-def test_reductions(reduction):
-    filter = toy_filter()
-    frames, out = problem(filter)
-    each = mixture_by_hand(out, "belief", frames["state"], [1.0] * S, range(S))
-    steps = stepped(frames)
-    expected = {"none": torch.where(steps, each, 0.0), "sum": each[steps].sum(), "mean": each[steps].mean()}
-    value = MixtureLoss(filter, reduction=reduction)(frames)["loss_state"]
-    torch.testing.assert_close(value, expected[reduction], **CLOSE)
-
-
 # ------------------------------------------------------------------------------------------------ interface
-
-
-def test_set_keys_and_in_keys():
-    filter = toy_filter()
-    frames, _ = problem(filter)
-    loss = MixtureLoss(filter)
-    expected = loss(frames)["loss_state"]
-    loss.set_keys(state=("truth", "x"))
-    renamed = frames.copy()
-    renamed["truth", "x"] = renamed["state"]
-    assert loss(renamed.exclude("state"))["loss_state"].equal(expected)
-    assert ("truth", "x") in loss.in_keys
-    assert ("truth", "x") not in MixtureLoss(filter, **only(TERMS, "nll")).in_keys
-    assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
 
 
 def test_errors():
