@@ -14,8 +14,6 @@ from tests.filters.factories import (
     toy_denkf,
     toy_frames,
 )
-from tests.filters.gaussian_for_tests import linear_filter
-from tests.filters.particle_for_tests import bootstrap
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.modules import (
     EnsembleAnalysis,
@@ -91,26 +89,6 @@ def test_marks_in_a_group_of_agents_reset_the_belief(float64, mark):
 
 
 # ------------------------------------------------------------------------------------------------ no rows, no steps
-
-
-@pytest.mark.parametrize("scheme", ["sensor", "perturbed", "etkf", "sakov"])
-@pytest.mark.parametrize("members", [2, 8])
-def test_no_rows(scheme, members):
-    filter = toy_denkf(scheme, ensemble_size=members, action=False)
-    frames = toy_frames((0, 4))
-    assert filter.sequence(frames)[MEAN].shape == (0, 4, 3)
-    step = filter.step(filter.initialise(toy_frames((0,), resets=False)))
-    assert step[ENSEMBLE].shape == (0, members, 3)
-
-
-@pytest.mark.parametrize(
-    "make", [linear_kalman, lambda: bootstrap(5), lambda: linear_filter("EKF"), lambda: linear_filter("UKF")]
-)
-def test_no_rows_of_other_filters(make):
-    frames = TensorDict(
-        {"observation": torch.randn(0, 4, 2), "observed": torch.ones(0, 4, 2, dtype=torch.bool)}, [0, 4]
-    )
-    assert make().sequence(frames)[MEAN].shape == (0, 4, 2)
 
 
 def test_no_steps_are_refused():

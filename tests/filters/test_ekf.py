@@ -17,6 +17,7 @@ from tests.filters.gaussian_for_tests import (
     learned_frames,
     linear_filter,
     linear_frames,
+    minimise,
     prior,
 )
 from torch_denkf.filters import LSTMFilter
@@ -156,15 +157,7 @@ def test_the_likelihood_finds_the_true_noise(name):
     r = ConstantNoise([1.0, 0.4], trainable=True, in_key="observation")
     filter = linear_filter(name, process_noise=q, noise=r)
     loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
-    optimiser = torch.optim.LBFGS(filter.parameters(), max_iter=20, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimiser.zero_grad()
-        value = loss(frames)["loss_nll"]
-        value.backward()
-        return value
-
-    before, after = optimiser.step(closure), closure()
+    before, after = minimise(loss, frames, filter.parameters(), 20)
     assert after < before
     learned = q(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"].detach()
     # 40,000 readings would tell one variance to sqrt(2 / 40,000) = 0.7 %; Q and R share them: 1 % and 4 % over seeds.

@@ -12,9 +12,11 @@ from tests.filters.factories import (
     linear_denkf,
     linear_kalman,
     linear_system,
+    linear_with,
 )
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.filters.particle_for_tests import bootstrap
+from tests.filters.test_several_analyses import reads
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.modules import ConstantNoise, FromSensor, GaussianPrior, LinearObservation
@@ -73,7 +75,6 @@ def test_a_prediction_does_not_resample_and_leaves_the_mask_alone(float64, obser
 
 def test_only_readings_are_left_out_of_a_prediction(float64):
     F, *_ = linear_system()
-    plain = linear_denkf()
 
     class Wind(NoisyLinear):
         def __init__(self):
@@ -83,11 +84,7 @@ def test_only_readings_are_left_out_of_a_prediction(float64):
         def compute(self, ensemble, wind, *, noise):
             return ensemble + wind.unsqueeze(-2)
 
-    names = ("noise", "observation", "analysis")
-    filter = Filter(
-        {"transition": plain["transition"], "wind": Wind(), **{name: plain[name] for name in names}},
-        initial=plain.initial,
-    )
+    filter = linear_with({"transition": NoisyLinear(F), "wind": Wind()})
     assert filter.structure.readings == ("observation",)
     td = filter.initialise(TensorDict({"wind": torch.tensor([3.0, -1.0])}))
     moved = td[MEAN] @ F.mT + td["wind"]
@@ -110,11 +107,6 @@ def test_a_filter_under_vmap_is_the_filter_row_by_row(float64):
 
 
 def test_one_of_two_sensors_may_be_missing(float64):
-    plain = linear_denkf()
-
-    def reads(parts):
-        return Filter({"transition": plain["transition"], **parts}, initial=plain.initial)
-
     both = reads({**parts_of_reading(0, "forecast", "mid"), **parts_of_reading(1, "mid", "belief")})
     td = both.initialise(TensorDict({"y0": torch.randn(1), "y1": torch.randn(1)}))
     for missing, kept in (("y0", 1), ("y1", 0)):

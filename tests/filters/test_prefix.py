@@ -9,9 +9,8 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.factories import linear_denkf, linear_kalman, random_walk
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from torch_denkf.filters import KalmanFilter
 from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
@@ -52,12 +51,6 @@ def test_a_prefix_changes_names_and_nothing_else(float64, name):
         torch.testing.assert_close(own["imu", *key], step[key], rtol=0, atol=1e-12)
 
 
-def walk(**kwargs):
-    """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
-    one = torch.eye(1)
-    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
-
-
 def by_hand(readings, q=0.25, r=1.0):
     """A scalar Kalman filter ``[T]``; the first element is its prior."""
     means, m, p = [0.0], 0.0, 1.0
@@ -79,7 +72,7 @@ def frames_of(first, second):
 def test_two_filters_of_one_environment(float64, way):
     torch.manual_seed(0)
     frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
-    filters = [walk(observation_key="first"), walk(observation_key="second", prefix="imu")]
+    filters = [random_walk(observation_key="first"), random_walk(observation_key="second", prefix="imu")]
     env = ReplayedFrames(frames)
     if way == "transforms":
         for filter in filters:
@@ -105,7 +98,7 @@ def test_two_filters_of_one_environment(float64, way):
 @pytest.mark.parametrize("way", ["transforms", "policy"])
 def test_two_filters_of_one_name_are_refused(way):
     frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
-    filters = [walk(observation_key="first"), walk(observation_key="second")]
+    filters = [random_walk(observation_key="first"), random_walk(observation_key="second")]
     if way == "transforms":
         env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filters[0]))
         with pytest.raises(ValueError, match=r"emits \('belief', 'mean'\) already.*prefix="):
@@ -117,7 +110,7 @@ def test_two_filters_of_one_name_are_refused(way):
 
 
 def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
-    one, two = walk(), walk()
+    one, two = random_walk(), random_walk()
     row = TensorDict({"observation": torch.ones(1)}, [])
     row = one(row.set(("previous", *MEAN), torch.zeros(1)).set(("previous", "belief", "cov"), torch.eye(1)))
     following = row["next"].set("observation", torch.ones(1))
@@ -128,7 +121,7 @@ def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
 def test_the_belief_of_one_is_the_reading_of_another(float64):
     torch.manual_seed(0)
     reading = torch.randn(2, 8, 1)
-    first, second = walk(prefix="inner"), walk(observation_key=("inner", *MEAN))
+    first, second = random_walk(prefix="inner"), random_walk(observation_key=("inner", *MEAN))
     out = TensorDictSequential(first, second)
     data = TensorDict({"observation": reading}, [2, 8])
     with set_recurrent_mode(True):
@@ -166,11 +159,11 @@ def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
 
 def test_a_prefix_is_a_name():
     with pytest.raises(TypeError, match="prefix of KalmanFilter is a name"):
-        walk(prefix=3)
+        random_walk(prefix=3)
 
 
 def test_foreign_modules_read_what_stands_under_a_prefix():
-    filter = walk(prefix="imu")
+    filter = random_walk(prefix="imu")
     double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])
     data = TensorDict({"observation": torch.ones(4, 1)}, [4])
     with set_recurrent_mode(True):
