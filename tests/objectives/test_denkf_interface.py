@@ -4,10 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import A, M, S, linear_kalman, toy_denkf
-from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
-from tests.objectives.problem_for_tests import only, problem, stepped
-from torch_denkf.filters import LSTMFilter
+from tests.filters.factories import A, M, S, toy_denkf
+from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
+from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.objectives import DEnKFLoss, MixtureLoss, SensorLoss, TransitionLoss
 
 
@@ -85,26 +84,3 @@ def test_parameters_and_state_are_the_filters():
     assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
     assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
     assert "state_scale" in loss.state_dict()
-
-
-def test_errors():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    with pytest.raises(ValueError, match="'nll'"):
-        DEnKFLoss(filter, score="nll")
-    with pytest.raises(KeyError, match=r"DEnKFLoss reads .*state.*set_keys"):
-        DEnKFLoss(filter)(frames.exclude("state"))
-    with pytest.raises(KeyError, match="'target_observation'"):
-        DEnKFLoss(filter)(frames.exclude("target_observation"))
-    with pytest.raises(KeyError, match="target_observation"):
-        DEnKFLoss(filter, **only(TERMS, "observation"))(frames.exclude("target_observation"))
-    td = TensorDict({"observation": torch.randn(4, 2), "state": torch.randn(4, 2)}, [4])
-    lstm = LSTMFilter(None, state_dim=2, observation_dim=2, observation_key="observation")
-    with pytest.raises(KeyError, match="no observation model"):
-        DEnKFLoss(lstm, **only(TERMS, "sensor"))(td)
-    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing"):
-        DEnKFLoss(linear_kalman(), **only(TERMS, "sensor"))(td)
-    with pytest.raises(KeyError, match="measurement"):
-        DEnKFLoss(filter)(frames.exclude("measurement"))
-    with pytest.raises(AttributeError, match="set_keys"):
-        DEnKFLoss(filter).in_keys = ["state"]

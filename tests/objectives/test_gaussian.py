@@ -111,17 +111,3 @@ def test_all_terms_train_all_parts(name, score):
     for parameter_name, parameter in filter.named_parameters():
         assert parameter.grad is not None, parameter_name
         assert parameter.grad.isfinite().all(), parameter_name
-
-
-def test_errors_say_what_to_do():
-    filter = linear_kalman()
-    with pytest.raises(ValueError, match='"crps", "nll" or "mse"'):
-        GaussianLoss(filter, score="energy")
-    with pytest.raises(ValueError, match=r"one entry for each of dims=\[0, 1\]; got 5"):
-        GaussianLoss(filter, dims=[0, 1], state_scale=[1.0] * 5)
-    assert GaussianLoss(filter)(frames_with_state()).get("loss_sensor", None) is None, "left out: there is no sensor"
-    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\).*set the weight sensor=0\.0"):
-        GaussianLoss(filter, sensor=1.0)(frames_with_state())
-    frames = learned_frames(2, 3).set("state", torch.randn(2, 3, 3))
-    with pytest.raises(KeyError, match=r"set_keys\(target_observation=\.\.\.\)"):
-        GaussianLoss(learned_filter("EKF"))(frames)

@@ -106,20 +106,3 @@ def test_angles_wrap(score):
 
 
 # ------------------------------------------------------------------------------------------------ interface
-
-
-def test_errors():
-    filter = toy_filter()
-    frames, _ = problem(filter)
-    with pytest.raises(ValueError, match="'mse'"):
-        MixtureLoss(filter, score="mse")
-    with pytest.raises(ValueError, match="component_std is the width"):
-        MixtureLoss(filter, component_std=[1.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="component_std has one entry"):
-        MixtureLoss(filter, component_std=[1.0, 1.0, 1.0], dims=[0, 1])
-    with pytest.raises(ValueError, match="state_scale has one entry"):
-        MixtureLoss(filter, state_scale=[1.0], dims=[0, 1])
-    with pytest.raises(KeyError, match=r"MixtureLoss reads 'state'.*set_keys"):
-        MixtureLoss(filter)(frames.exclude("state"))
-    with pytest.raises(KeyError, match="target_observation"):
-        MixtureLoss(filter, sensor=1.0)(frames.exclude("target_observation"))

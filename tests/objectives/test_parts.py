@@ -252,18 +252,3 @@ def test_particles_start_with_equal_weights():
     filter = toy_filter("soft")
     frames, _ = problem(filter, resets=False)
     check_gradient(TransitionLoss(filter), frames, filter, [filter["transition"]])
-
-
-def test_errors():
-    with pytest.raises(ValueError, match='"crps", "energy" or "mse"'):
-        TransitionLoss(toy_denkf(), score="nll")
-    with pytest.raises(ValueError, match='"crps", "nll" or "mse"'):
-        TransitionLoss(linear_kalman(), score="energy")
-    with pytest.raises(ValueError, match="not negative"):
-        TransitionLoss(linear_kalman(), spread=-1.0)
-    with pytest.raises(ValueError, match="Name the prefix"):
-        TransitionLoss(linear_kalman(), belief="analysis")
-    with pytest.raises(ValueError, match="two times"):
-        TransitionLoss(linear_kalman())(problem(toy_denkf())[0][0, 0])
-    with pytest.raises(KeyError, match="'state', which is missing"):
-        TransitionLoss(linear_kalman())(learned_frames(2, 3))
