@@ -5,9 +5,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import linear_system
-from tests.filters.gaussian_for_tests import linear_filter, linear_frames, minimise, prior
+from tests.filters.gaussian_for_tests import minimise, prior
 from torch_denkf.filters import BackpropKF
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.modules import CholeskyNoise, DiagonalNoise
@@ -93,10 +92,3 @@ def test_the_motion_is_learned_where_it_is_trainable():
     parameters = [filter["transition"].matrix, *filter["noise"].parameters()]
     minimise(loss, frames, parameters, 25)
     torch.testing.assert_close(filter["transition"].matrix.detach(), F, rtol=0, atol=0.05)
-
-
-def test_a_reading_that_is_an_angle_counts_modulo_a_turn(float64):
-    filter, frames = linear_filter("BackpropKF", angles=[0]), linear_frames(3, 9)
-    expected = filter.sequence(frames.copy())
-    frames["observation"][..., 0] += 2 * torch.pi * torch.randint(-2, 3, (3, 9))
-    close(filter.sequence(frames), expected, filter.belief_keys)

@@ -56,15 +56,6 @@ def test_actions_move_the_mean_alone(float64, name):
 
 
 @ALL
-def test_a_missing_reading_still_lets_the_covariance_grow(float64, name):
-    F, Q, *_ = linear_system()
-    out = linear_filter(name).sequence(linear_frames(10, missing=1.0, resets=False))
-    cov = out["belief", "cov"]
-    torch.testing.assert_close(cov[1:], F @ cov[:-1] @ F.mT + Q, rtol=0, atol=1e-12)
-    assert (out["info", "log_likelihood"] == 0).all()
-
-
-@ALL
 @pytest.mark.parametrize("update_at_reset", [False, True])
 def test_step_equals_sequence(float64, name, update_at_reset):
     filter = learned_filter(name, update_at_reset=update_at_reset)

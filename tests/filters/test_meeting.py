@@ -319,6 +319,7 @@ def test_a_sensor_that_is_none_is_named_as_the_sensor():
         ({"observation_key": ()}, "observation_key of KalmanFilter is a key"),
         ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
         ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
+        ({"prefix": 3}, "prefix of KalmanFilter is a name"),
         ({"reject": "yes"}, "reject of KalmanFilter is True or False"),
         ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
         ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),

@@ -157,11 +157,6 @@ def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
     assert named_loss["loss_nll"] != 0
 
 
-def test_a_prefix_is_a_name():
-    with pytest.raises(TypeError, match="prefix of KalmanFilter is a name"):
-        random_walk(prefix=3)
-
-
 def test_foreign_modules_read_what_stands_under_a_prefix():
     filter = random_walk(prefix="imu")
     double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])

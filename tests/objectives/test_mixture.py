@@ -89,20 +89,4 @@ def test_a_known_observation_needs_no_target():
     torch.testing.assert_close(loss(frames)["loss_sensor"], expected, **CLOSE)
 
 
-@pytest.mark.parametrize("score", ["mixture", "crps"])
-def test_angles_wrap(score):
-    filter = toy_filter()
-    frames, out = problem(filter)
-    # Near the middle of the particles: no error exceeds pi.
-    ensemble = out["belief", "ensemble"].detach()
-    frames["state"] = (ensemble.amax(-2) + ensemble.amin(-2)) / 2
-    assert (out["belief", "ensemble"] - frames["state"].unsqueeze(-2)).abs().max() < math.pi
-    plain = MixtureLoss(filter, score=score, dims=[2, 1])(frames)["loss_state"]
-    turned = frames.clone()
-    turned["state"][..., 1] += 2 * math.pi * torch.randint(-3, 4, (2, 7))
-    wrapped = MixtureLoss(filter, score=score, dims=[2, 1], angles=[1])(turned)["loss_state"]
-    torch.testing.assert_close(wrapped, plain, rtol=1e-9, atol=1e-12)
-    assert MixtureLoss(filter, score=score, dims=[2, 1], angles=[2])(turned)["loss_state"] > plain + 0.5
-
-
 # ------------------------------------------------------------------------------------------------ interface

@@ -118,21 +118,6 @@ def test_a_full_covariance_of_the_noise():
     torch.testing.assert_close(losses["loss_sensor"], whole["loss_sensor"], **CLOSE)
 
 
-def test_angles_of_the_observation_wrap():
-    filter = toy_denkf()
-    frames, out = problem(filter)
-    frames["target_observation"] = out["sensor", "ensemble"][..., 0, :].detach() + 0.1
-    turned = frames.clone()
-    turned["target_observation"][..., 1] += 2 * math.pi
-    for loss in (SensorLoss, ObservationLoss):
-        before = sum(loss(filter, observation_angles=[1])(frames).values())
-        after = sum(loss(filter, observation_angles=[1])(turned).values())
-        torch.testing.assert_close(after, before)
-        assert (sum(loss(filter)(turned).values()) - before).abs() > 1
-    whole = DEnKFLoss(filter, **only(TERMS, "sensor"), observation_angles=[1])(turned)["loss_sensor"]
-    torch.testing.assert_close(whole, SensorLoss(filter)(frames)["loss_sensor"])
-
-
 # ----------------------------------------------------------------------------------------------- observation
 
 
