@@ -307,11 +307,13 @@ BOTH = {**ANGLES, "observation_angles": [0]}
 SAMPLED = ensemble("sensor", "samples")  # a filter whose sensor draws samples
 
 LOSSES = {
-    **{f"DEnKFLoss, {score}": (DEnKFLoss, SAMPLED, {**BOTH, "score": score}) for score in ("crps", "mse")},
+    **{f"DEnKFLoss, {score}": (DEnKFLoss, SAMPLED, {**BOTH, "score": score}) for score in ("crps", "energy", "mse")},
     "DEnKFLoss, nll": (DEnKFLoss, SAMPLED, {**BOTH, "nll": 1.0, "observation": 1.0}),
     **{f"GaussianLoss, {score}": (GaussianLoss, gaussian(EKF), {**BOTH, "score": score}) for score in ("crps", "nll")},
     "GaussianLoss, dims": (GaussianLoss, gaussian(UKF), {**BOTH, "dims": [1, 0]}),
-    "MixtureLoss": (MixtureLoss, particles(), ANGLES),
+    **{
+        f"MixtureLoss, {score}": (MixtureLoss, particles(), {**ANGLES, "score": score}) for score in ("mixture", "crps")
+    },
     "TransitionLoss": (TransitionLoss, SAMPLED, ANGLES),
     "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), ANGLES),
     "SensorLoss": (SensorLoss, SAMPLED, {"observation_angles": [0]}),

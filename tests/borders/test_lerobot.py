@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.borders.test_constructors import refused
 from tests.data.lerobot.lerobot_folder import FPS, SIZE, joints, write_info, write_version_2, write_version_3
 from tests.data.lerobot.test_errors import edit_table
 from torch_denkf.data import LeRobotReplay
@@ -29,11 +30,8 @@ def root(tmp_path):
     return tmp_path
 
 
-def refuses(root, *words, error=ValueError):
-    with pytest.raises(error, match=re.escape(words[0])) as caught:
-        open_all(root)
-    missing = [word for word in words if word not in str(caught.value)]
-    assert not missing, str(caught.value)
+def refuses(root, *words):
+    refused(lambda: open_all(root), *words)
 
 
 def edit_info(root, **changes):

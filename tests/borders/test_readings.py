@@ -215,7 +215,12 @@ def test_readings_that_no_step_uses_may_be_anything(name):
         env.step(env.rand_action(td))
 
 
-@pytest.mark.parametrize("name", ["Kalman", "etkf", "sensor", "systematic", "LSTM"])
+def some(*names, slow):
+    """Of each kind of belief one traced here, in one way or the other; the rest with the slow tests."""
+    return pytest.mark.parametrize("name", [*names, *(pytest.param(name, marks=pytest.mark.slow) for name in slow)])
+
+
+@some("sensor", "Kalman", slow=["etkf", "systematic", "LSTM"])
 def test_compiled_steps_and_sequences(name):
     """Through dynamo: one graph without a branch."""
     _, spoiled, _ = frames_of(name, 3, 6)
@@ -231,7 +236,7 @@ def test_compiled_steps_and_sequences(name):
     assert filter.step(td.update(spoiled[:, 1]))[REJECTED].equal(got[REJECTED][:, 1])
 
 
-@pytest.mark.parametrize("name", ["Kalman", "etkf", "sensor", "systematic", "transport", "LSTM"])
+@some("systematic", "LSTM", slow=["Kalman", "etkf", "sensor", "transport"])
 def test_packaged_steps(name, tmp_path):
     _, spoiled, count = frames_of(name, 3, 6)
     filter = make(name, reject=True)

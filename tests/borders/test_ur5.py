@@ -1,7 +1,6 @@
 """Damaged collections of UR5 demos: refused by file and line."""
 
 import json
-import re
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
+from tests.borders.test_constructors import refused
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.applications.ur5.data.files import COMMAND, MANIFEST, read_manifest, write_demo, write_manifest
 
@@ -22,10 +22,7 @@ def root(tmp_path):
 
 
 def refuses(root, *words):
-    with pytest.raises(ValueError, match=re.escape(words[0])) as caught:
-        open_all(root)
-    missing = [word for word in (*words, COMMAND) if word not in str(caught.value)]
-    assert not missing, str(caught.value)
+    refused(lambda: open_all(root), *words, COMMAND)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

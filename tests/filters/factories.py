@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.inductor import need_compiler
 from torch_denkf.modules import EnsembleAnalysis, GaussianPrior, StochasticMLP, SubModel
@@ -126,6 +126,20 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
         initial=FixedEnsemble(members) if initial is None else initial,
         **kwargs,
     )
+
+
+def linear_with(modules, *, analysis=None, initial=None, **options):
+    """The filter of :func:`linear_denkf` behind other modules, some of them in the place of its own of that name."""
+    plain = linear_denkf()
+    parts = {**modules, **{name: plain[name] for name in ("noise", "transition", "observation") if name not in modules}}
+    parts.setdefault("analysis", plain["analysis"] if analysis is None else analysis)
+    return Filter(parts, initial=plain.initial if initial is None else initial, **options)
+
+
+def random_walk(**kwargs):
+    """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
+    one = torch.eye(1)
+    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
 
 
 def assert_equal(first, second, keys, *, atol=0.0):

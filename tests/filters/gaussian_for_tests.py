@@ -90,6 +90,19 @@ def learned_frames(*batch):
     return frames
 
 
+def minimise(loss, frames, parameters, max_iter):
+    """By L-BFGS; the loss before and after."""
+    optimiser = torch.optim.LBFGS(list(parameters), max_iter=max_iter, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimiser.zero_grad()
+        value = sum(loss(frames).values())
+        value.backward()
+        return value
+
+    return optimiser.step(closure), closure()
+
+
 def directional_check(loss, parameters, *, step=1e-5, rtol=1e-5):
     """The gradient along one random direction in all parameters, against a central difference; all must matter."""
     parameters = list(parameters)

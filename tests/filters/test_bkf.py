@@ -5,9 +5,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import linear_system
-from tests.filters.gaussian_for_tests import linear_filter, linear_frames, prior
+from tests.filters.gaussian_for_tests import minimise, prior
 from torch_denkf.filters import BackpropKF
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.modules import CholeskyNoise, DiagonalNoise
@@ -44,15 +43,7 @@ def test_the_sensor_and_its_noise_are_learned_through_the_filter():
     filter = make_filter()
     # The likelihood of the innovation says nothing about the units of a sensor: the true state must.
     loss = GaussianLoss(filter, score="nll", transition=0.0, sensor=0.0)
-    optimiser = torch.optim.LBFGS(filter.parameters(), max_iter=40, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimiser.zero_grad()
-        value = sum(loss(frames).values())
-        value.backward()
-        return value
-
-    optimiser.step(closure)
+    minimise(loss, frames, filter.parameters(), 40)
     linear = filter["sensor"].module
     torch.testing.assert_close(linear.weight[:, :2].detach(), 0.5 * torch.eye(2), rtol=0, atol=0.02)
     torch.testing.assert_close(linear.bias.detach(), torch.tensor([-0.5, -0.5]), rtol=0, atol=0.05)
@@ -99,20 +90,5 @@ def test_the_motion_is_learned_where_it_is_trainable():
         filter["sensor"].module.bias.fill_(-0.5)
     loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
     parameters = [filter["transition"].matrix, *filter["noise"].parameters()]
-    optimiser = torch.optim.LBFGS(parameters, max_iter=25, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimiser.zero_grad()
-        value = loss(frames)["loss_nll"]
-        value.backward()
-        return value
-
-    optimiser.step(closure)
+    minimise(loss, frames, parameters, 25)
     torch.testing.assert_close(filter["transition"].matrix.detach(), F, rtol=0, atol=0.05)
-
-
-def test_a_reading_that_is_an_angle_counts_modulo_a_turn(float64):
-    filter, frames = linear_filter("BackpropKF", angles=[0]), linear_frames(3, 9)
-    expected = filter.sequence(frames.copy())
-    frames["observation"][..., 0] += 2 * torch.pi * torch.randint(-2, 3, (3, 9))
-    close(filter.sequence(frames), expected, filter.belief_keys)

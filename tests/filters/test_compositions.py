@@ -11,8 +11,9 @@ from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import FEATURES, B, E, ReplayedFrames, S, T, compose, frames_for
-from tests.filters.factories import NoisyLinear, linear_kalman, linear_system
-from torch_denkf.filters import Filter, KalmanFilter
+from tests.filters.factories import NoisyLinear, linear_kalman, linear_system, stepwise
+from tests.filters.two_readings_for_tests import parts_of_reading
+from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -25,18 +26,13 @@ from torch_denkf.transforms import DEnKFTransform
 BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
 PAIRS = [pair for pair in combinations(FEATURES, 2) if set(pair) != {"flipout", "dropout"}]
 every_pair = pytest.mark.parametrize("features", PAIRS, ids=" + ".join)
-#: Each feature once. To trace a composition takes dynamo ten seconds; `make test-all` traces all pairs.
-TRACED = [
-    ("two sensors", "two analyses"),
-    ("mask on one", "dropout"),
-    ("flipout", "actions"),
-    ("extra outputs", "foreign module"),
-    ("stored carry", "resets"),
-]
-some_pairs = pytest.mark.parametrize(
+#: To trace a composition takes dynamo ten seconds: all features at once, and every pair with `make test-all`.
+#: Networks with dropout in place of flipout are traced in test_sequence.py and test_compiled.py.
+ALL = tuple(feature for feature in FEATURES if feature != "dropout")
+all_at_once = pytest.mark.parametrize(
     "features",
-    [pair if pair in TRACED else pytest.param(pair, marks=pytest.mark.slow) for pair in PAIRS],
-    ids=" + ".join,
+    [ALL, *(pytest.param(pair, marks=pytest.mark.slow) for pair in PAIRS)],
+    ids=lambda features: "all" if features == ALL else " + ".join(features),
 )
 
 
@@ -85,7 +81,7 @@ def with_carry(frames, beliefs):
     return frames.copy().set(BELIEF[0], beliefs[BELIEF[0]])
 
 
-@some_pairs
+@all_at_once
 def test_compiled_is_eager(float64, features):
     filter, frames, carry = prepared(features)
     data = frames if carry is None else with_carry(frames, stepped(filter, frames, carry))
@@ -187,69 +183,6 @@ def deterministic(features):
 # ---------------------------------------------------------------------------------- in distribution, under fresh noise
 
 
-def two_readings(scheme, size=20_000):
-    """A scalar random walk, seen by two sensors, one analysis after the other."""
-    one = torch.eye(1)
-    return Filter(
-        {
-            "transition": NoisyLinear(one, one),
-            "r1": ConstantNoise([1.0], in_key="first", out_key=("first_noise")),
-            "r2": ConstantNoise([1.0], in_key="second", out_key=("second_noise")),
-            "h1": LinearObservation(one, out_key="first_predicted"),
-            "analysis1": EnsembleAnalysis(
-                scheme,
-                predicted_key="first_predicted",
-                observation_key="first",
-                noise_variance_key="first_noise",
-                belief_prefix="mid",
-            ),
-            "h2": LinearObservation(one, in_key=("mid", "ensemble"), out_key="second_predicted"),
-            "analysis2": EnsembleAnalysis(
-                scheme,
-                forecast_key=("mid", "ensemble"),
-                predicted_key="second_predicted",
-                observation_key="second",
-                noise_variance_key="second_noise",
-            ),
-        },
-        initial=GaussianPrior([0.0], [1.0], ensemble_size=size),
-    )
-
-
-def test_the_pairs_that_are_traced_hold_each_feature():
-    assert sorted(feature for pair in TRACED for feature in pair) == sorted(FEATURES)
-    assert set(TRACED) <= set(PAIRS)
-
-
-@pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
-@pytest.mark.parametrize("way", ["step", "sequence", "compiled"])
-def test_two_analyses_are_the_kalman_filter_of_both_readings(float64, scheme, way):
-    torch.manual_seed(0)
-    filter, one = two_readings(scheme), torch.eye(1)
-    kalman = KalmanFilter(
-        one, torch.ones(2, 1), process_noise_cov=one, noise_cov=torch.eye(2), mean=torch.zeros(1), cov=one
-    )
-    frames = TensorDict({"first": torch.randn(4, 1), "second": torch.randn(4, 1)}, [4])
-    exact = kalman.sequence(frames.copy().set("observation", torch.cat([frames["first"], frames["second"]], -1)))
-    if way == "compiled":
-        filter.compile(chunk=3, backend="eager")
-    if way == "step":
-        row, rows = filter.initialise(frames[0].copy()), []
-        for t in range(1, 4):
-            row = filter.step(row.update(frames[t]))
-            rows.append(row.copy())
-        out = torch.stack(rows)
-    else:
-        out = filter.sequence(frames.copy())[1:]
-    # Five standard errors of 20,000 members: 5 / sqrt(E) of the mean's, 5 sqrt(2 / E) of the variance's scale.
-    torch.testing.assert_close(out["belief", "mean"], exact["belief", "mean"][1:], rtol=0, atol=0.05)
-    torch.testing.assert_close(out["belief", "var"], exact["belief", "var"][1:], rtol=0.06, atol=0)
-    likelihood = sum(out[key] for key in filter.log_likelihood_keys)
-    torch.testing.assert_close(likelihood, exact["info", "log_likelihood"][1:], rtol=0, atol=0.1)
-    own = [out["info", name, "log_likelihood"] for name in ("analysis1", "analysis2")]
-    torch.testing.assert_close(own[0] + own[1], out["info", "log_likelihood"])
-
-
 @pytest.mark.parametrize("way", ["step", "sequence"])
 def test_two_sensors_draw_their_own_noise(way):
     torch.manual_seed(0)
@@ -278,26 +211,16 @@ def test_two_sensors_draw_their_own_noise(way):
     assert torch.corrcoef(torch.stack(samples))[0, 1].abs() < 5 / 1500**0.5
 
 
-def test_large_ensemble_with_everything_is_the_kalman_filter(float64):
-    torch.manual_seed(0)
-    F, Q, H, R = linear_system()
+@pytest.mark.parametrize("scheme", ["perturbed", "etkf"])
+@pytest.mark.parametrize("way", ["step", "sequence"])
+def test_two_analyses_are_the_kalman_filter_of_both_readings(float64, scheme, way):
+    """One reading after the other, each with a mask of its own, and resets."""
+    F, Q, *_ = linear_system()
     kalman = linear_kalman()
-    half = lambda index: {  # noqa: E731
-        "predicted_key": f"p{index}",
-        "observation_key": f"y{index}",
-        "noise_variance_key": f"r{index}",
-        "observed_key": f"seen{index}",
-    }
+    first = parts_of_reading(0, "forecast", "mid", scheme, observed_key="seen0")
+    second = parts_of_reading(1, "mid", "belief", scheme, observed_key="seen1")
     filter = Filter(
-        {
-            "transition": NoisyLinear(F, torch.linalg.cholesky(Q)),
-            "r0": ConstantNoise(R[:1].sqrt(), in_key="y0", out_key="r0"),
-            "r1": ConstantNoise(R[1:].sqrt(), in_key="y1", out_key="r1"),
-            "h0": LinearObservation(H[:1], out_key="p0"),
-            "a0": EnsembleAnalysis("perturbed", belief_prefix="mid", **half(0)),
-            "h1": LinearObservation(H[1:], in_key=("mid", "ensemble"), out_key="p1"),
-            "a1": EnsembleAnalysis("perturbed", forecast_key=("mid", "ensemble"), **half(1)),
-        },
+        {"transition": NoisyLinear(F, torch.linalg.cholesky(Q)), **first, **second},
         initial=GaussianPrior(kalman.initial.mean, kalman.initial.cov.diagonal().sqrt(), ensemble_size=20_000),
     )
     y, seen = torch.randn(2, 8, 2), torch.rand(2, 8, 2) < 0.7
@@ -306,6 +229,11 @@ def test_large_ensemble_with_everything_is_the_kalman_filter(float64):
     exact = kalman.sequence(TensorDict({"observation": y, "observed": seen, "is_init": start}, [2, 8]))
     frames = TensorDict({"y0": y[..., :1], "y1": y[..., 1:], "is_init": start}, [2, 8])
     frames.update({"seen0": seen[..., :1], "seen1": seen[..., 1:]})
-    out = filter.sequence(frames)
+    out = stepwise(filter, frames) if way == "step" else filter.sequence(frames)
+    # Five standard errors of 20,000 members, of the mean and of the variance.
     torch.testing.assert_close(out["belief", "mean"], exact["belief", "mean"], rtol=0, atol=0.06)
     torch.testing.assert_close(out["belief", "var"], exact["belief", "var"], rtol=0.07, atol=0.01)
+    likelihood = sum(out[key] for key in filter.log_likelihood_keys)
+    torch.testing.assert_close(likelihood, exact["info", "log_likelihood"], rtol=0, atol=0.1)
+    own = [out["info", name, "log_likelihood"] for name in ("a0", "a1")]
+    torch.testing.assert_close(own[0] + own[1], out["info", "log_likelihood"])

@@ -214,6 +214,14 @@ def test_copies_compute_the_same(name, copy):
 
 
 @every_filter
+def test_a_batch_of_no_rows_stays_one(name):
+    filter, frames = with_noise(name, 0, 4)
+    out = filter.sequence(frames.copy())
+    assert out["belief", "mean"].shape == (0, 4, 2)
+    assert filter.step(frames[:, 1].update(out[:, 0].select(*filter.carry_keys)))["belief", "mean"].shape == (0, 2)
+
+
+@every_filter
 def test_seeds_decide_and_nothing_is_kept_between_rollouts(name):
     env = filtered(name, batch_size=[2], max_steps=5)
     rollouts = []

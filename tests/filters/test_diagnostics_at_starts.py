@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
-from torch_denkf.filters import Filter
+from tests.filters.factories import linear_denkf, linear_kalman, linear_system, linear_with
+from tests.filters.test_forecasts import Reversed
 from torch_denkf.modules import FromSensor
 
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
@@ -51,30 +51,11 @@ def test_the_diagnostics_of_a_start(how, update_at_reset):
     assert (out["info", "nis"][~starts] > 0).all()
 
 
-class WithSpeed(NoisyLinear):
-    """Writes something else beside the forecast, and reads an action."""
-
-    def __init__(self, matrix, control):
-        super().__init__(matrix, control=control)
-        self.out_keys = [("forecast", "speed"), ("forecast", "ensemble")]
-
-    def compute(self, state, action, *, noise):
-        moved = super().compute(state, action, noise=noise)
-        return (moved - state).norm(dim=-1), moved
-
-
 def test_a_start_that_is_updated_needs_no_action():
     """The first observation of an episode comes before any action."""
     plain = linear_denkf(update_at_reset=True)
-    names = ("noise", "observation", "analysis")
-    filter = Filter(
-        {
-            "transition": WithSpeed(linear_system()[0], torch.tensor([[0.5], [-1.0]])),
-            **{name: plain[name] for name in names},
-        },
-        initial=plain.initial,
-        update_at_reset=True,
-    )
+    driven = Reversed(linear_system()[0], torch.tensor([[0.5], [-1.0]]))
+    filter = linear_with({"transition": driven}, update_at_reset=True)
     td = TensorDict({"observation": torch.randn(3, 2)}, [3])
     start = filter.initialise(td.copy())
     assert start.get(("forecast", "speed"), None) is None
@@ -83,11 +64,10 @@ def test_a_start_that_is_updated_needs_no_action():
 
 def test_a_start_from_the_sensors_reading_runs_the_sensor():
     """Also where it is not updated with that frame: the initial belief reads what the frame modules write."""
-    plain, (_, _, _, R) = linear_denkf(), linear_system()
+    *_, R = linear_system()
     sensor = TensorDictModule(lambda raw: 2.0 * raw, ["raw"], ["observation"])
     initial = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=20_000, observation_key="observation")
-    names = ("noise", "transition", "observation", "analysis")
-    filter = Filter({"sensor": sensor, **{name: plain[name] for name in names}}, initial=initial)
+    filter = linear_with({"sensor": sensor}, initial=initial)
     out = filter.initialise(TensorDict({"raw": torch.tensor([[1.0, -3.0]])}, [1]))
     # 5 standard errors of 20,000 members.
     assert ((out[MEAN] - torch.tensor([2.0, -6.0])).abs() < 5 * (R / 20_000).sqrt()).all()

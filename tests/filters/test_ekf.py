@@ -5,8 +5,6 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 
 from tests.filters.factories import assert_equal, linear_kalman, linear_system, stepwise
 from tests.filters.gaussian_for_tests import (
@@ -19,9 +17,9 @@ from tests.filters.gaussian_for_tests import (
     learned_frames,
     linear_filter,
     linear_frames,
+    minimise,
     prior,
 )
-from torch_denkf.envs.linear import LinearGaussianEnv
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import (
     AroundState,
@@ -30,7 +28,6 @@ from torch_denkf.modules import (
     GaussianPrior,
 )
 from torch_denkf.objectives import GaussianLoss
-from torch_denkf.transforms import DEnKFTransform
 
 ALL = pytest.mark.parametrize("name", FILTERS)
 
@@ -56,15 +53,6 @@ def test_actions_move_the_mean_alone(float64, name):
     moved = with_control["belief", "mean"][:, :-1] @ F.mT + frames["action"][:, :-1] @ torch.tensor(CONTROL).mT
     stepped = ~frames["is_init"][:, 1:].squeeze(-1)
     torch.testing.assert_close(with_control["forecast", "mean"][:, 1:][stepped], moved[stepped], rtol=0, atol=1e-12)
-
-
-@ALL
-def test_a_missing_reading_still_lets_the_covariance_grow(float64, name):
-    F, Q, *_ = linear_system()
-    out = linear_filter(name).sequence(linear_frames(10, missing=1.0, resets=False))
-    cov = out["belief", "cov"]
-    torch.testing.assert_close(cov[1:], F @ cov[:-1] @ F.mT + Q, rtol=0, atol=1e-12)
-    assert (out["info", "log_likelihood"] == 0).all()
 
 
 @ALL
@@ -160,15 +148,7 @@ def test_the_likelihood_finds_the_true_noise(name):
     r = ConstantNoise([1.0, 0.4], trainable=True, in_key="observation")
     filter = linear_filter(name, process_noise=q, noise=r)
     loss = GaussianLoss(filter, state=0.0, transition=0.0, sensor=0.0, nll=1.0)
-    optimiser = torch.optim.LBFGS(filter.parameters(), max_iter=20, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimiser.zero_grad()
-        value = loss(frames)["loss_nll"]
-        value.backward()
-        return value
-
-    before, after = optimiser.step(closure), closure()
+    before, after = minimise(loss, frames, filter.parameters(), 20)
     assert after < before
     learned = q(TensorDict({("belief", "mean"): torch.zeros(2)}))["forecast", "noise"].detach()
     # 40,000 readings would tell one variance to sqrt(2 / 40,000) = 0.7 %; Q and R share them: 1 % and 4 % over seeds.
@@ -177,66 +157,7 @@ def test_the_likelihood_finds_the_true_noise(name):
     torch.testing.assert_close(learned[0, 1], Q[0, 1], rtol=0, atol=0.1 * Q.diagonal().prod().sqrt().item())
 
 
-# --------------------------------------------------------------------------------------------- in an environment
-
-
-def base_env(**kwargs):
-    F, Q, H, R = linear_system()
-    control = torch.tensor(CONTROL)
-    return LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), control=control, missing=0.3, **kwargs)
-
-
-@ALL
-def test_in_the_transform(float64, name):
-    filter = linear_filter(name, control=True)
-    env = TransformedEnv(base_env(batch_size=[3], max_steps=[3, 5, 30]), DEnKFTransform(filter, diagnostics=INFO))
-    env.append_transform(InitTracker())
-    check_env_specs(env)
-    rollout = env.rollout(12, break_when_any_done=False)
-    assert rollout["is_init"].sum() > 3, "resets on the way"
-    frames = rollout.select("observation", "observed", "is_init", "action")
-    expected = filter.sequence(frames.copy())
-    assert_equal(rollout, expected, BELIEF, atol=1e-11)
-    # At a reset the belief is the prior, and the other rows keep theirs.
-    start = rollout["is_init"].squeeze(-1)
-    assert (rollout["belief", "mean"][start] == filter.initial.mean).all()
-    assert (rollout["belief", "cov"][start] == filter.initial.cov).all()
-
-
-@ALL
-def test_as_part_of_a_policy(float64, name):
-    filter = linear_filter(name, control=True)
-    gain = TensorDictModule(lambda mean: -0.3 * mean[..., :1], [("belief", "mean")], ["action"])
-    env = TransformedEnv(base_env(batch_size=[2], max_steps=[4, 30]), InitTracker())
-    env.append_transform(filter.make_tensordict_primer())
-    # The action of this step is not known when the filter runs: here it moves the state of the *next* belief.
-    policy = TensorDictSequential(linear_filter(name), gain)
-    rollout = env.rollout(9, policy, break_when_any_done=False)
-    frames = rollout.select("observation", "observed", "is_init")
-    assert_equal(rollout, linear_filter(name).sequence(frames), BELIEF, atol=1e-11)
-
-
-@pytest.mark.parametrize("name", ["EKF", "UKF"])
-def test_copies_and_state_dicts(float64, name, tmp_path):
-    filter, other = learned_filter(name), learned_filter(name)
-    frames = learned_frames(2, 5)
-    expected = filter.sequence(frames.copy())
-    torch.save(filter.state_dict(), tmp_path / "filter.pt")
-    other.load_state_dict(torch.load(tmp_path / "filter.pt"))
-    assert_equal(other.sequence(frames.copy()), expected, BELIEF)
-    torch.save(filter, tmp_path / "whole.pt")
-    whole = torch.load(tmp_path / "whole.pt", weights_only=False)
-    assert_equal(whole.sequence(frames.copy()), expected, BELIEF)
-
-
-@ALL
-def test_compiled_step_equals_eager(name):
-    filter = linear_filter(name, control=True)
-    td = filter.initialise(linear_frames(3, resets=False))
-    eager = filter.step(td.copy())
-    torch.compiler.reset()
-    compiled = torch.compile(filter.step, backend="aot_eager")(td.copy())
-    assert_equal(compiled, eager, BELIEF, atol=1e-5)
+# ---------------------------------------------------------------------------------------------------------- keys
 
 
 @ALL

@@ -9,8 +9,8 @@ from tests.filters.factories import (
     NoisyLinear,
     linear_denkf,
     linear_system,
+    linear_with,
 )
-from torch_denkf.filters import Filter
 from torch_denkf.modules import (
     ConstantNoise,
     EnsembleAnalysis,
@@ -20,23 +20,19 @@ from torch_denkf.modules import (
 class Reversed(NoisyLinear):
     """Writes something else before the forecast, and the forecast of a Kalman filter in another order."""
 
-    def __init__(self, matrix):
-        super().__init__(matrix)
+    def __init__(self, matrix, control=None):
+        super().__init__(matrix, control=control)
         self.out_keys = [("forecast", "speed"), ("forecast", "ensemble")]
 
-    def compute(self, state, *, noise):
-        moved = super().compute(state, noise=noise)
+    def compute(self, state, action=None, *, noise):
+        moved = super().compute(state, action, noise=noise)
         return (moved - state).norm(dim=-1), moved
 
 
 def test_forecasts_are_told_by_their_names(float64):
     F, _, _, _ = linear_system()
     plain = linear_denkf(update_at_reset=True)
-    other = Filter(
-        {"transition": Reversed(F), **{name: plain[name] for name in ("noise", "observation", "analysis")}},
-        initial=plain.initial,
-        update_at_reset=True,
-    )
+    other = linear_with({"transition": Reversed(F)}, update_at_reset=True)
     assert other.structure.forecast_of == {ENSEMBLE: ("forecast", "ensemble")}
     frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6])
     out = other.sequence(frames.copy())
@@ -57,32 +53,18 @@ def test_two_forecasts_of_one_name_are_refused_until_one_is_named():
             moved = super().compute(state, noise=noise)
             return moved, moved
 
-    plain = linear_denkf()
-    modules = {"transition": Two(), **{name: plain[name] for name in ("noise", "observation", "analysis")}}
     with pytest.raises(ValueError, match="forecast_keys="):
-        Filter(modules, initial=plain.initial)
-    Filter(modules, initial=plain.initial, forecast_keys={ENSEMBLE: ("forecast", "ensemble")})
+        linear_with({"transition": Two()})
+    linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("forecast", "ensemble")})
     with pytest.raises(ValueError, match="forecast_keys names"):
-        Filter(modules, initial=plain.initial, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
+        linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
 
 
 def test_a_module_that_undoes_another_is_refused():
-    plain = linear_denkf()
+    again = EnsembleAnalysis("etkf", observation_key="observation")
     with pytest.raises(ValueError, match=r"over what 'analysis' .* before any module has read it"):
-        Filter(
-            {name: plain[name] for name in ("noise", "transition", "observation", "analysis")}
-            | {"again": EnsembleAnalysis("etkf", observation_key="observation")},
-            initial=plain.initial,
-        )
+        linear_with({**dict(linear_denkf().module.named_children()), "again": again})
+    noise = ConstantNoise([1.0, 1.0], in_key="observation", out_key=("observation", "noise"))
+    analysis = EnsembleAnalysis("etkf", observation_key="observation", noise_variance_key=("observation", "noise"))
     with pytest.raises(ValueError, match="'observation' is a tensor"):
-        Filter(
-            {
-                "noise": ConstantNoise([1.0, 1.0], in_key="observation", out_key=("observation", "noise")),
-                "transition": plain["transition"],
-                "observation": plain["observation"],
-                "analysis": EnsembleAnalysis(
-                    "etkf", observation_key="observation", noise_variance_key=("observation", "noise")
-                ),
-            },
-            initial=plain.initial,
-        )
+        linear_with({"noise": noise}, analysis=analysis)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
-from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system, linear_with
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
 from torch_denkf.modules._call import Call
@@ -116,10 +116,7 @@ def test_an_update_in_a_plain_module_is_that_of_the_sub_model():
         def forward(self, tensordict):
             return self.inner(tensordict)
 
-    names = ("noise", "transition", "observation")
-    other = Filter(
-        {**{name: plain[name] for name in names}, "analysis": OnTensorDicts(plain["analysis"])}, initial=plain.initial
-    )
+    other = linear_with({}, analysis=OnTensorDicts(plain["analysis"]))
     frames = TensorDict({"observation": torch.randn(3, 6, 2)}, [3, 6]).set("observed", torch.rand(3, 6, 2) < 0.6)
     torch.testing.assert_close(other.sequence(frames.copy())[ENSEMBLE], plain.sequence(frames.copy())[ENSEMBLE])
 

@@ -113,7 +113,3 @@ def test_large_ensemble_is_the_kalman_filter(float64, scheme):
             assert (error / exact["belief", "var"]).abs().max() < 0.15
         else:
             assert error.abs().max() < 0.3
-
-
-def test_covariance_is_carried():
-    assert linear_kalman().carry_keys == [("belief", "mean"), ("belief", "cov")]

@@ -11,18 +11,21 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, stepwise
-from torch_denkf.filters import Filter, KalmanFilter
+from tests.filters.factories import (
+    FixedEnsemble,
+    NoisyLinear,
+    linear_denkf,
+    linear_kalman,
+    linear_with,
+    random_walk,
+    stepwise,
+)
+from torch_denkf.filters import Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform, LastAction
 
 MEAN = ("belief", "mean")
-
-
-def walk(**kwargs):
-    one = torch.eye(1)
-    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
 
 
 # ------------------------------------------------------------------------------------------- noise that actions drive
@@ -82,12 +85,11 @@ class Reads(SubModel):
 
 
 def test_a_transition_behind_a_module_of_the_action_is_refused():
-    parts = dict(driven(0).module.named_children())
-    parts["transition"] = Reads()
+    filter = driven(0)
     with pytest.raises(
         ValueError, match=r"'transition' forecasts the belief and reads .* which 'noise' makes of the act"
     ):
-        Filter(parts, initial=driven(0).initial)
+        Filter({**dict(filter.module.named_children()), "transition": Reads()}, initial=filter.initial)
 
 
 # ------------------------------------------------------------------------------------------------ marks, known beliefs
@@ -175,15 +177,6 @@ def test_readings_of_several_robots_are_not_averaged(make, way):
         run[way]()
 
 
-def test_a_group_is_filtered_robot_by_robot(float64):
-    filter = linear_kalman()
-    agents = TensorDict({"observation": torch.randn(2, 3, 5, 2)}, [2, 3, 5])
-    out = filter.sequence(agents.copy())
-    for robot in range(3):
-        alone = filter.sequence(agents[:, robot].copy())
-        torch.testing.assert_close(out[MEAN][:, robot], alone[MEAN], rtol=0, atol=1e-12)
-
-
 # ------------------------------------------------------------------------------------- an analysis of a user's own
 
 
@@ -204,8 +197,7 @@ class Robust(SubModel):
 
 
 def robust(mask, **kwargs):
-    parts = dict(linear_denkf().module.named_children())
-    return Filter({**parts, "analysis": Robust(mask)}, initial=linear_denkf().initial, **kwargs)
+    return linear_with({}, analysis=Robust(mask), **kwargs)
 
 
 @pytest.mark.parametrize("mask", [None, "optional"])
@@ -272,15 +264,15 @@ class Groups(EnvBase):
 @pytest.mark.parametrize("each", [True, False])
 def test_a_belief_that_torchrl_would_not_reset_is_refused(each):
     with pytest.raises(ValueError, match=r"end in .*agents.* alone, and torchrl then keeps what stands outside"):
-        TransformedEnv(Groups(each=each), DEnKFTransform(walk())).rollout(2)
+        TransformedEnv(Groups(each=each), DEnKFTransform(random_walk())).rollout(2)
     with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
-        TransformedEnv(Groups(each=each), walk().make_tensordict_primer()).rollout(2)
+        TransformedEnv(Groups(each=each), random_walk().make_tensordict_primer()).rollout(2)
     with pytest.raises(ValueError, match=r"end in .*agents.* alone"):
         TransformedEnv(Groups(each=each), LastAction({("agents", "action"): "last"})).rollout(2)
 
 
 def test_a_belief_under_the_name_of_the_group_is_reset_with_it():
-    filter = walk(prefix="agents", observation_key=("agents", "x"))
+    filter = random_walk(prefix="agents", observation_key=("agents", "x"))
     env = TransformedEnv(Groups(each=False), DEnKFTransform(filter))
     rollout = env.rollout(7, break_when_any_done=False)
     x, mean = rollout["agents", "x"].squeeze(-1), rollout["agents", "belief", "mean"].squeeze(-1)
@@ -295,14 +287,14 @@ def test_a_belief_under_the_name_of_the_group_is_reset_with_it():
 
 def test_what_is_no_tensordict_is_named():
     with pytest.raises(TypeError, match=r"KalmanFilter takes a tensordict, or a dictionary .*; got NoneType"):
-        walk().step(None)
+        random_walk().step(None)
 
 
 def test_a_negative_covariance_is_no_divergence():
-    row = walk().initialise(TensorDict({"observation": torch.ones(2, 1)}, [2]))
+    row = random_walk().initialise(TensorDict({"observation": torch.ones(2, 1)}, [2]))
     row["belief", "cov"] = torch.full((2, 1, 1), -5.0)
     with pytest.raises(ValueError, match=r"negative variances in \[\('belief', 'cov'\)\]"):
-        walk().step(row)
+        random_walk().step(row)
 
 
 @pytest.mark.parametrize(
@@ -316,9 +308,8 @@ def test_with_reject_a_bad_mask_is_named(mask):
 
 
 def test_a_sensor_that_is_none_is_named_as_the_sensor():
-    parts = dict(linear_denkf().module.named_children())
     with pytest.raises(TypeError, match=r"^sensor must be a TensorDict module"):
-        Filter({"sensor": torch.nn.Linear(2, 2), **parts}, initial=linear_denkf().initial)
+        linear_with({"sensor": torch.nn.Linear(2, 2)})
 
 
 @pytest.mark.parametrize(
@@ -328,6 +319,7 @@ def test_a_sensor_that_is_none_is_named_as_the_sensor():
         ({"observation_key": ()}, "observation_key of KalmanFilter is a key"),
         ({"init_key": b"is_init"}, "init_key of KalmanFilter is a key"),
         ({"control_keys": "action"}, "control_keys of KalmanFilter is a list of keys"),
+        ({"prefix": 3}, "prefix of KalmanFilter is a name"),
         ({"reject": "yes"}, "reject of KalmanFilter is True or False"),
         ({"update_at_reset": 1}, "update_at_reset of KalmanFilter is True or False"),
         ({"observd_key": "seen"}, "KalmanFilter takes no argument 'observd_key'; it takes transition,"),
@@ -335,7 +327,7 @@ def test_a_sensor_that_is_none_is_named_as_the_sensor():
 )
 def test_arguments_are_checked_under_the_name_of_the_class_that_was_called(arguments, message):
     with pytest.raises(TypeError, match=message):
-        walk(**arguments)
+        random_walk(**arguments)
 
 
 def test_a_class_of_a_users_own_checks_its_keys_too():

@@ -1,6 +1,5 @@
 """What a filter writes is its own memory, and what it was given is copied."""
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -169,13 +168,6 @@ def test_a_parameter_that_would_not_be_trained_is_refused():
     transition = LinearTransition(learned, torch.eye(2), trainable=True)
     assert isinstance(transition.matrix, nn.Parameter)
     assert transition.matrix is not learned
-
-
-def test_numpy_arrays_behind_a_prior():
-    mean = np.zeros(2, dtype=np.float32)
-    prior = GaussianPrior(mean, [1.0, 1.0], ensemble_size=8)
-    mean[0] = 9.0
-    assert prior.mean.tolist() == [0.0, 0.0]
 
 
 class Foreign(SubModel):

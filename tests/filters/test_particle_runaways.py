@@ -19,6 +19,7 @@ from torch_denkf.modules import ConstantNoise, GaussianLikelihood, GaussianPrior
 from torch_denkf.transforms import DEnKFTransform
 
 STEPS, EVERY, Q, R, PRIOR = 48, 6, 0.1, 0.3, 2.0
+WHOLE = 45  # the first step and whole chunks of four: what is left over would be compiled by itself
 MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
 
@@ -107,7 +108,7 @@ def test_particles_that_run_away_leave_the_others_as_they_are(resampling, dtype)
 
 
 @pytest.mark.filterwarnings("ignore:The variance")
-@pytest.mark.parametrize("ceiling", [1e12, None])
+@pytest.mark.parametrize("ceiling", [1e12, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_loop_a_sequence_and_a_compiled_sequence_are_the_same(ceiling):
     """In a loop the filter checks that its belief is finite: -inf is a weight that a particle may have."""
     filter = cubic_filter(100, variance_ceiling=ceiling)
@@ -121,11 +122,11 @@ def test_a_loop_a_sequence_and_a_compiled_sequence_are_the_same(ceiling):
             frame = given[:, step].copy().update(belief.select(*filter.carry_keys))
             belief = filter.step(frame)
             means.append(belief[MEAN])
-        compiled = filter.compile(chunk=4, backend="eager").sequence(given.copy())
+        compiled = filter.compile(chunk=4, backend="eager").sequence(given[:, :WHOLE].copy())
     assert (sequence["belief", "log_weight"] == -torch.inf).any()
     after = slice(EVERY - 1, None)
     torch.testing.assert_close(torch.stack(means, 1)[:, after], sequence[MEAN][:, after], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(compiled[MEAN][:, after], sequence[MEAN][:, after], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(compiled[MEAN][:, after], sequence[MEAN][:, EVERY - 1 : WHOLE], rtol=1e-4, atol=1e-4)
     assert sequence[MEAN][:, after].abs().max() < 2.0
 
 
@@ -149,7 +150,7 @@ def test_the_warning_says_that_particles_have_run_away_once():
             filter.compile(chunk=4, **options)
         with warnings.catch_warnings(record=True) as said, torch.no_grad():
             warnings.simplefilter("always")
-            filter.sequence(frames(readings, observed))
+            filter.sequence(frames(readings, observed)[:WHOLE])
         (text,) = [str(warning.message) for warning in said if "variance_ceiling" in str(warning.message)]
         assert "some particles have run away" in text
         assert "near their weighted median until a reading takes their weight" in text

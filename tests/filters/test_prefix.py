@@ -9,12 +9,8 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from tests.filters.composed import ReplayedFrames
-from tests.filters.factories import linear_denkf, linear_kalman
+from tests.filters.factories import linear_denkf, linear_kalman, random_walk
 from tests.filters.test_contract import FILTERS, every_filter, readings
-from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, KalmanFilter
-from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import LinearTransition, MomentPrior, Select
 from torch_denkf.monitoring import Gated, InnovationMonitor, Monitored, MonitoredSensor
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 from torch_denkf.smoothers import EnRTS, FixedLag, RTSSmoother
@@ -55,12 +51,6 @@ def test_a_prefix_changes_names_and_nothing_else(float64, name):
         torch.testing.assert_close(own["imu", *key], step[key], rtol=0, atol=1e-12)
 
 
-def walk(**kwargs):
-    """x' = x + N(0, .25), read with N(0, 1) noise, from N(0, 1)."""
-    one = torch.eye(1)
-    return KalmanFilter(one, one, process_noise=[0.5], noise=[1.0], mean=torch.zeros(1), cov=one, **kwargs)
-
-
 def by_hand(readings, q=0.25, r=1.0):
     """A scalar Kalman filter ``[T]``; the first element is its prior."""
     means, m, p = [0.0], 0.0, 1.0
@@ -82,7 +72,7 @@ def frames_of(first, second):
 def test_two_filters_of_one_environment(float64, way):
     torch.manual_seed(0)
     frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
-    filters = [walk(observation_key="first"), walk(observation_key="second", prefix="imu")]
+    filters = [random_walk(observation_key="first"), random_walk(observation_key="second", prefix="imu")]
     env = ReplayedFrames(frames)
     if way == "transforms":
         for filter in filters:
@@ -108,7 +98,7 @@ def test_two_filters_of_one_environment(float64, way):
 @pytest.mark.parametrize("way", ["transforms", "policy"])
 def test_two_filters_of_one_name_are_refused(way):
     frames = frames_of(torch.randn(2, 6, 1), torch.randn(2, 6, 1))
-    filters = [walk(observation_key="first"), walk(observation_key="second")]
+    filters = [random_walk(observation_key="first"), random_walk(observation_key="second")]
     if way == "transforms":
         env = TransformedEnv(ReplayedFrames(frames), DEnKFTransform(filters[0]))
         with pytest.raises(ValueError, match=r"emits \('belief', 'mean'\) already.*prefix="):
@@ -120,7 +110,7 @@ def test_two_filters_of_one_name_are_refused(way):
 
 
 def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
-    one, two = walk(), walk()
+    one, two = random_walk(), random_walk()
     row = TensorDict({"observation": torch.ones(1)}, [])
     row = one(row.set(("previous", *MEAN), torch.zeros(1)).set(("previous", "belief", "cov"), torch.eye(1)))
     following = row["next"].set("observation", torch.ones(1))
@@ -131,7 +121,7 @@ def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
 def test_the_belief_of_one_is_the_reading_of_another(float64):
     torch.manual_seed(0)
     reading = torch.randn(2, 8, 1)
-    first, second = walk(prefix="inner"), walk(observation_key=("inner", *MEAN))
+    first, second = random_walk(prefix="inner"), random_walk(observation_key=("inner", *MEAN))
     out = TensorDictSequential(first, second)
     data = TensorDict({"observation": reading}, [2, 8])
     with set_recurrent_mode(True):
@@ -167,44 +157,8 @@ def test_smoothers_and_losses_of_a_filter_with_a_prefix(float64, make):
     assert named_loss["loss_nll"] != 0
 
 
-def test_fused_filter_and_a_packaged_step_with_a_prefix(float64, tmp_path):
-    def make(**kwargs):
-        sensors = {"gps": FusedSensor(Select([0]), [0.5], delay=2), "wheel": FusedSensor(Select([1]), [0.3])}
-        motion = LinearTransition(torch.tensor([[1.0, 0.1], [0.0, 1.0]]), 0.1 * torch.eye(2))
-        return FusedFilter(motion, sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)), **kwargs)
-
-    frames = TensorDict({"gps": torch.randn(3, 6, 1), "wheel": torch.randn(3, 6, 1)}, [3, 6])
-    plain, other = make(), make(prefix="base")
-    expected, out = plain.sequence(frames.copy()), other.sequence(frames.copy())
-    for key in plain.out_keys:
-        assert torch.equal(out["base", *key], expected[key])
-    example = other.initialise(frames[:, 0].copy())
-    step = load_step(export_step(other, example, tmp_path / "step.pt2", compiled=False))
-    entries = {".".join(key): example["base", *key] for key in plain.carry_keys}
-    got = step({**entries, "gps": frames["gps"][:, 1], "wheel": frames["wheel"][:, 1]})
-    # A late reading of before the episode: the second element of the sequence is this step.
-    torch.testing.assert_close(got["belief.mean"], expected["belief", "mean"][:, 1])
-
-
-def test_an_ekf_with_a_prefix_compiles(float64):
-    from tests.filters.gaussian_for_tests import linear_filter
-
-    plain, other = linear_filter("EKF"), linear_filter("EKF", prefix="imu")
-    assert isinstance(other, EKF)
-    frames = readings(3, 5)
-    expected = plain.sequence(frames.copy())
-    out = other.compile(chunk=2, backend="eager").sequence(frames.copy())
-    for key in plain.out_keys:
-        torch.testing.assert_close(out["imu", *key], expected[key], rtol=0, atol=1e-12)
-
-
-def test_a_prefix_is_a_name():
-    with pytest.raises(TypeError, match="prefix of KalmanFilter is a name"):
-        walk(prefix=3)
-
-
 def test_foreign_modules_read_what_stands_under_a_prefix():
-    filter = walk(prefix="imu")
+    filter = random_walk(prefix="imu")
     double = TensorDictModule(lambda mean: 2 * mean, [("imu", "belief", "mean")], ["doubled"])
     data = TensorDict({"observation": torch.ones(4, 1)}, [4])
     with set_recurrent_mode(True):

@@ -1,23 +1,15 @@
 """The LSTM as a filter: torch's own LSTM on whole sequences is the oracle; and what it is for, a memory."""
 
-import pickle
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
-from torchrl.modules import set_recurrent_mode
 
-from tests.filters.factories import stepwise
-from tests.transforms.envs_for_tests import base_env
 from torch_denkf.applications.car import dead_reckoning
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.filters import LSTMFilter
 from torch_denkf.modules import GaussianAround, ImageSensor
 from torch_denkf.objectives import GaussianLoss
-from torch_denkf.transforms import DEnKFTransform
 
 BELIEF = [("belief", name) for name in ("mean", "cov", "var", "hidden", "cell")]
 
@@ -79,27 +71,8 @@ def test_resets_are_separate_runs(float64, update_at_reset):
     assert_same(filter.sequence(frames.copy()), torch.cat(runs, 1), atol=1e-14)
 
 
-@pytest.mark.parametrize("batch", [(3, 9), (9,), (2, 2, 5)])
-@pytest.mark.parametrize("update_at_reset", [True, False])
-def test_steps_are_the_sequence(float64, batch, update_at_reset):
-    filter, frames = reader(2, update_at_reset=update_at_reset), readings(batch, width=2)
-    expected = filter.sequence(frames.copy())
-    assert_same(stepwise(filter, frames), expected, atol=1e-14)
-    with set_recurrent_mode(True):
-        assert_same(filter(frames.copy()), expected)
-    assert_same(pickle.loads(pickle.dumps(filter)).sequence(frames.copy()), expected)
-
-
-@pytest.mark.parametrize("width", [1, 2])
-def test_what_is_not_observed_may_be_anything(float64, width):
-    filter, frames = reader(), readings((3, 9), width=width)
-    expected = filter.sequence(frames.copy())
-    leaf = torch.where(frames["observed"], frames["observation"], torch.nan).requires_grad_()
-    broken = filter.sequence(frames.copy().set("observation", leaf))
-    assert_same(broken, expected)
-    broken["belief", "mean"].sum().backward()
-    assert leaf.grad.isfinite().all()
-    # The flag tells a missing reading from a reading of zero.
+def test_a_flag_tells_a_missing_reading_from_a_reading_of_zero(float64):
+    filter, frames = reader(), readings((3, 9))
     zeros = frames.copy().set("observation", torch.zeros(3, 9, 2)).set("observed", torch.ones(3, 9, 1).bool())
     missing = zeros.copy().set("observed", torch.zeros(3, 9, 1).bool())
     assert not filter.sequence(zeros)["belief", "mean"].equal(filter.sequence(missing)["belief", "mean"])
@@ -113,41 +86,6 @@ def test_actions_are_read_one_step_late(float64):
     frames["action"][:, 3] += 1
     changed = (filter.sequence(frames.copy())["belief", "mean"] != expected).any(-1).any(0)
     assert changed.tolist() == [False] * 4 + [True] * 2
-
-
-def env(**kwargs):
-    return base_env(seed=0, batch_size=[2], **kwargs)
-
-
-def test_transform_over_an_environment(float64):
-    filter = reader()
-    filtered = TransformedEnv(env(max_steps=4), DEnKFTransform(filter))
-    check_env_specs(filtered)
-    filtered.append_transform(InitTracker())
-    rollout = filtered.rollout(9, break_when_any_done=False)
-    expected = filter.sequence(rollout.select("observation", "observed", "is_init"))
-    assert rollout["is_init"].sum() > 2, "rows start anew"
-    assert_same(rollout, expected, atol=1e-14)
-
-
-def test_the_primer_carries_the_memory_of_a_policy(float64):
-    filter = reader(2)
-    primed = TransformedEnv(env(max_steps=4), InitTracker())
-    primed.append_transform(filter.make_tensordict_primer())
-    zeros = torch.zeros(primed.action_spec.shape)
-    policy = TensorDictSequential(filter, TensorDictModule(lambda mean: zeros, [("belief", "mean")], ["action"]))
-    rollout = primed.rollout(6, policy=policy, break_when_any_done=False)
-    expected = filter.sequence(rollout.select("observation", "observed", "is_init"))
-    assert rollout["is_init"].sum() == 4, "each row starts anew once"
-    assert_same(expected, rollout, atol=1e-14)
-
-
-def test_compiled_step_equals_eager():
-    filter = reader()
-    td = filter.initialise(readings((3,), resets=False))
-    torch.compiler.reset()
-    compiled = torch.compile(filter.step, backend="aot_eager")(td.copy())
-    assert_same(compiled, filter.step(td.copy()), atol=1e-6)
 
 
 # ----------------------------------------------------------------------------------------------------- a vehicle

@@ -8,9 +8,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from tests.filters.factories import linear_denkf
+from tests.filters.factories import linear_denkf, linear_with
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.filters import Filter
 from torch_denkf.transforms import DEnKFTransform
 
 MEAN = ("belief", "mean")
@@ -42,9 +41,7 @@ class Pushed(TensorDictModuleBase):
 
 @pytest.mark.parametrize("mode", [False, True])
 def test_frames_of_a_sequence_are_one_and_steps_are_not(float64, mode):
-    plain = linear_denkf()
-    modules = {"raw": Smoothed(), "noise": plain["noise"], "transition": plain["transition"], "push": Pushed()}
-    filter = Filter(modules | {name: plain[name] for name in ("observation", "analysis")}, initial=plain.initial)
+    filter = linear_with({"raw": Smoothed(), "transition": linear_denkf()["transition"], "push": Pushed()})
     frames = TensorDict({"raw": torch.randn(3, 6, 2)}, [3, 6])
     with set_recurrent_mode(mode):
         out = filter.sequence(frames.copy())
@@ -58,9 +55,7 @@ def test_frames_of_a_sequence_are_one_and_steps_are_not(float64, mode):
 
 def test_an_environment_takes_single_steps_whatever_the_mode():
     """A collector inside of torchrl's recurrent mode: the beliefs that it stores are those of steps."""
-    plain, rollouts = linear_denkf(), []
-    modules = {"noise": plain["noise"], "transition": plain["transition"], "push": Pushed()}
-    filter = Filter(modules | {name: plain[name] for name in ("observation", "analysis")}, initial=plain.initial)
+    filter, rollouts = linear_with({"transition": linear_denkf()["transition"], "push": Pushed()}), []
     for mode in (False, True):
         env = TransformedEnv(base_env(seed=0, batch_size=[2], max_steps=[3, 4]), DEnKFTransform(filter))
         torch.manual_seed(0)

@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf
+from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_with
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import with_history
@@ -110,7 +110,6 @@ def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
 
 
 def test_a_belief_that_no_module_passes_on_is_refused():
-    plain = linear_denkf()
 
     class WithBias(FixedEnsemble):
         def __init__(self, members):
@@ -128,12 +127,8 @@ def test_a_belief_that_no_module_passes_on_is_refused():
         def compute(self, state, bias, *, noise):
             return state + bias.unsqueeze(-2)
 
-    names = ("noise", "observation", "analysis")
     with pytest.raises(ValueError, match=r"'bias'.* no module writes"):
-        Filter(
-            {"transition": Biased(), **{name: plain[name] for name in names}},
-            initial=WithBias(plain.initial.members),
-        )
+        linear_with({"transition": Biased()}, initial=WithBias(linear_denkf().initial.members))
 
 
 def test_a_buffer_that_filters_before_its_slices_are_marked_is_refused():

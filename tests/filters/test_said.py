@@ -12,6 +12,7 @@ from torchrl.modules import set_recurrent_mode
 
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.particle_for_tests import bootstrap
+from tests.filters.test_noise_sizes import SizeAtTheStep
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
@@ -82,16 +83,6 @@ def test_a_stochastic_analysis_that_names_no_variances_compiles(float64):
     assert {kind[0] for kind in filter.compiled._functions} == {"first", "chunk", "step"}
     for out in outs[1:]:
         torch.testing.assert_close(out, outs[0], rtol=0, atol=1e-12)
-
-
-class SizeAtTheStep(NoisyLinear):
-    """A transition whose noise only a step can draw."""
-
-    def draw_noise(self, batch_size, *, members=None, here=False, **kwargs):
-        return super().draw_noise(batch_size, members=members, **kwargs) if here else None
-
-    def noise_sizes(self, *values):
-        return {**super().noise_sizes(*values), "here": True}
 
 
 def test_a_compiled_filter_that_cannot_draw_its_noise_says_so_once():

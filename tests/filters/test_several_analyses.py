@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.filters.beliefs_for_tests import ENSEMBLE, MEAN, VAR, close
-from tests.filters.factories import linear_denkf, linear_system
+from tests.filters.factories import linear_denkf, linear_system, linear_with
 from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.filters import Filter
 from torch_denkf.modules import SubModel
@@ -23,17 +23,16 @@ def readings(*batch):
     return frames.update({f"y{i}": frames["observation"][..., i : i + 1] for i in (0, 1)})
 
 
+def reads(parts):
+    """The motion and the start of the linear system, and what reads."""
+    plain = linear_denkf()
+    return Filter({"transition": plain["transition"], **parts}, initial=plain.initial)
+
+
 def test_their_diagnostics_add_up_to_those_of_all_readings():
     """The chain rule: a density of two readings is that of one times that of the other, given the first."""
     both = linear_denkf()
-    filter = Filter(
-        {
-            "transition": both["transition"],
-            **parts_of_reading(0, "forecast", "mid"),
-            **parts_of_reading(1, "mid", "belief"),
-        },
-        initial=both.initial,
-    )
+    filter = reads({**parts_of_reading(0, "forecast", "mid"), **parts_of_reading(1, "mid", "belief")})
     frames = readings(3, 6)
     out, expected = filter.sequence(frames.copy()), both.sequence(frames.copy())
     close(out, expected, [MEAN, VAR, *TOTALS], atol=1e-10)
@@ -45,7 +44,6 @@ def test_their_diagnostics_add_up_to_those_of_all_readings():
 
 def test_analyses_side_by_side_may_be_put_together():
     """Two analyses of one forecast, of whose beliefs a third module takes the middle: nothing is written over."""
-    plain = linear_denkf()
 
     class Middle(SubModel):
         def __init__(self):
@@ -54,22 +52,10 @@ def test_analyses_side_by_side_may_be_put_together():
         def compute(self, one, two):
             return (one + two) / 2
 
-    filter = Filter(
-        {
-            "transition": plain["transition"],
-            **parts_of_reading(0, "forecast", "one"),
-            **parts_of_reading(1, "forecast", "two"),
-            "middle": Middle(),
-        },
-        initial=plain.initial,
-    )
+    parts = {**parts_of_reading(0, "forecast", "one"), **parts_of_reading(1, "forecast", "two")}
+    filter = reads({**parts, "middle": Middle()})
     td = filter.initialise(readings())
-    single = [
-        Filter(
-            {"transition": plain["transition"], **parts_of_reading(i, "forecast", "belief")}, initial=plain.initial
-        ).step(td.copy())
-        for i in (0, 1)
-    ]
+    single = [reads(parts_of_reading(i, "forecast", "belief")).step(td.copy()) for i in (0, 1)]
     close(filter.step(td), {ENSEMBLE: (single[0][ENSEMBLE] + single[1][ENSEMBLE]) / 2}, [ENSEMBLE])
 
 
@@ -87,8 +73,7 @@ class Scaled(SubModel):
 
 def test_a_sum_is_left_out_where_one_of_its_parts_is_missing():
     plain = linear_denkf()
-    names = ("noise", "transition", "observation", "analysis")
-    filter = Filter({**{name: plain[name] for name in names}, "scale": Scaled()}, initial=plain.initial)
+    filter = Filter({**dict(plain.module.named_children()), "scale": Scaled()}, initial=plain.initial)
     td = filter.initialise(readings().set("factor", torch.tensor([2.0])))
     whole, part, alone = filter.step(td.copy()), filter.step(td.copy(), without=["factor"]), plain.step(td.copy())
     close(part, alone, [ENSEMBLE, MEAN])
@@ -102,8 +87,7 @@ def test_a_reading_goes_through_several_sensors():
     plain, (F, _, _, _) = linear_denkf(), linear_system()
     code = TensorDictModule(nn.Linear(2, 2), ["raw"], ["code"])
     sensor = TensorDictModule(nn.Tanh(), ["code"], ["observation"])
-    names = ("noise", "transition", "observation", "analysis")
-    filter = Filter({"code": code, "sensor": sensor, **{name: plain[name] for name in names}}, initial=plain.initial)
+    filter = linear_with({"code": code, "sensor": sensor})
     assert filter.structure.readings == ("raw",)
     td = filter.initialise(TensorDict({}))
     close(filter.predict(td.copy()), {ENSEMBLE: td[ENSEMBLE] @ F.mT}, [ENSEMBLE])
@@ -115,8 +99,7 @@ def test_a_mask_that_a_module_writes_need_not_be_given():
     """Readings far off are masked inside the filter; the mask is no input of it."""
     plain = linear_denkf()
     near = TensorDictModule(lambda y: y.abs() < 3, ["observation"], ["observed"])
-    names = ("noise", "transition", "observation", "analysis")
-    filter = Filter({"near": near, **{name: plain[name] for name in names}}, initial=plain.initial)
+    filter = linear_with({"near": near})
     assert "observed" not in filter.in_keys
     assert "observed" in plain.in_keys
     frames = TensorDict({"observation": 3 * torch.randn(3, 6, 2)}, [3, 6])

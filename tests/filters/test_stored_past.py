@@ -31,27 +31,17 @@ def run(name):
 
 
 @every
-@pytest.mark.parametrize("begin", [1, 5])
-def test_a_sequence_goes_on_from_the_middle(float64, name, begin):
+@pytest.mark.parametrize(("begin", "stored"), [(1, "belief_keys"), (5, "belief_keys"), (4, "carry_keys")])
+def test_a_sequence_goes_on_from_the_middle(float64, name, begin, stored):
+    """From all that was believed; or from what is carried, of which what was smoothed follows."""
     filter, frames, whole = run(name)
     rest = frames[:, begin:].copy()
-    for key in filter.belief_keys:
+    for key in getattr(filter, stored):
         rest[key] = whole[key][:, begin:]
     out = filter.sequence(rest)
     for key in filter.belief_keys:
         torch.testing.assert_close(out[key], whole[key][:, begin:], rtol=0, atol=1e-12)
     assert not torch.equal(whole["smoothed", "mean"][:, -1], whole["belief", "mean"][:, -1])
-
-
-@every
-def test_what_was_smoothed_follows_from_the_past(float64, name):
-    filter, frames, whole = run(name)
-    rest = frames[:, 4:].copy()
-    for key in filter.carry_keys:
-        rest[key] = whole[key][:, 4:]
-    out = filter.sequence(rest)
-    for key in filter.belief_keys:
-        torch.testing.assert_close(out[key], whole[key][:, 4:], rtol=0, atol=1e-12)
 
 
 @every

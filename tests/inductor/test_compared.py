@@ -70,6 +70,7 @@ def rows_of_a_jacobian(state):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_torch_still_adds_up_the_rows_of_a_jacobian_of_index_select():
     """If this fails, torch is right: `Select` may use index_select again, and this test may go."""
     state = torch.zeros(4)
@@ -120,8 +121,19 @@ def test_two_of_four_numbers_are_read(make, forecast, options):
 # -------------------------------------------------------------------------------------------- what is refused
 
 
-@pytest.mark.parametrize("sequence", [False, True])
-@pytest.mark.parametrize("readings", ["numbers", "zero", "hidden", "hidden and NaN"])
+@pytest.mark.parametrize(
+    ("readings", "sequence"),
+    [
+        ("numbers", False),
+        ("hidden and NaN", False),
+        ("zero", True),
+        *(
+            pytest.param(readings, sequence, marks=pytest.mark.slow)
+            for readings, sequence in [("zero", False), ("hidden", False)]
+            + [(readings, True) for readings in ("numbers", "hidden", "hidden and NaN")]
+        ),
+    ],
+)
 def test_a_compiler_that_is_wrong_is_refused(sequence, readings):
     filter, size = kalman(), [2, 3] if sequence else [2]
     frames = TensorDict({"observation": torch.randn(*size, 3)}, size)

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.conftest import COMPILED
-from tests.filters.factories import has_compiler
+from tests.filters.factories import has_compiler, linear_kalman
 from torch_denkf._lock import locked
 from torch_denkf.inductor.libraries import clear_damaged_libraries, is_whole
 
@@ -71,7 +72,20 @@ print(*sorted(loaded() - before))
 """
 
 
-@pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
+needs_compiler = pytest.mark.skipif(not has_compiler(), reason="torch.compile needs a C++ compiler")
+
+
+@needs_compiler
+def test_half_libraries_go_before_a_filter_is_compiled(cache, monkeypatch):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(cache))
+    monkeypatch.setattr(torch, "compile", lambda function, **options: function)
+    filter = linear_kalman().compile()
+    filter.step(filter.initialise(TensorDict({"observation": torch.zeros(2)})))
+    assert [path.name for path in (cache / "ab").iterdir()] == ["cabwhole.so"]
+
+
+@needs_compiler
+@pytest.mark.slow
 def test_a_compilation_that_was_killed_is_done_again():
     """A library of the tests' own cache, cut as a killed linker leaves it."""
     said = io.StringIO()

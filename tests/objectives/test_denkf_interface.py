@@ -4,11 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.filters.factories import A, M, S, linear_kalman, toy_denkf
-from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, TERMS, score_by_hand
-from tests.objectives.problem_for_tests import only, problem, stepped
-from torch_denkf.filters import LSTMFilter
-from torch_denkf.modules import Select
+from tests.filters.factories import A, M, S, toy_denkf
+from tests.objectives.denkf_for_tests import CLOSE, ONLY_STATE, score_by_hand
+from tests.objectives.problem_for_tests import problem, stepped
 from torch_denkf.objectives import DEnKFLoss, MixtureLoss, SensorLoss, TransitionLoss
 
 
@@ -20,18 +18,6 @@ def test_paper_preset(float64):
     expected = (out["belief", "mean"] - frames["state"]).square().mean(-1)[stepped(frames)].mean()
     torch.testing.assert_close(losses["loss_state"], expected, **CLOSE)
     assert set(DEnKFLoss.paper(filter, sensor=0.0)(frames).keys()) == {"loss_state", "loss_transition"}
-
-
-def test_known_observation_model_gives_the_target(float64):
-    filter = toy_denkf()
-    filter = type(filter)(
-        filter["transition"], filter["sensor"], Select([2, 0]), filter["noise"], initial=filter.initial
-    )
-    frames, out = problem(filter)
-    frames = frames.exclude("target_observation")
-    expected = score_by_hand("crps", out["sensor", "ensemble"], frames["state"][..., [2, 0]])
-    observed = frames["observed"].all(-1)
-    torch.testing.assert_close(DEnKFLoss(filter)(frames)["loss_sensor"], expected[observed].mean(), **CLOSE)
 
 
 def test_set_keys(float64):
@@ -98,36 +84,3 @@ def test_parameters_and_state_are_the_filters():
     assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
     assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
     assert "state_scale" in loss.state_dict()
-
-
-def test_flat_slices(float64):
-    # What a SliceSampler gives: [B * T], is_init at the start of every slice.
-    filter = toy_denkf()
-    frames, _ = problem(filter, batch=(3, 5))
-    loss = DEnKFLoss(filter)
-    expected, out = loss(frames), loss(frames.reshape(15))
-    for key in list(expected.keys()):
-        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-12)
-
-
-def test_errors():
-    filter = toy_denkf()
-    frames, _ = problem(filter)
-    with pytest.raises(ValueError, match="'nll'"):
-        DEnKFLoss(filter, score="nll")
-    with pytest.raises(KeyError, match=r"DEnKFLoss reads .*state.*set_keys"):
-        DEnKFLoss(filter)(frames.exclude("state"))
-    with pytest.raises(KeyError, match="'target_observation'"):
-        DEnKFLoss(filter)(frames.exclude("target_observation"))
-    with pytest.raises(KeyError, match="target_observation"):
-        DEnKFLoss(filter, **only(TERMS, "observation"))(frames.exclude("target_observation"))
-    td = TensorDict({"observation": torch.randn(4, 2), "state": torch.randn(4, 2)}, [4])
-    lstm = LSTMFilter(None, state_dim=2, observation_dim=2, observation_key="observation")
-    with pytest.raises(KeyError, match="no observation model"):
-        DEnKFLoss(lstm, **only(TERMS, "sensor"))(td)
-    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\), which is missing"):
-        DEnKFLoss(linear_kalman(), **only(TERMS, "sensor"))(td)
-    with pytest.raises(KeyError, match="measurement"):
-        DEnKFLoss(filter)(frames.exclude("measurement"))
-    with pytest.raises(AttributeError, match="set_keys"):
-        DEnKFLoss(filter).in_keys = ["state"]

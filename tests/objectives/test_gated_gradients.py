@@ -81,8 +81,14 @@ def test_gradients_by_finite_differences(float64, case, belief, delay):
     assert check_largest_gradients([filter], value, rtol=1e-5, atol=1e-6) >= 8
 
 
-@pytest.mark.parametrize("belief", BELIEFS)
-@pytest.mark.parametrize("case", ["weights and a joint update", "watched"])
+@pytest.mark.parametrize(
+    ("case", "belief"),
+    [
+        ("weights and a joint update", "ensemble"),
+        pytest.param("weights and a joint update", "moments", marks=pytest.mark.slow),
+        *(pytest.param("watched", belief, marks=pytest.mark.slow) for belief in BELIEFS),
+    ],
+)
 def test_a_package_takes_the_same_steps(float64, tmp_path, case, belief):
     filter, data = CASES[case](belief, 2), frames(2, 8).exclude("state")
 

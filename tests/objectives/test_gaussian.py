@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.distributions import MultivariateNormal, Normal
 
 from tests.filters.factories import linear_kalman
 from tests.filters.gaussian_for_tests import learned_filter, learned_frames, linear_filter, linear_frames
@@ -21,55 +20,6 @@ OFF = {"state": 0.0, "transition": 0.0, "sensor": 0.0}
 def frames_with_state(batch=3, steps=8, **kwargs):
     frames = linear_frames(batch, steps, **kwargs)
     return frames.set("state", torch.randn(batch, steps, 2))
-
-
-def moments(out, key="belief"):
-    return out[key, "mean"], out[key, "cov"]
-
-
-@pytest.mark.parametrize(("name", "key"), [("state", "belief"), ("transition", "forecast")])
-def test_crps_is_that_of_a_large_sample(float64, name, key):
-    frames = frames_with_state(2, 4, resets=False)
-    filter = linear_kalman()
-    loss = GaussianLoss(filter, **{**OFF, name: 2.0}, reduction="none")
-    got = loss(frames)[f"loss_{name}"]
-    mean, cov = moments(filter.sequence(frames.copy()), key)
-    sample = MultivariateNormal(mean, cov).sample((40_000,)).movedim(0, -2)
-    expected = 2 * crps_ensemble(sample, frames["state"]).mean(-1)
-    assert (got[:, 0] == 0).all(), "the first element holds the initial belief"
-    # Standard error of a mean of 40,000 errors of size 1: 0.5 %; two dimensions, weight 2.
-    torch.testing.assert_close(got[:, 1:], expected[:, 1:], rtol=0, atol=0.03)
-
-
-def test_nll_is_the_density_of_the_state_in_its_own_units(float64):
-    frames = frames_with_state()
-    filter = linear_kalman()
-    mean, cov = moments(filter.sequence(frames.copy()))
-    counts = ~frames["is_init"].squeeze(-1)
-    expected = -MultivariateNormal(mean, cov).log_prob(frames["state"])[counts].mean()
-    for scale in (None, [0.1, 20.0]):
-        loss = GaussianLoss(filter, **{**OFF, "state": 1.0}, score="nll", state_scale=scale)
-        torch.testing.assert_close(loss(frames)["loss_state"], expected, rtol=1e-11, atol=0)
-    one = GaussianLoss(filter, **{**OFF, "state": 1.0}, score="nll", dims=[1])(frames)["loss_state"]
-    density = Normal(mean[..., 1], cov[..., 1, 1].sqrt()).log_prob(frames["state"][..., 1])
-    torch.testing.assert_close(one, -density[counts].mean(), rtol=1e-11, atol=0)
-
-
-def test_mse_of_the_mean(float64):
-    frames, filter = frames_with_state(), linear_kalman()
-    out, counts = filter.sequence(frames.copy()), ~frames["is_init"].squeeze(-1)
-    for name, key in (("state", "belief"), ("transition", "forecast")):
-        error = (out[key, "mean"] - frames["state"]) / torch.tensor([2.0, 0.5])
-        loss = GaussianLoss(filter, **{**OFF, name: 1.0}, score="mse", state_scale=[2.0, 0.5])
-        torch.testing.assert_close(loss(frames)[f"loss_{name}"], error.square().mean(-1)[counts].mean())
-
-
-def test_innovation_nll(float64):
-    frames, filter = frames_with_state(), linear_filter("EKF")
-    expected = filter.sequence(frames.copy())["info", "log_likelihood"].squeeze(-1)[~frames["is_init"].squeeze(-1)]
-    loss = GaussianLoss(filter, **OFF, nll=0.5)
-    assert "state" not in loss.in_keys
-    torch.testing.assert_close(loss(frames.exclude("state"))["loss_nll"], -0.5 * expected.mean())
 
 
 @pytest.mark.parametrize("score", ["crps", "nll", "mse"])
@@ -161,17 +111,3 @@ def test_all_terms_train_all_parts(name, score):
     for parameter_name, parameter in filter.named_parameters():
         assert parameter.grad is not None, parameter_name
         assert parameter.grad.isfinite().all(), parameter_name
-
-
-def test_errors_say_what_to_do():
-    filter = linear_kalman()
-    with pytest.raises(ValueError, match='"crps", "nll" or "mse"'):
-        GaussianLoss(filter, score="energy")
-    with pytest.raises(ValueError, match=r"one entry for each of dims=\[0, 1\]; got 5"):
-        GaussianLoss(filter, dims=[0, 1], state_scale=[1.0] * 5)
-    assert GaussianLoss(filter)(frames_with_state()).get("loss_sensor", None) is None, "left out: there is no sensor"
-    with pytest.raises(KeyError, match=r"\('sensor', 'ensemble'\).*set the weight sensor=0\.0"):
-        GaussianLoss(filter, sensor=1.0)(frames_with_state())
-    frames = learned_frames(2, 3).set("state", torch.randn(2, 3, 3))
-    with pytest.raises(KeyError, match=r"set_keys\(target_observation=\.\.\.\)"):
-        GaussianLoss(learned_filter("EKF"))(frames)

@@ -118,21 +118,6 @@ def test_a_full_covariance_of_the_noise():
     torch.testing.assert_close(losses["loss_sensor"], whole["loss_sensor"], **CLOSE)
 
 
-def test_angles_of_the_observation_wrap():
-    filter = toy_denkf()
-    frames, out = problem(filter)
-    frames["target_observation"] = out["sensor", "ensemble"][..., 0, :].detach() + 0.1
-    turned = frames.clone()
-    turned["target_observation"][..., 1] += 2 * math.pi
-    for loss in (SensorLoss, ObservationLoss):
-        before = sum(loss(filter, observation_angles=[1])(frames).values())
-        after = sum(loss(filter, observation_angles=[1])(turned).values())
-        torch.testing.assert_close(after, before)
-        assert (sum(loss(filter)(turned).values()) - before).abs() > 1
-    whole = DEnKFLoss(filter, **only(TERMS, "sensor"), observation_angles=[1])(turned)["loss_sensor"]
-    torch.testing.assert_close(whole, SensorLoss(filter)(frames)["loss_sensor"])
-
-
 # ----------------------------------------------------------------------------------------------- observation
 
 
@@ -252,18 +237,3 @@ def test_particles_start_with_equal_weights():
     filter = toy_filter("soft")
     frames, _ = problem(filter, resets=False)
     check_gradient(TransitionLoss(filter), frames, filter, [filter["transition"]])
-
-
-def test_errors():
-    with pytest.raises(ValueError, match='"crps", "energy" or "mse"'):
-        TransitionLoss(toy_denkf(), score="nll")
-    with pytest.raises(ValueError, match='"crps", "nll" or "mse"'):
-        TransitionLoss(linear_kalman(), score="energy")
-    with pytest.raises(ValueError, match="not negative"):
-        TransitionLoss(linear_kalman(), spread=-1.0)
-    with pytest.raises(ValueError, match="Name the prefix"):
-        TransitionLoss(linear_kalman(), belief="analysis")
-    with pytest.raises(ValueError, match="two times"):
-        TransitionLoss(linear_kalman())(problem(toy_denkf())[0][0, 0])
-    with pytest.raises(KeyError, match="'state', which is missing"):
-        TransitionLoss(linear_kalman())(learned_frames(2, 3))

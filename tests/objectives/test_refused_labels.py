@@ -1,16 +1,21 @@
 """What a loss cannot score is refused by name: labels of another shape, another kind of belief, what is no key."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.borders.test_constructors import refused as refuses
 from tests.filters.differences_for_tests import central_difference
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_denkf, linear_kalman, toy_denkf
+from tests.filters.gaussian_for_tests import learned_filter
 from tests.filters.particle_for_tests import bootstrap, toy_filter
-from torch_denkf.filters import ParticleFilter
+from tests.objectives.denkf_for_tests import TERMS
+from tests.objectives.problem_for_tests import only, problem
+from torch_denkf.filters import LSTMFilter, ParticleFilter
 from torch_denkf.modules import DiagonalNoise, GaussianLikelihood, Select
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, SensorLoss, TransitionLoss
 from torch_denkf.smoothers import EnKS, EnRTS
@@ -50,14 +55,6 @@ LABELS = {  # of a state of two dimensions, for a batch [4, 5]
 }
 
 
-def refuses(make, *words, error=ValueError):
-    """The message holds these words."""
-    with pytest.raises(error) as caught:
-        make()
-    message = str(caught.value)
-    assert all(word in message for word in words), message
-
-
 @pytest.mark.parametrize("case", LABELS.values(), ids=LABELS)
 @pytest.mark.parametrize("make", LOSSES.values(), ids=LOSSES)
 def test_labels_of_another_shape(make, case):
@@ -85,6 +82,67 @@ def test_parts_of_the_state_where_all_of_it_is_read():
     loss = SensorLoss(linear_denkf("etkf"))
     loss.set_keys(sensor="observation")
     refuses(lambda: loss(read), "'observed'", "got [4, 5]")
+
+
+# ------------------------------------------------------------------------------------------- settings, missing entries
+
+
+def lstm():
+    return LSTMFilter(None, state_dim=2, observation_dim=2, observation_key="observation")
+
+
+SETTINGS = [
+    ("DEnKFLoss", {"score": "nll"}, "'nll'"),
+    ("GaussianLoss", {"score": "energy"}, '"crps", "nll" or "mse"'),
+    ("GaussianLoss", {"dims": [0, 1], "state_scale": [1.0] * 5}, "one entry for each of dims=[0, 1]; got 5"),
+    ("MixtureLoss", {"score": "mse"}, "'mse'"),
+    ("MixtureLoss", {"state_scale": [1.0], "dims": [0, 1]}, "state_scale has one entry"),
+    ("MixtureLoss", {"component_std": [1.0, 0.0]}, "component_std is the width"),
+    ("MixtureLoss", {"component_std": [1.0] * 3, "dims": [0, 1]}, "component_std has one entry"),
+    ("TransitionLoss", {"score": "nll"}, '"crps", "energy" or "mse"'),
+    ("TransitionLoss", {"spread": -1.0}, "not negative"),
+    ("TransitionLoss", {"belief": "analysis"}, "Name the prefix"),
+]
+
+
+@pytest.mark.parametrize(("loss", "options", "words"), SETTINGS)
+def test_settings(loss, options, words):
+    refuses(lambda: LOSSES[loss](**options), words)
+
+
+def test_an_energy_of_steps_of_moments():
+    refuses(lambda: TransitionLoss(linear_kalman(), score="energy"), '"crps", "nll" or "mse"')
+
+
+OBSERVATION, SENSOR = only(TERMS, "observation"), only(TERMS, "sensor")
+MISSING = [
+    ("state", DEnKFLoss, toy_denkf, {}, "DEnKFLoss reads", "state", "set_keys"),
+    ("state", MixtureLoss, toy_filter, {}, "MixtureLoss reads 'state'", "set_keys"),
+    ("state", TransitionLoss, toy_denkf, {}, "'state', which is missing"),
+    ("measurement", DEnKFLoss, toy_denkf, {}, "measurement"),
+    ("target_observation", DEnKFLoss, toy_denkf, {}, "'target_observation'"),
+    ("target_observation", DEnKFLoss, toy_denkf, OBSERVATION, "target_observation"),
+    ("target_observation", MixtureLoss, toy_filter, {"sensor": 1.0}, "target_observation"),
+    ("target_observation", GaussianLoss, partial(learned_filter, "EKF"), {}, "set_keys(target_observation=...)"),
+    ("target_observation", DEnKFLoss, lstm, SENSOR, "no observation model"),
+]
+
+
+@pytest.mark.parametrize(("left_out", "loss", "make", "options", "words"), [(*case[:4], case[4:]) for case in MISSING])
+def test_missing_entries(left_out, loss, make, options, words):
+    frames, _ = problem(toy_denkf())
+    frames = frames.set("observation", torch.zeros(2, 7, 2)).exclude(left_out, "noise")
+    refuses(lambda: loss(make(), **options)(frames), *words, error=KeyError)
+
+
+def test_a_step_takes_two_times():
+    frames, _ = problem(toy_denkf())
+    refuses(lambda: TransitionLoss(linear_kalman())(frames[0, 0]), "two times")
+
+
+def test_the_keys_that_a_loss_reads_are_set_by_name():
+    with pytest.raises(AttributeError, match="set_keys"):
+        DEnKFLoss(toy_denkf()).in_keys = ["state"]
 
 
 # --------------------------------------------------------------------------------------------- another kind of belief

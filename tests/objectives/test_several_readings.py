@@ -37,6 +37,13 @@ def start():
     return torch.tensor([1.0, -1.0]), torch.diag(torch.tensor([1.0, 2.0]))
 
 
+def exact(key, rows=slice(None), *, process_noise_cov, mean, cov):
+    """The Kalman filter of some rows of the linear system's readings."""
+    F, _, H, R = linear_system()
+    prior = {"mean": mean, "cov": cov, "observation_key": key}
+    return KalmanFilter(F, H[rows], process_noise_cov=process_noise_cov, noise=R[rows].sqrt(), **prior)
+
+
 @pytest.mark.parametrize("info", INFO)
 def test_two_kalman_analyses(info):
     F, Q, H, R = linear_system()
@@ -51,7 +58,7 @@ def test_two_kalman_analyses(info):
         },
         initial=MomentPrior(mean, cov),
     )
-    one = KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=mean, cov=cov, observation_key="both")
+    one = exact("both", process_noise_cov=Q, mean=mean, cov=cov)
     frames, off = readings(), {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0, "reduction": "none"}
     value = GaussianLoss(filter, **off)(frames)["loss_nll"]
     torch.testing.assert_close(value, GaussianLoss(one, **off)(frames)["loss_nll"], rtol=1e-10, atol=1e-12)
@@ -95,15 +102,8 @@ def test_two_ensemble_analyses(info):
         },
         initial=FixedEnsemble(members),
     )
-    one = KalmanFilter(
-        F,
-        H,
-        process_noise_cov=0 * Q,
-        noise=R.sqrt(),
-        mean=members.mean(0),
-        cov=ensemble_cov(members),
-        observation_key="both",
-    )
+    moments = {"process_noise_cov": 0 * Q, "mean": members.mean(0), "cov": ensemble_cov(members)}
+    one = exact("both", **moments)
     frames, weights = readings(), {"state": 0.0, "transition": 0.0, "nll": 1.0, "reduction": "none"}
     value = DEnKFLoss(filter, **weights)(frames)["loss_nll"]
     expected = GaussianLoss(one, **weights)(frames)["loss_nll"]
@@ -113,14 +113,6 @@ def test_two_ensemble_analyses(info):
         log_likelihood=(info[0], "log_likelihood") if len(set(info)) > 1 else ("info", "gps", "log_likelihood")
     )
     first = loss(frames)["loss_nll"]
-    alone = KalmanFilter(
-        F,
-        H[:1],
-        process_noise_cov=0 * Q,
-        noise=R[:1].sqrt(),
-        mean=members.mean(0),
-        cov=ensemble_cov(members),
-        observation_key="gps",
-    )
+    alone = exact("gps", slice(1), **moments)
     only_first_step = GaussianLoss(alone, **weights)(frames)["loss_nll"][:, 1]
     torch.testing.assert_close(first[:, 1], only_first_step, rtol=1e-9, atol=1e-11)

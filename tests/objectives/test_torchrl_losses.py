@@ -167,15 +167,8 @@ def test_sac(float64):
     filter, frames = filter_and_frames()
     data = collected(filter, frames)
     data["action"] = data["action"].tanh() * 0.9
-    head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor())
-    actor = ProbabilisticActor(
-        TensorDictSequential(filter, TensorDictModule(head, [MEAN], ["loc", "scale"])),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
-    value = q_network()
-    loss = SACLoss(actor, value, num_qvalue_nets=1, fixed_alpha=True, alpha_init=0.3, target_entropy=-2.0)
+    actor, head, options = sac(filter, inside=True)
+    loss = SACLoss(actor, q_network(), num_qvalue_nets=1, **options)
     torch.manual_seed(3)
     actor_loss, _ = loss.actor_loss(data.copy())
     actor_loss = actor_loss.mean()
