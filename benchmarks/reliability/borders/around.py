@@ -139,20 +139,6 @@ def _no_moments(points: torch.Tensor) -> bool:
     return all(bool(value[1].isnan().all()) for value in moments) and torch.equal(points[0], sound)
 
 
-def car_settings() -> dict[str, d.Wrong]:
-    """Wrong settings of a car's filter."""
-    return {
-        "dt": d.POSITIVE,
-        "ensemble_size": d.LARGE_COUNT,
-        "velocity_std": d.vector(2, positive=True),
-        "velocity_mean": d.vector(2),
-        **dict.fromkeys(("lags", "longest", "features"), d.COUNT),
-        **dict.fromkeys(("reach", "focal", "inflation"), d.POSITIVE),
-        "size": d.SIZE,
-        "colour": d.Wrong({"no such setting": "red"}),
-    }
-
-
 def _track() -> dict[str, d.Wrong]:
     frame = np.zeros((24, 72, 3), np.uint8)
     frames = {
