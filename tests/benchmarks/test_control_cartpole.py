@@ -136,22 +136,6 @@ def test_what_the_filter_is_told_is_what_the_analysis_uses():
     assert not torch.allclose(belief()[0], update(0.3)[0], atol=1e-3)
 
 
-def test_the_ends_of_the_track_are_left_out():
-    """Pieces are, in which the cart was read there; noisy angles are kept. A batch of such pieces only is no error."""
-    task = TASKS["cartpole"]
-    learner = Learner(cartpole.unlearned_filter(4), task.prior, 8, task.learning)
-    data = rollout(cartpole.NoisyCartpole(2, 0.0), None, cartpole.STEPS, ExplorationType.RANDOM)
-    data["observation"].zero_()
-    data["observation"][0, 60, 0] = -1.6  # in the third of ten pieces
-    data["observation"][1, :, 1] = 1.9
-    learner.add(data)
-    assert len(learner.episodes) == 19
-    data["observation"][..., 0] = 1.6
-    learner.add(data)
-    assert len(learner.episodes) == 19
-    learner.update(1)
-
-
 @pytest.mark.slow
 def test_a_filter_learns_the_cartpole_from_readings_alone():
     """The noise of the readings within 10 %; velocities to 0.3 m/s and 0.4 rad/s, as it believes."""
