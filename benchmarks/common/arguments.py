@@ -73,3 +73,8 @@ def processor() -> str:
         if line.startswith("model name"):
             return line.split(":")[1].strip()
     return platform.processor() or platform.machine()
+
+
+def made_by(study: str, more: str = "") -> list[str]:
+    """The last lines of a page: the command, and what is said of it; processor and torch."""
+    return [f"* Command: `{command(study)}`{more}.", f"* Hardware: {processor()}; torch {torch.__version__}."]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
+import torch
 from tqdm import tqdm
 
 from torch_denkf._files import write_text
@@ -48,6 +50,17 @@ def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: s
         futures = [pool.submit(call) for call in calls]
         for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
             future.result()
+
+
+def compute(jobs: Mapping[Path, Callable[[], list[dict]]], processes: int, title: str) -> list[dict]:
+    """The rows of all jobs, each of which leaves them in a file; those that are there are not computed again."""
+    side_by_side([partial(_alone, file, rows) for file, rows in jobs.items()], processes, title)
+    return read_rows(jobs)
+
+
+def _alone(file: Path, rows: Callable[[], list[dict]]) -> None:
+    torch.set_num_threads(1)
+    once(file, rows)
 
 
 def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda row: None) -> list[dict]:

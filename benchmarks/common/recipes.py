@@ -46,7 +46,6 @@ class Recipe:
     """
 
     observation_key: NestedKey = ("sensor", "ensemble")
-    needs_training = False  # True where the state follows from the readings only by learned weights
     scaled: ClassVar[tuple[type[nn.Module], ...]] = (ScaledNoise,)  # modules that set_inflation sets
     dims: Sequence[int]
     unit: Tensor

@@ -16,8 +16,6 @@ from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, LinearObservation, LinearTransition, MappedNoise, MomentPrior
 from torch_denkf.pretrained import from_pretrained
 
-__all__ = ["arm_task"]
-
 JOINTS, EVERY, DT = 7, 8, 0.01  # six joints and the gripper's opening; encoder steps in a step of the environment; s
 ENCODER = math.radians(2.0)  # rad, white
 STIFFNESS, FORCE, DRIFT = 10.0, 0.2, 0.5  # N/rad; N, white; N for each root of a second

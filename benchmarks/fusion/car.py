@@ -22,8 +22,6 @@ from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianAround, Select
 from torch_denkf.pretrained import from_pretrained
 
-__all__ = ["car_task"]
-
 FINER = 5  # filter steps between two frames
 DT, FIX, LATE = KITTI_DT / FINER, 48, 15  # s; steps between two fixes of the GPS, and by which they are late
 CAMERA = torch.tensor([0.6, 0.02])  # m/s and rad/s of the camera's readings in training, and their gain's error

@@ -13,8 +13,8 @@ from statistics import median
 import torch
 from tensordict import TensorDict
 
-from benchmarks.common.arguments import command, parse, processor
-from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.jobs import compute
 from benchmarks.common.tables import Columns, head, line, pick, write_page
 from benchmarks.fusion.arm import arm_task
 from benchmarks.fusion.car import car_task
@@ -111,7 +111,6 @@ def rms(error: torch.Tensor) -> float:
 
 def job(name: str, seed: int, study: Study) -> list[dict]:
     """All of one task, trained with one seed."""
-    torch.set_num_threads(1)
     if name == "UR5":
         sizes = {"demos": (2, 2), "steps": 3} if study.smoke else {"demos": study.demos}
         task = arm_task(**sizes, validate=study.validate)
@@ -127,11 +126,6 @@ def job(name: str, seed: int, study: Study) -> list[dict]:
         train(task, weights, updates=updates, window=window, batch=BATCH, seed=seed)
         write_checkpoint(file, {"parts": task.parts.state_dict(), "weights": weights.state_dict()})
     return [{**row, "seed": seed} for row in rows(task, weights)]
-
-
-def one_file(file: Path, name: str, seed: int, study: Study) -> None:
-    """A job of its own process: rows into a file."""
-    once(file, partial(job, name, seed, study))
 
 
 def page(found: Sequence[dict], study: Study) -> str:
@@ -162,8 +156,7 @@ def page(found: Sequence[dict], study: Study) -> str:
         late = dict.fromkeys(row["condition"] for row in own if "late" in row["condition"])
         lines += [line(condition, middle(pick(own, condition=condition))) for condition in late]
         lines.append("")
-    lines += [f"* Command: `{command('fusion')}`.", f"* Hardware: {processor()}; torch {torch.__version__}."]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *made_by("fusion")]) + "\n"
 
 
 def main() -> None:
@@ -173,9 +166,7 @@ def main() -> None:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), seeds=1)
     tasks = ["UR5"] + ["KITTI"] * (study.kitti is not None or study.smoke)
     runs = [(name, seed) for seed in range(study.seeds) for name in tasks]
-    files = {study.out / "parts" / f"{name}-{seed}.json": (name, seed) for name, seed in runs}
-    jobs = [partial(one_file, file, *run, study) for file, run in files.items()]
-    side_by_side(jobs, study.processes, "fusion")
-    found = read_rows(files)
+    jobs = {study.out / "parts" / f"{name}-{seed}.json": partial(job, name, seed, study) for name, seed in runs}
+    found = compute(jobs, study.processes, "fusion")
     COLUMNS.write(found, study.out / "fusion.csv")
     write_page(page(found, study), study.out / "fusion.md")

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 
 from torch_denkf.fusion import FusedFilter
 
-__all__ = ["FAULTS", "FEATURE_STEPS", "Task", "add_features", "delayed", "faulty", "without"]
-
 #: What a sensor does for a while, without a word.
 FAULTS = ("frozen", "offset", "noise")
 STARTUP = 0.5  # seconds, in which the first readings come

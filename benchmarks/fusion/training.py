@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from benchmarks.fusion.task import FAULTS, Task, faulty, without
 from torch_denkf.fusion import SensorAttention
 
-__all__ = ["make_weights", "train"]
-
 FLOOR = 1e-4  # of the weights: the encoders read eight times as often as the camera, and are ten times as exact
 
 

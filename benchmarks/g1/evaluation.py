@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.beliefs import save_belief
 from benchmarks.common.scores import cost
 from benchmarks.g1.baselines import Baselines
-from benchmarks.g1.readings import blackouts
+from benchmarks.g1.readings import BLACK, blackouts
 from benchmarks.g1.recipes import G1Recipe
 from benchmarks.g1.scores import blackout, scores
 from benchmarks.g1.tables import named
 from benchmarks.g1.targets import Target
 from benchmarks.g1.training import run_filter
-from torch_denkf._files import write_bytes
 from torch_denkf.filters import Filter
 
 TIMED = 100  # rows to time a filter on
+PICTURED = 2  # test episodes whose beliefs are left for the plots
 
 
 def score_row(
@@ -58,24 +57,19 @@ def filter_rows(recipe: G1Recipe, model: Filter, readings: dict[str, TensorDict]
 
 
 def save_beliefs(
-    recipe: G1Recipe, model: Filter, readings: dict[str, TensorDict], numbers: list[int], file: Path, *, count: int = 2
+    recipe: G1Recipe, model: Filter, readings: dict[str, TensorDict], numbers: list[int], name: str, folder: Path
 ) -> None:
-    """Leaves beliefs of the first test episodes for the pictures, clean and with black frames: ``FILE.npz``."""
-    size, entries = recipe.target.size, {"episodes": np.array(numbers[:count])}
+    """Leaves beliefs of the first test episodes for the pictures: ``NAME-CONDITION-EPISODE.pt``."""
+    size = recipe.target.size
     for condition in ("clean", "black20", "black20_unannounced"):
-        reading = readings[condition][:count]
-        mean, var = run_filter(model, reading)
-        begin = blackouts(readings[condition]["valid"].sum((1, 2)))[:count]
-        parts = {
-            "mean": mean[..., :size],
-            "var": var[..., :size],
-            "truth": reading["state"],
-            "observed": reading["observed"].squeeze(-1),
-            "length": reading["valid"].sum((1, 2)),
-            "begin": begin,
-            "reading": reading["sensor", "ensemble"].mean(-2),
-        }
-        entries |= {f"{condition}_{name}": value.numpy() for name, value in parts.items()}
-    memory = io.BytesIO()
-    np.savez_compressed(memory, **entries)
-    write_bytes(file, memory.getbuffer())
+        everyone = readings[condition]
+        lengths = everyone["valid"].sum((1, 2))
+        starts = blackouts(lengths)
+        means, variances = run_filter(model, everyone[:PICTURED])
+        for k, reading in enumerate(everyone[:PICTURED]):
+            step, rows = torch.arange(int(lengths[k])), slice(int(lengths[k]))
+            black = (step >= starts[k]) & (step < starts[k] + BLACK) & (condition != "clean")
+            mean, var = means[k, rows, :size], variances[k, rows, :size]
+            read = {"reading": reading["sensor", "ensemble"][rows].mean(-2)}
+            file = folder / f"{name}-{condition}-{numbers[k]}.pt"
+            save_belief(file, mean, var, reading["state"][rows], ~black.unsqueeze(-1), **read)

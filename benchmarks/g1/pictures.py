@@ -5,109 +5,41 @@ Plots hold no frame of the recording. Videos do: they stay in --out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.common.plots import save
+from benchmarks.common.beliefs import Numbers, read_belief
 from benchmarks.g1.recordings import NAMES, Recordings
-from torch_denkf.plots import belief_video, plot_bands
 
 LABELS = [f"{name.replace('_', ' ')}, deg" for name in NAMES]
-DEGREES = [180 / np.pi] * len(NAMES)
 SHOWN = (("clean", 0), ("black20", 1), ("black20_unannounced", 1))  # condition, and which of the saved episodes
-
-
-def read_belief(file: Path, condition: str, which: int) -> TensorDict:
-    """One episode's belief ``[T]`` of a file that :func:`benchmarks.g1.evaluation.save_beliefs` wrote.
-
-    Raises:
-        FileNotFoundError: without the file.
-    """
-    if not file.is_file():
-        raise FileNotFoundError(f"no beliefs in {file}; run the table first, with the filter denkf and the state arm")
-    with np.load(file) as saved:
-        length = int(saved[f"{condition}_length"][which])
-        keys = ("mean", "var", "truth", "observed", "reading", "begin")
-        parts = {key: torch.from_numpy(saved[f"{condition}_{key}"][which : which + 1]) for key in keys}
-        number = int(saved["episodes"][which])
-    belief = TensorDict({"belief": {key: parts[key][0, :length] for key in ("mean", "var")}}, batch_size=[length])
-    belief["state"], belief["reading"] = parts["truth"][0, :length], parts["reading"][0, :length]
-    belief["observed"] = parts["observed"][0, :length].unsqueeze(-1)
-    step = torch.arange(length)
-    belief["black"] = ((step >= parts["begin"]) & (step < parts["begin"] + 20)).unsqueeze(-1)
-    belief["black"] &= condition.startswith("black20")
-    belief["episode"] = torch.full((length,), number)
-    return belief
+FILMED = (0, 3, 6)  # joints in a video
 
 
 def draw_all(study: Recordings) -> Iterator[Path]:
-    """Draws the joints, with and without black frames, and two videos; yields the files.
+    """Draws the joints, with and without black frames, and videos; yields the files.
 
     Raises:
         FileNotFoundError: without beliefs.
     """
-    file = study.out / "beliefs" / "denkf-arm-glimpse-0.npz"
+    data, test = study.data, study.roles(0).test
+    numbers = Numbers(LABELS, [180 / math.pi] * len(LABELS), 1 / data.fps)
     for condition, which in SHOWN:
-        belief = read_belief(file, condition, which)
-        yield draw_joints(belief, study.data.fps, study.out / f"joints-{condition}.png", condition)
-        yield draw_video(belief, study, study.out / f"episode-{condition}.mp4", condition)
+        belief = read_belief(study.out / "beliefs" / f"denkf-arm-glimpse-0-{condition}-{test[which]}.pt")
+        title = _title(belief, test[which], condition)
+        yield numbers.draw(belief, study.out / f"joints-{condition}.png", title)
+        episode = next(e for e in data.episodes if e.number == test[which])
+        pixels = data[torch.arange(episode.start, episode.start + episode.length)]["pixels"]
+        yield numbers.film(belief, pixels, FILMED, study.out / f"episode-{condition}.mp4", title)
 
 
-def _title(belief: TensorDict, condition: str) -> str:
+def _title(belief: TensorDict, number: int, condition: str) -> str:
     error = (belief["belief", "mean"] - belief["state"])[1:].abs().mean().rad2deg()
-    text = f"episode {int(belief['episode'][0])}, unseen in training: {error:.2f} deg on average"
+    text = f"episode {number}, unseen in training: {error:.2f} deg on average"
     if condition == "clean":
         return text
     return text + "; shaded: 20 black frames" + ", which nothing announces" * condition.endswith("unannounced")
-
-
-def draw_joints(belief: TensorDict, fps: float, path: Path, condition: str) -> Path:
-    """All joints over time: truth, mean, 90 % band, and the sensor's readings."""
-    joints = len(NAMES)
-    readings = {dim: belief["reading"][:, dim] for dim in range(joints)}
-    axes = plot_bands(
-        belief,
-        dims=range(joints),
-        names=LABELS,
-        factors=DEGREES,
-        readings=readings,
-        observed=~belief["black"],
-        time=1 / fps,
-        band="variance",
-    )
-    figure = axes[0].figure
-    figure.set_size_inches(9, 12)
-    figure.suptitle(_title(belief, condition))
-    save(figure, path)
-    return path
-
-
-def draw_video(belief: TensorDict, study: Recordings, path: Path, condition: str) -> Path:
-    """The recording with truth and belief of three joints beside it; black where the camera was."""
-    data = study.data
-    number = int(belief["episode"][0])
-    episode = next(e for e in data.episodes if e.number == number)
-    pixels = data[torch.arange(episode.start, episode.start + episode.length)]["pixels"]
-    pixels = pixels * ~belief["black"].view(-1, 1, 1, 1)
-    dims = (0, 3, 6)
-    belief_video(
-        path,
-        belief.exclude("observed"),
-        pixels,
-        observed=~belief["black"],
-        time=1 / data.fps,
-        bands={
-            "dims": dims,
-            "names": [LABELS[dim] for dim in dims],
-            "factors": [DEGREES[dim] for dim in dims],
-            "band": "variance",
-        },
-        title=_title(belief, condition),
-        every=2,
-        size=(11, 5),
-    )
-    return path

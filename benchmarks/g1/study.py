@@ -225,9 +225,10 @@ def _filter(base: Base, names: dict) -> list[dict]:
     recipe, model = base.train(names["filter"])
     rows = filter_rows(recipe, model, base.test, names)
     rows[0]["validation_crps"] = filter_error(recipe, model, joined(base.validation))["crps"]
-    if names["filter"] in ("denkf", "denkfactions") and base.target.name == "arm" and base.trained.kind == FIRST:
-        file = base.study.out / "beliefs" / f"{names['filter']}-{base.name}.npz"
-        save_beliefs(recipe, model, base.test, base.trained.roles.test, file)
+    if names["filter"] == "denkf" and base.target.name == "arm" and base.trained.kind == FIRST:
+        save_beliefs(
+            recipe, model, base.test, base.trained.roles.test, f"denkf-{base.name}", base.study.out / "beliefs"
+        )
     return rows
 
 

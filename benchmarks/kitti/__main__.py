@@ -10,12 +10,10 @@ from pathlib import Path
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
-from benchmarks.kitti.folds import Part, with_disturbances
 from benchmarks.kitti.frontier import draw
-from benchmarks.kitti.streams import find_streams, prepare, spans
-from benchmarks.kitti.study import Study, evaluate_and_draw, make_jobs, prepare_jobs, rows_of, run_jobs
+from benchmarks.kitti.study import Study, make_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
-from benchmarks.kitti.training import Budget, load_filter
+from benchmarks.kitti.training import Budget
 from torch_denkf._files import write_text
 from torch_denkf.applications.car import write_drives
 
@@ -30,44 +28,15 @@ def smoke(study: Study) -> Study:
     return replace(study, root=folder / "kitti", out=folder / "out", **kinds, **settings)
 
 
-def write_table(study: Study, rows: list[dict], begun: float) -> None:
-    """Leaves rows and their tables in the study's folder."""
-    header = f"`{command('kitti')}`: {(time.time() - begun) / 60:.0f} min, {study.processes} process(es)"
-    report(study.out, COLUMNS, rows, markdown(rows, header))
-
-
 def table(study: Study) -> None:
     """Trains and tests every filter and sensor on every fold."""
     begun = time.time()
     jobs = make_jobs(study)
     write_text(study.out / "settings.json", json.dumps(asdict(study), indent=1, default=str))
     run_jobs(jobs, study.processes)
-    write_table(study, rows_of(study.out), begun)
-
-
-def train(study: Study) -> None:
-    """Trains filters on the folds that leave the --test drives out, without testing them."""
-    jobs = make_jobs(study)
-    prepare_jobs(jobs, study.processes)
-    for job in jobs:
-        base = job.base()
-        for name in study.filters:
-            job.train(name, base)
-            print(f"{job.out(name)}: evaluate --checkpoint {job.out(name)} --test {job.fold.name}")
-
-
-def evaluate(study: Study) -> None:
-    """Tests one trained filter on any drives, those of another folder, too."""
-    begun = time.time()
-    if study.checkpoint is None:
-        raise SystemExit("evaluate needs --checkpoint: a folder that train or table left in --out/folds")
-    recipe, model, name, sensor = load_filter(study.checkpoint)
-    streams = find_streams(study.root, study.size, list(study.test) or None)
-    parts = with_disturbances([Part(stream) for stream in streams])
-    prepare([each for part in parts for each in spans(part.stream, sensor)], study.cache, study.processes)
-    names = {"filter_name": name, "kind": sensor, "seed": 0}
-    rows = evaluate_and_draw(recipe, model, streams, study.cache, study.out / "plots", **names)
-    write_table(study, rows, begun)
+    rows = rows_of(study.out)
+    header = f"`{command('kitti')}`: {(time.time() - begun) / 60:.0f} min, {study.processes} process(es)"
+    report(study.out, COLUMNS, rows, markdown(rows, header))
 
 
 def main() -> None:
@@ -81,10 +50,9 @@ def main() -> None:
     if study.command == "frontier" and not study.smoke:
         print(*draw(study), sep="\n")
         return
-    {"table": table, "train": train, "evaluate": evaluate}.get(study.command, table)(study)
+    table(study)
     if study.smoke:
         print(*draw(study), sep="\n")
-        evaluate(replace(study, checkpoint=next(study.out.glob("folds/*/filter.pt")).parent))
 
 
 if __name__ == "__main__":

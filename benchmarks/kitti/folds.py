@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
-from benchmarks.kitti.streams import DISTURBANCES, Stream, mirror, rows
-from torch_denkf.applications.car.odometry.batches import with_start
+from benchmarks.kitti.streams import DISTURBANCES, LONGEST, Stream, read_by
+from torch_denkf.applications.car.odometry.batches import PairSampler
+from torch_denkf.applications.car.odometry.streams import rows
 
 VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 # Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
@@ -42,6 +42,11 @@ class Part:
     begin: float = 0.0  # shares of its rows
     end: float = 1.0
     weight: float = 1.0
+
+    @property
+    def steps(self) -> int:
+        """Between the two frames of a pair."""
+        return self.stream.steps
 
     def read(self, cache: Path) -> TensorDict:
         """The stretch, ``[n]``."""
@@ -139,7 +144,8 @@ def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
     velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
     loc, scale = velocity.mean(0), velocity.std(0)
     loc[1], scale[1] = 0.0, velocity[:, 1].square().mean().sqrt()
-    frames = [rows(part, torch.arange(1, len(part), max(len(part) // 50, 1)), "image")["pixels"] for part in data]
+    some = [torch.arange(1, len(part), max(len(part) // 50, 1)) for part in data]
+    frames = [rows(read_by("image", part), at, LONGEST)["pixels"] for part, at in zip(data, some, strict=True)]
     frames = torch.cat(frames)
     dt = torch.stack([part["dt"][0, 0] for part in data])
     if (dt / dt[0] - 1).abs().max() > 0.01:
@@ -147,36 +153,7 @@ def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
     return Statistics(loc, scale, frames.mean((0, 2, 3)), frames.std((0, 2, 3)), float(dt[0]))
 
 
-class FrameSampler:
+def frame_sampler(parts: Sequence[Part], cache: Path, sensor: str) -> PairSampler:
     """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
-
-    def __init__(self, parts: Sequence[Part], cache: Path, sensor: str, streams_per_batch: int = 8):
-        parts = [part for part in parts if part.stream.steps == 1 or sensor == "flow"]
-        self.data, self.sensor, self.count = [part.read(cache) for part in parts], sensor, streams_per_batch
-        self.steps = torch.tensor([part.stream.steps for part in parts])
-        self.weight = torch.tensor([part.weight for part in parts])
-
-    def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
-        """Observed frames ``[batch]``, every second one mirrored."""
-        count = batch // self.count
-        return torch.cat(
-            self._draw(generator, self.weight, lambda n: torch.randint(1, n, (count,), generator=generator))
-        )
-
-    def windows(self, generator: torch.Generator, length: int, start_std: Tensor) -> TensorDict:
-        """Windows ``[streams_per_batch, length]`` that start from a wrong velocity."""
-        steps = torch.arange(length)
-        chosen = self._draw(
-            generator,
-            self.weight * (self.steps == 1),
-            lambda n: torch.randint(1, n - length + 1, (), generator=generator) + steps,
-        )
-        return with_start(torch.stack(chosen), start_std, generator)
-
-    def _draw(self, generator: torch.Generator, weight: Tensor, index: Callable[[int], Tensor]) -> list[TensorDict]:
-        chosen: list[TensorDict] = []
-        for number in torch.multinomial(weight, self.count, replacement=True, generator=generator).tolist():
-            data = self.data[number]
-            frames = rows(data, index(len(data)), self.sensor)
-            chosen.append(mirror(frames) if len(chosen) % 2 else frames)
-        return chosen
+    parts = [part for part in parts if part.steps == 1 or sensor == "flow"]
+    return PairSampler(parts, [read_by(sensor, part.read(cache)) for part in parts], LONGEST)

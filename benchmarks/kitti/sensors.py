@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.common.scores import SensorLoss
-from benchmarks.kitti.folds import Fold, FrameSampler, Part, Statistics, statistics
+from benchmarks.kitti.folds import Fold, Part, Statistics, frame_sampler, statistics
 from benchmarks.kitti.readings import read_sensor, read_spans
 from torch_denkf.applications.car import FlowSensor
 from torch_denkf.functional import crps_ensemble
@@ -81,7 +81,7 @@ class SensorTraining:
         self, sensor: SubModel, parts: Sequence[Part], held_out: Sequence[Part], out: Path, updates: int, **settings
     ) -> SubModel:
         """Trains a sensor alone, or reads it where that was done before; settings are ``lr`` and ``keep``."""
-        sampler, loss = FrameSampler(parts, self.cache, self.kind), sensor_loss(sensor, self.facts.unit)
+        sampler, loss = frame_sampler(parts, self.cache, self.kind), sensor_loss(sensor, self.facts.unit)
         rates = {"lr": settings.pop("lr", 2e-3), "weight_decay": 0.02}
         return train_part(
             sensor,

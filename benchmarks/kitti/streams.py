@@ -15,9 +15,8 @@ from torchrl.envs.transforms import Transform
 from benchmarks.common.jobs import side_by_side
 from torch_denkf.applications.car import read_kitti_drive, with_motion
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
-from torch_denkf.applications.car.kitti.frames import MOTION_KEYS, frames_at
+from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
 from torch_denkf.applications.car.kitti.gaps import steps_between
-from torch_denkf.applications.car.kitti.mirror import mirror_drive
 from torch_denkf.applications.car.vision import static_region
 from torch_denkf.data.cache import cached
 from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
@@ -152,15 +151,6 @@ def spans(stream: Stream, sensor: str) -> list[Stream]:
     return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
 
 
-def rows(stream: TensorDict, index: torch.Tensor, sensor: str) -> TensorDict:
-    """Rows of a stream as the sensor reads them, and what it should read: the velocities of all steps of the pair."""
-    frames = frames_at(stream.exclude("image") if sensor == "flow" else stream.exclude(*MOTION_KEYS), index)
-    lags = torch.arange(LONGEST)
-    velocity = stream["state"][(index.unsqueeze(-1) - lags).clamp_min(0)][..., 3:]
-    return frames.set("target_observation", (velocity * (lags < frames["steps"]).unsqueeze(-1)).sum(-2))
-
-
-def mirror(frames: TensorDict) -> TensorDict:
-    """What a mirrored world would have shown: sideways motion and turns change sign."""
-    mirrored = mirror_drive(frames)
-    return mirrored.set("target_observation", frames["target_observation"] * torch.tensor([1.0, -1.0]))
+def read_by(sensor: str, stream: TensorDict) -> TensorDict:
+    """A stream without what a sensor does not read."""
+    return stream.exclude("image") if sensor == "flow" else stream.exclude(*MOTION_KEYS)

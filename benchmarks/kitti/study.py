@@ -32,19 +32,17 @@ SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
 class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
-    table: leave one drive out after the other, in all conditions. train: some folds, without testing. evaluate: one
-    trained filter on any drives. frontier: error against milliseconds a step of the filters that a table left. What
-    was broken off goes on where it stopped. See benchmarks/kitti/README.md.
+    table: leave one drive out after the other, in all conditions. frontier: error against milliseconds a step of the
+    filters that a table left. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
     """
 
-    command: Positional[Literal["train", "evaluate", "table", "frontier"]] = "table"
+    command: Positional[Literal["table", "frontier"]] = "table"
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/kitti")  # checkpoints, logs, table and plots
     drives: tuple[str, ...] = ()  # drives of the study; all that are found
     test: tuple[str, ...] = ()  # drives to leave out, one after the other; all
     filters: some_of(sorted(FILTERS)) = ("denkf",)
     sensors: some_of(sorted(SENSORS)) = ("flow",)
-    checkpoint: Path | None = None  # of evaluate: a folder below --out/folds
     seeds: int = 1
     rendered: int = 0  # drives to render for a first training of the sensor
     first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out

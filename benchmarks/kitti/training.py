@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from benchmarks.common.scores import belief_crps
 from benchmarks.common.training import fit_filter, read_filter
-from benchmarks.kitti.folds import VELOCITIES, Fold, FrameSampler, Statistics
+from benchmarks.kitti.folds import VELOCITIES, Fold, Statistics, frame_sampler
 from benchmarks.kitti.readings import read_spans
 from benchmarks.kitti.recipes import FILTERS, KITTIRecipe
 from benchmarks.kitti.sensors import SENSORS, SensorOfFold, sensor_loss
-from torch_denkf.applications.car.odometry.batches import ReadingSampler
-from torch_denkf.applications.car.odometry.scores import EndToEndLoss
+from torch_denkf.applications.car.odometry.batches import ReadingSampler, mark_start
+from torch_denkf.applications.car.odometry.scores import EndToEndLoss, gain_of
 from torch_denkf.applications.car.odometry.streams import all_frames, lose_frames
 from torch_denkf.filters import Filter
 from torch_denkf.training import Stage
@@ -47,9 +47,7 @@ class Budget:
 @torch.no_grad()
 def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict], seed: int = 0) -> TensorDict:
     """Filters readings of one length side by side, ``[K, N]``, each from its true first state."""
-    batch = torch.stack([reading.copy() for reading in readings])
-    batch["is_init"] = torch.zeros(*batch.batch_size, 1, dtype=torch.bool)
-    batch["is_init"][:, 0] = True
+    batch = mark_start(torch.stack([reading.copy() for reading in readings]))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return recipe.part(model, sensor=False).sequence(batch)
@@ -86,13 +84,9 @@ def calibration_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[Ten
 
 def log_gains(fold: Fold, base: SensorOfFold) -> Tensor:
     """How far off a sensor's speed is over each whole drive that it has not seen: logarithms of read by driven."""
-    logarithms = []
-    for part, (first, last, _) in zip(fold.tune, base.readings[::2], strict=True):
-        if part.stream.condition == "clean":
-            drive = all_frames(torch.cat([first, last]))[1:]
-            read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
-            logarithms.append((read.sum() / driven.sum()).clamp(0.5, 2.0).log())
-    return torch.stack(logarithms)
+    drives = zip(fold.tune, base.readings[::2], strict=True)
+    clean = [torch.cat([first, last]) for part, (first, last, _) in drives if part.stream.condition == "clean"]
+    return torch.stack([gain_of(reading) for reading in clean])
 
 
 def certain_gain(gains: Tensor) -> float:
@@ -131,7 +125,7 @@ def train_filter(
     def stages() -> list[Stage]:
         readings, weights = [tune for tune, _, _ in base.readings], [share for *_, share in base.readings]
         windows = ReadingSampler(readings, weights, budget.length, float(gains.square().mean().sqrt()))
-        frames = FrameSampler(fold.train, cache, kind)
+        frames = frame_sampler(fold.train, cache, kind)
         third = max(budget.end_to_end // 3, 1)
         return [
             Stage(

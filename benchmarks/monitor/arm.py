@@ -19,22 +19,6 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, Select
 from torch_denkf.monitoring import Gated, InnovationMonitor, MonitoredSensor
 from torch_denkf.pretrained import from_pretrained
 
-__all__ = [
-    "CHOSEN",
-    "FAULTS",
-    "ArmGuard",
-    "Beliefs",
-    "arm_filter",
-    "arm_monitor",
-    "arm_rows",
-    "chosen_on",
-    "demo_runs",
-    "error_of",
-    "gated_errors",
-    "own_demos",
-    "read_demos",
-]
-
 JOINTS, STEPS = 7, 320
 ENCODER = 0.01  # rad: noise of the encoders
 FIRST, LAST = 120, 180  # steps of a fault

@@ -22,8 +22,6 @@ from torch_denkf.applications.car.vision.signs import FLOW_SIGNS
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor, SignGate
 
-__all__ = ["CHOSEN", "CarGuard", "CarGates", "clean_rows", "drive_rows", "gates_of", "monitor_of", "path_scores"]
-
 #: Up to half of a picture may be sun or shadow, and one brighter than the last by two thirds; 1 % may be any smear.
 FLOOR = (0.01, 0.5, 0.5, 0.5, 0.0, 0.0)
 PICTURES = len(PICTURE_SIGNS)

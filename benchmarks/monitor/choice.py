@@ -15,8 +15,6 @@ from benchmarks.monitor.car import CarGuard, gates_of, monitor_of, path_scores, 
 from benchmarks.monitor.drives import FAULTS, car_filter, filtered, side_by_side
 from benchmarks.monitor.scores import detection, false_alarms
 
-__all__ = ["choose_arm", "choose_car"]
-
 RATES = (0.005, 0.02, 0.05, 0.1, 0.15, 0.2)
 MARGINS = (1.0, 1.3, 1.6, 2.0)
 REFERENCES = (1.0, 1.5, 2.0)

@@ -25,18 +25,6 @@ from torch_denkf.filters import Filter
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.transforms import BlackFrames, Brightness, OccludingBox
 
-__all__ = [
-    "ALWAYS",
-    "FAULTS",
-    "SIGNS",
-    "believed_spans",
-    "car_filter",
-    "failing",
-    "filtered",
-    "side_by_side",
-    "stretches",
-]
-
 LENGTH, PERIOD = 20, 60  # frames that a fault lasts, and between the beginnings of two
 SIGNS = (*PICTURE_SIGNS, *FLOW_SIGNS)
 _IMAGE = {"in_keys": ("image",)}

@@ -9,8 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Run", "afterwards", "auroc", "detection", "false_alarms", "spans_of"]
-
 AFTER = 10  # steps after a fault in which an alarm is neither right nor wrong, and an error may settle
 
 

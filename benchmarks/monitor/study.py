@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import torch
-
-from benchmarks.common.arguments import command, parse, processor
-from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.jobs import compute
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.monitor import car
 from benchmarks.monitor.drives import FAULTS, failing
@@ -71,7 +69,6 @@ def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
 
 def rows_of(study: Study, task: str) -> list[dict]:
     """The rows of one task."""
-    torch.set_num_threads(1)
     cache = study.out / "readings"
     if task == "ur5":
         from benchmarks.monitor.arm import arm_rows, own_demos  # needs mujoco
@@ -101,7 +98,6 @@ def rows_of(study: Study, task: str) -> list[dict]:
 
 def trials_of(study: Study, task: str) -> list[dict]:
     """What is tried for one task on drives or demos that are in no test, and in the last row what is chosen."""
-    torch.set_num_threads(1)
     if task == "ur5":
         from benchmarks.monitor.arm import chosen_on, own_demos
         from benchmarks.monitor.choice import choose_arm
@@ -122,11 +118,6 @@ def trials_of(study: Study, task: str) -> list[dict]:
     return [*rows, {"trial": "car: chosen", **asdict(guard)}]
 
 
-def one_task(study: Study, task: str, file: Path) -> None:
-    """A job of its own process: rows into a file."""
-    once(file, partial(trials_of if study.choose else rows_of, study, task))
-
-
 def choice_page(rows: Sequence[dict], study: Study) -> str:
     """Everything that was tried, and what is chosen."""
     lines = ["# What is chosen, and on what", ""]
@@ -140,8 +131,7 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
         "Drives and demos of these trials are in no test. Car: 16 invented drives calibrate, each left out where it is",
         "judged itself; 8 others have the faults. Arm: 23 of 70 demos calibrate, 47 have the faults.",
         "",
-        f"* Command: `{command('monitor')}`; {study.draws} draws of the filter's noise.",
-        f"* Hardware: {processor()}; torch {torch.__version__}.",
+        *made_by("monitor", f"; {study.draws} draws of the filter's noise"),
     ]
     return "\n".join(lines) + "\n"
 
@@ -179,8 +169,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
         "with the gate, what the pictures speak against is read again over two or three steps. box-all: a box hides",
         "5 % of each frame; with the gate, the flow is continued over it.",
         "",
-        f"* Command: `{command('monitor')}`; {study.draws} draws of the filter's noise.",
-        f"* Hardware: {processor()}; torch {torch.__version__}.",
+        *made_by("monitor", f"; {study.draws} draws of the filter's noise"),
     ]
     return "\n".join(lines) + "\n"
 
@@ -197,11 +186,13 @@ def main() -> None:
         tasks = ["ur5"] * ("ur5" in study.tasks) + ["car"] * any(task != "ur5" for task in study.tasks)
     else:
         tasks = [task for task in study.tasks if task != "kitti-real" or study.root is not None]
-    files = {task: study.out / ("choice" if study.choose else "parts") / f"{task}.json" for task in tasks}
-    side_by_side([partial(one_task, study, task, file) for task, file in files.items()], study.processes, "monitor")
+    folder, rows_for = (study.out / "choice", trials_of) if study.choose else (study.out / "parts", rows_of)
+    rows = compute(
+        {folder / f"{task}.json": partial(rows_for, study, task) for task in tasks}, study.processes, "monitor"
+    )
     if study.choose:
-        write_page(choice_page(read_rows(files.values()), study), study.out / "choice.md")
+        write_page(choice_page(rows, study), study.out / "choice.md")
         return
-    rows = sorted(read_rows(files.values()), key=COLUMNS.order)
+    rows = sorted(rows, key=COLUMNS.order)
     COLUMNS.write(rows, study.out / "monitor.csv")
     write_page(page(rows, study), study.out / "monitor.md")

@@ -25,8 +25,6 @@ from typing import Any, Literal
 import torch_denkf
 from benchmarks.reliability.hostile import MARK
 
-__all__ = ["SECONDS", "Case", "Refused", "Verdict", "apart", "judge", "workshop"]
-
 Kind = Literal["clear", "right", "unclear", "silent", "hang", "crash"]
 
 SECONDS = 20.0  # after which a case counts as a hang

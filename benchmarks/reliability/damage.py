@@ -15,8 +15,6 @@ from hypothesis import strategies as st
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["Wrong", "copied", "drawn", "fields", "finite", "gone", "same", "same_but", "written"]
-
 NAN, INF = math.nan, math.inf
 Named = st.SearchStrategy[tuple[str, Any]]
 
@@ -76,7 +74,6 @@ RATE = SHARE | {"one": 1.0, "too small for eight bits": 0.001}
 COUNT = Wrong({"zero": 0, "negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
 LARGE_COUNT = COUNT | {"one": 1}
 COUNT_OR_NONE = Wrong({"negative": -3, "fraction": 2.5, **TEXT}, drawn(NO_COUNT))
-FROM_ZERO = COUNT_OR_NONE
 CHOICE = Wrong({"unknown": "sideways", "a number": 3, "empty": ""}, drawn(st.text("xyz?", min_size=1)))
 MODULE = Wrong({"nothing": None, "text": "network"}, drawn(st.integers() | st.binary(max_size=4)))
 SIZE = Wrong(

@@ -21,8 +21,6 @@ from benchmarks.common.tables import head, line
 from benchmarks.reliability.case import Case, Verdict, judge
 from benchmarks.reliability.target import Target
 
-__all__ = ["BORDERS", "Fuzz", "all_targets", "search", "summary"]
-
 #: Modules of benchmarks/reliability/borders.
 BORDERS = (
     "filters_made",

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["MARK", "PICKLES", "Bomb", "npz_of_zeros"]
-
 #: What a hostile file makes in the working folder when it gets to run.
 MARK = "the-code-ran"
 

@@ -15,8 +15,6 @@ from benchmarks.common.arguments import command, processor, some_of
 from benchmarks.common.tables import head, line
 from benchmarks.reliability.soaks import disks, kills, layouts, steps
 
-__all__ = ["PARTS", "Soak"]
-
 PARTS = ("steps", "kills", "disks", "layouts")
 RESULTS = Path(__file__).parent / "results"
 

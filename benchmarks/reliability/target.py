@@ -14,8 +14,6 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import SECONDS, Case
 from torch_denkf._arguments import _signature
 
-__all__ = ["Folder", "Subject", "Target"]
-
 
 @dataclass(frozen=True)
 class Target:

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.common.arguments import command, processor
+from benchmarks.common.arguments import made_by
 from benchmarks.common.tables import Columns, head, line, pick
 from benchmarks.smoothing import gaussian, linear
 from benchmarks.smoothing.gaussian import Series
@@ -198,5 +198,4 @@ def page(rows: Sequence[dict], ways: Sequence[dict]) -> str:
         for group in dict.fromkeys(row["group"] for row in ways):
             errors = [fmean(r["translation_m_per_m"] for r in pick(ways, group=group, method=m)) for m in methods]
             lines.append(line(group, *(f"{error:.4f} m/m" for error in errors)))
-    lines += ["", f"* Command: `{command('smoothing')}`.", f"* Hardware: {processor()}; torch {torch.__version__}."]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *made_by("smoothing")]) + "\n"

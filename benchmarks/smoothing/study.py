@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean
 
-import torch
-
-from benchmarks.common.arguments import command, parse, processor
-from benchmarks.common.jobs import once, read_rows, side_by_side
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.jobs import compute, read_rows
 from benchmarks.common.tables import Columns, head, line, pick, write_page
 from benchmarks.smoothing import against_dapper, ours, paths, real
 from benchmarks.smoothing.cases import CASES
@@ -48,12 +46,6 @@ class Study:
     real: bool = False  # recordings in the place of chaotic systems
     root: Path | None = None  # of --real: folder with KITTI's sequences and poses
     smoke: bool = False  # a few cycles: does it run?
-
-
-def one_file(file: Path, rows: partial) -> None:
-    """A job of its own process: rows into a file."""
-    torch.set_num_threads(1)
-    once(file, rows)
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
@@ -95,13 +87,9 @@ def page(rows: Sequence[dict], study: Study) -> str:
         partly = [f" ({count} seeds)" if 0 < count < len(found) else "" for count in counts]
         cells += ["" if error is None else f"{error:.3f}{seeds}" for error, seeds in zip(errors, partly, strict=True)]
         lines.append(line(*cells, f"{case.scored} {case.target}", "yes" if scored <= case.target else "no"))
-    lines += [
-        "",
-        f"* Command: `{command('smoothing')}`; seeds 0 to {study.seeds - 1}, none left out; {study.cycles:,} cycles of",
-        "  25 (Lorenz-63) and 15 (Lorenz-96) small steps of 0.01; double precision.",
-        f"* Hardware: {processor()}; torch {torch.__version__}.",
-    ]
-    return "\n".join(lines) + "\n"
+    said = f"; seeds 0 to {study.seeds - 1}, none left out; {study.cycles:,} cycles of\n"
+    said += "  25 (Lorenz-63) and 15 (Lorenz-96) small steps of 0.01; double precision"
+    return "\n".join([*lines, "", *made_by("smoothing", said)]) + "\n"
 
 
 def main() -> None:
@@ -121,8 +109,7 @@ def main() -> None:
             for seed in seeds:
                 file = parts / f"{case.name}-dapper-{seed}.json"
                 jobs[file] = partial(against_dapper.rows, case, seed, study.cycles)
-    side_by_side([partial(one_file, file, rows) for file, rows in jobs.items()], study.processes, "smoothing")
-    rows = joined(read_rows(jobs))
+    rows = joined(compute(jobs, study.processes, "smoothing"))
     COLUMNS.write(rows, study.out / "smoothing.csv")
     write_page(page(rows, study), study.out / "smoothing.md")
 
@@ -130,8 +117,7 @@ def main() -> None:
 def run_real(study: Study) -> None:
     """The part on recordings."""
     jobs, ways = real.jobs(study.root, study.out, study.smoke)
-    calls = [partial(one_file, file, rows) for file, rows in {**jobs, **ways}.items()]
-    side_by_side(calls, study.processes, "smoothing")
+    compute({**jobs, **ways}, study.processes, "smoothing")
     rows, way_rows = read_rows(jobs), read_rows(ways)
     real.COLUMNS.write(rows, study.out / "smoothing_real.csv")
     if way_rows:

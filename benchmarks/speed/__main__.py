@@ -28,9 +28,10 @@ PAIRS = (
     "against_dapper",
     "against_floor",
     "packaged_step",
+    "training_step",  # and these are commands of their own
+    "transform_cost",
+    "scaling",
 )
-#: Of this package, and commands of their own: with ratios() -> list[dict].
-SCRIPTS = ("training_step", "transform_cost", "scaling")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
 
@@ -45,8 +46,6 @@ def in_this_process(name: str, seconds: float, out: Path) -> None:
         from benchmarks.speed.machine import measure
 
         result = measure()
-    elif name in SCRIPTS:
-        result = importlib.import_module(f"benchmarks.speed.{name}").ratios()
     else:
         result = [row.as_dict() for row in importlib.import_module(f"benchmarks.speed.{name}").rows(seconds)]
     out.write_text(json.dumps(result))
@@ -94,7 +93,7 @@ def smoke() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=12.0, help="to spend on each comparison (default: 12)")
-    parser.add_argument("--only", nargs="+", default=[*PAIRS, *SCRIPTS], help="run these pairs, keep other rows")
+    parser.add_argument("--only", nargs="+", default=PAIRS, choices=PAIRS, help="run these pairs, keep other rows")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="folder of the results")
     parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "speed.png")
     parser.add_argument(
@@ -119,10 +118,10 @@ def main() -> None:
 
     begun = time.perf_counter()
     machine = in_own_process("machine", args.seconds)
-    names = [name for name in args.only if name in PAIRS or name in SCRIPTS]
+    names = args.only
     command = "make bench" if set(names) >= set(PAIRS) else "python -m benchmarks.speed --only " + " ".join(names)
     command += " --no-compile" * args.no_compile + " --plain" * args.plain
-    known, order = args.out / "speed.json", [*PAIRS, *SCRIPTS]
+    known, order = args.out / "speed.json", PAIRS
     for name in names:
         print(f"{name} ...", flush=True)
         new = [{**row, "pair": name} for row in in_own_process(name, args.seconds)]

@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from statistics import median
 
+MET = {True: "yes", False: "**no**", None: ""}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -22,6 +24,7 @@ class Row:
         name: what is compared, with its size.
         ratio: ours over theirs; below 1 ours is faster.
         target: the ratio must not exceed it; ``None`` where there is none to meet.
+        least: nor be below this, where it is no ratio of times.
         aim: the ratio hoped for.
         ours_us: microseconds of processor time that ours takes, a step unless the name says otherwise.
         theirs_us: the same of the other.
@@ -35,11 +38,17 @@ class Row:
     ours_us: float | None = None
     theirs_us: float | None = None
     note: str = ""
+    least: float = 0.0
 
     @property
     def met(self) -> bool | None:
         """Whether the target is met; ``None`` without a target or a measurement."""
-        return None if self.target is None or self.ratio is None else self.ratio <= self.target
+        return None if self.target is None or self.ratio is None else self.least <= self.ratio <= self.target
+
+    @property
+    def met_text(self) -> str:
+        """The same in a table."""
+        return MET[self.met]
 
     def as_dict(self) -> dict:
         """What is written to JSON."""
@@ -104,6 +113,19 @@ def interleave(
     finally:
         gc.enable()
     return Timings(times)
+
+
+def in_turn(calls: Mapping[str, Callable[[], object]], rounds: int, repeats: int = 1) -> Timings:
+    """Times calls that take long: so many rounds of all of them, after one that warms up; each so often in a round."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(rounds + 1):
+        for name, call in calls.items():
+            began = time.process_time()
+            for _ in range(repeats):
+                call()
+            if turn:
+                seconds[name].append((time.process_time() - began) / repeats)
+    return Timings(seconds)
 
 
 def settle(limit: float = 30.0) -> None:

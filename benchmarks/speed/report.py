@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from torch_denkf._files import replacing, write_text
+from benchmarks.common.tables import head, line
+from benchmarks.speed.pairs import MET
+from torch_denkf._files import write_text
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -27,25 +29,20 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
         "image sensor) unless the row says otherwise. Pairs that this command leaves out were measured before. Plain:",
         "the ratio of a compiled filter without this package's passes for inductor, from `--plain`.",
         "",
-        "| what | ratio | plain | target | aim | met | ours, us | theirs, us | what differs |",
-        "|---|---|---|---|---|---|---|---|---|",
+        *head("what", "ratio", "plain", "target", "aim", "met", "ours, us", "theirs, us", "what differs"),
     ]
     for row in rows:
-        met = {True: "yes", False: "**no**", None: ""}[row.get("met")]
         ratio = number(row["ratio"]) or "not measured"
         limits = [number(row.get("target")), number(row.get("aim"))]
         times = [number(row.get("ours_us"), 1), number(row.get("theirs_us"), 1)]
         plain = number(row.get("plain"))
-        lines.append("| " + " | ".join([row["name"], ratio, plain, *limits, met, *times, row.get("note", "")]) + " |")
+        lines.append(line(row["name"], ratio, plain, *limits, MET[row.get("met")], *times, row.get("note", "")))
     return "\n".join(lines) + "\n"
 
 
 def picture(rows: list[dict], path: Path) -> None:
     """Ratios as bars on a logarithmic axis, with a mark at each target."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from benchmarks.common.plots import plt, save
 
     rows = [row for row in rows if row["ratio"]][::-1]
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.3 * len(rows)))
@@ -62,9 +59,7 @@ def picture(rows: list[dict], path: Path) -> None:
     axes.set_xlabel("ours / theirs (black: target; green: met)")
     axes.margins(x=0.12, y=0.01)
     figure.tight_layout()
-    with replacing(path) as beside:
-        figure.savefig(beside, dpi=120)
-    plt.close(figure)
+    save(figure, path, dpi=120)
 
 
 def write(rows: list[dict], machine: dict, command: str, seconds: float, results: Path, plot: Path) -> None:

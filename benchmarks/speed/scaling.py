@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.arguments import command, parse
-from benchmarks.common.tables import write_page
+from benchmarks.common.tables import head, line, write_page
 from benchmarks.speed.machine import in_child
+from benchmarks.speed.pairs import Row
 from torch_denkf.functional import analyse
 
 MEMBERS = 32
@@ -139,20 +140,24 @@ def measure(rounds: int = 9, sizes: tuple[int, ...] = SIZES) -> dict[str, dict]:
     return out
 
 
-def ratios(found: dict[str, dict] | None = None) -> list[dict]:
-    """Rows for ``make bench``: slopes, which must also be at least 0.9, and copies of the ensemble."""
+def rows_of(found: dict[str, dict]) -> list[Row]:
+    """Slopes, which must also be at least 0.9, and copies of the ensemble."""
     rows = []
-    for scheme, values in (measure() if found is None else found).items():
+    for scheme, values in found.items():
         for what in ("seconds", "bytes"):
             value = slope(values["sizes"], values[what])
             name = f"analysis ({scheme}), S = O: slope of {'time' if what == 'seconds' else 'memory'} from 10^4 to 10^6"
-            rows.append({"name": name, "ratio": value, "target": 1.1, "met": 0.9 <= value <= 1.1, "note": "0.9 to 1.1"})
+            rows.append(Row(name, value, 1.1, note="0.9 to 1.1", least=0.9))
         large = [held for size, held in zip(values["sizes"], values["copies"], strict=True) if size >= LINEAR_FROM]
         most = max(*large, values["resident_copies"])
         name = f"analysis ({scheme}), S = O: ensembles in memory, at most, from 10^4 to 10^6"
-        note = "arguments and result included"
-        rows.append({"name": name, "ratio": most, "target": COPIES, "met": most <= COPIES, "note": note})
+        rows.append(Row(name, most, COPIES, note="arguments and result included"))
     return rows
+
+
+def rows(seconds: float) -> list[Row]:
+    """The same for ``make bench``, which takes as long as it takes."""
+    return rows_of(measure())
 
 
 def table(found: dict[str, dict], command: str, seconds: float) -> str:
@@ -166,24 +171,17 @@ def table(found: dict[str, dict], command: str, seconds: float) -> str:
         'ensembles [E, S]; the arguments alone are three for "sensor" and two for "etkf". Error: of the increment',
         "against double precision, relative, for variances R of 0.5, 1e-5 and 1e-7 (the members' is 1).",
         "",
-        "| scheme | S = O | time, ms | copies | error, R = 0.5 | R = 1e-5 | R = 1e-7 |",
-        "|---|---|---|---|---|---|---|",
+        *head("scheme", "S = O", "time, ms", "copies", "error, R = 0.5", "R = 1e-5", "R = 1e-7"),
     ]
     for scheme, values in found.items():
         for row, size in enumerate(values["sizes"]):
             errors = [f"{values['errors'][noise][row]:.0e}" for noise in NOISES]
-            cells = [
-                scheme,
-                f"{size:,}",
-                f"{1e3 * values['seconds'][row]:.3g}",
-                f"{values['copies'][row]:.2f}",
-                *errors,
-            ]
-            lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", "| what | value | wanted | met |", "|---|---|---|---|"]
-    for row in ratios(found):
-        wanted = row["note"] if "slope" in row["name"] else f"<= {row['target']}"
-        lines.append(f"| {row['name']} | {row['ratio']:.2f} | {wanted} | {'yes' if row['met'] else '**no**'} |")
+            cells = [f"{1e3 * values['seconds'][row]:.3g}", f"{values['copies'][row]:.2f}", *errors]
+            lines.append(line(scheme, f"{size:,}", *cells))
+    lines += ["", *head("what", "value", "wanted", "met")]
+    for row in rows_of(found):
+        wanted = row.note if row.least else f"<= {row.target}"
+        lines.append(line(row.name, f"{row.ratio:.2f}", wanted, row.met_text))
     resident = ", ".join(f"{scheme} {values['resident_copies']:.2f}" for scheme, values in found.items())
     lines += [
         "",

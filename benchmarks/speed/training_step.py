@@ -13,17 +13,17 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 
 import torch
 from tensordict import TensorDict
 
 from benchmarks.common.arguments import command, parse
-from benchmarks.common.tables import write_page
+from benchmarks.common.tables import head, line, write_page
 from benchmarks.speed.machine import in_child
-from torch_denkf.applications.car import UnicycleTransition
+from benchmarks.speed.pairs import Row, Timings, in_turn
+from benchmarks.speed.workload import car_filter
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, ImageSensor, Select, StochasticMLP
+from torch_denkf.modules import ImageSensor
 from torch_denkf.objectives import DEnKFLoss
 
 BATCH, STEPS, IMAGE = 64, 20, (6, 50, 150)
@@ -36,19 +36,13 @@ OPTIONS = {
     "chunks, recompute, bfloat16": {"recompute": True, "trunk_dtype": torch.bfloat16},
 }
 DEFAULT = "chunks of 32 MiB (default on a CPU)"
+ALONE = ("trunk alone, all frames in one call", "trunk alone, chunks")
 
 
 def make_filter(**options) -> DEnKF:
-    """The README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's sensor and noise."""
+    """The README's filter of a vehicle."""
     torch.manual_seed(0)
-    return DEnKF(
-        transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
-        sensor=ImageSensor(observation_dim=2, image_shape=IMAGE, **options),
-        observation=Select([3, 4]),
-        noise=DiagonalNoise(observation_dim=2),
-        analysis=EnsembleAnalysis("sensor"),
-        initial=AroundState([0.0, 0.0, 0.0, 0.3, 0.02]),
-    )
+    return car_filter(lambda: ImageSensor(observation_dim=2, image_shape=IMAGE, **options))
 
 
 def make_batch(batch: int = BATCH, steps: int = STEPS) -> TensorDict:
@@ -84,46 +78,26 @@ def trunk_alone(denkf: DEnKF, batch: TensorDict, *, chunked: bool):
     return step
 
 
-def measure(rounds: int = 7, batch: int = BATCH, steps: int = STEPS) -> dict[str, list[float]]:
-    """Seconds of processor time a round, for each option and for the trunk alone in both ways."""
+def measure(rounds: int = 7, batch: int = BATCH, steps: int = STEPS) -> Timings:
+    """Each option, and the trunk alone in both ways."""
     torch.set_num_threads(1)
     data, filters = make_batch(batch, steps), {name: make_filter(**options) for name, options in OPTIONS.items()}
     calls = {name: training_step(denkf, data) for name, denkf in filters.items()}
-    calls["trunk alone, all frames in one call"] = trunk_alone(filters[DEFAULT], data, chunked=False)
-    calls["trunk alone, chunks"] = trunk_alone(filters[DEFAULT], data, chunked=True)
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(rounds + 1):  # the first round warms up
-        for name, call in calls.items():
-            began = time.process_time()
-            call()
-            if turn:
-                seconds[name].append(time.process_time() - began)
-    return seconds
+    for name, chunked in zip(ALONE, (False, True), strict=True):
+        calls[name] = trunk_alone(filters[DEFAULT], data, chunked=chunked)
+    return in_turn(calls, rounds)
 
 
-def ratio(seconds: dict[str, list[float]], name: str, other: str) -> float:
-    """Median over the rounds of one over the other."""
-    return median(a / b for a, b in zip(seconds[name], seconds[other], strict=True))
+def rows_of(timings: Timings) -> list[Row]:
+    """A training step over the trunk's own forward and backward."""
+    note = f"B={BATCH}, T={STEPS}, 150x50x6; forward, CRPS, backward, clipping, AdamW; a whole step"
+    name = "training step, KITTI preset / "
+    return [timings.row(name + other, DEFAULT, other, target=1.15, note=note) for other in ALONE]
 
 
-def ratios(seconds: dict[str, list[float]] | None = None) -> list[dict]:
-    """Rows for ``make bench``: a training step over the trunk's own forward and backward."""
-    seconds = measure() if seconds is None else seconds
-    rows = []
-    for other in ("trunk alone, all frames in one call", "trunk alone, chunks"):
-        value = ratio(seconds, DEFAULT, other)
-        rows.append(
-            {
-                "name": f"training step, KITTI preset / {other}",
-                "ratio": value,
-                "target": 1.15,
-                "met": value <= 1.15,
-                "ours_us": 1e6 * median(seconds[DEFAULT]),
-                "theirs_us": 1e6 * median(seconds[other]),
-                "note": f"B={BATCH}, T={STEPS}, 150x50x6; forward, CRPS, backward, clipping, AdamW; a whole step",
-            }
-        )
-    return rows
+def rows(seconds: float) -> list[Row]:
+    """The same for ``make bench``, which takes as long as it takes."""
+    return rows_of(measure())
 
 
 CHILD = """
@@ -147,25 +121,23 @@ def resident_mib(name: str, batch: int, steps: int) -> float:
     return in_child(CHILD.format(name=name, batch=batch, steps=steps))
 
 
-def table(seconds: dict[str, list[float]], memory: dict[str, float], command: str, elapsed: float) -> str:
+def table(timings: Timings, memory: dict[str, float], command: str, elapsed: float) -> str:
     """The Markdown page."""
-    whole, chunks = "trunk alone, all frames in one call", "trunk alone, chunks"
     lines = [
         "# A training step of the KITTI preset",
         "",
         f"B = {BATCH}, T = {STEPS}, frames of 150x50x6, E = 32; one thread, processor time, medians over rounds.",
         "Memory: resident peak of a child process beyond model and batch (the batch itself is 220 MiB).",
         "",
-        "| training step | s | over the trunk alone, one call | over the trunk alone, chunks | memory, MiB |",
-        "|---|---|---|---|---|",
+        *head("training step", "s", "over the trunk alone, one call", "over the trunk alone, chunks", "memory, MiB"),
     ]
+    taken = {name: f"{1e-6 * timings.micro(name):.2f}" for name in timings.rounds}
     for name in OPTIONS:
-        values = [f"{median(seconds[name]):.2f}", *(f"{ratio(seconds, name, other):.2f}" for other in (whole, chunks))]
-        lines.append(f"| {name} | {' | '.join(values)} | {memory[name]:,.0f} |")
-    lines += [f"| {name} | {median(seconds[name]):.2f} | | | |" for name in (whole, chunks)]
-    lines += ["", "| what | ratio | target | met |", "|---|---|---|---|"]
-    for row in ratios(seconds):
-        lines.append(f"| {row['name']} | {row['ratio']:.2f} | {row['target']} | {'yes' if row['met'] else '**no**'} |")
+        cells = [f"{timings.ratio(name, other):.2f}" for other in ALONE]
+        lines.append(line(name, taken[name], *cells, f"{memory[name]:,.0f}"))
+    lines += [line(name, taken[name], "", "", "") for name in ALONE]
+    lines += ["", *head("what", "ratio", "target", "met")]
+    lines += [line(row.name, f"{row.ratio:.2f}", row.target, row.met_text) for row in rows_of(timings)]
     lines += [
         "",
         "In one call the results of the first layer alone are 600 MB, in fresh pages at every step; chunks of",
@@ -189,9 +161,9 @@ class TrainingStep:
         """Measures and prints."""
         began = time.perf_counter()
         batch, steps = (2, 3) if self.smoke else (BATCH, STEPS)
-        seconds = measure(1 if self.smoke else self.rounds, batch, steps)
+        timings = measure(1 if self.smoke else self.rounds, batch, steps)
         memory = {name: resident_mib(name, batch, steps) for name in OPTIONS}
-        write_page(table(seconds, memory, command("speed.training_step"), time.perf_counter() - began), self.out)
+        write_page(table(timings, memory, command("speed.training_step"), time.perf_counter() - began), self.out)
 
 
 if __name__ == "__main__":

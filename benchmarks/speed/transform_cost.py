@@ -26,17 +26,20 @@ from torchrl.envs import CatTensors, Compose, DMControlEnv, DoubleToFloat, EnvBa
 from torchrl.envs.transforms import Transform
 
 from benchmarks.common.arguments import command, parse
-from benchmarks.common.tables import write_page
+from benchmarks.common.tables import head, line, write_page
+from benchmarks.speed.pairs import Row, Timings, in_turn
+from benchmarks.speed.workload import car_filter
 from examples.append_to_env import NOISE, make_filter
-from torch_denkf.applications.car import KITTIReplayEnv, UnicycleTransition
+from torch_denkf.applications.car import KITTIReplayEnv
 from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.applications.reacher import NoisyEncoders
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import DEnKF
-from torch_denkf.modules import AroundState, DiagonalNoise, EnsembleAnalysis, Select, StochasticMLP, VectorSensor
+from torch_denkf.modules import VectorSensor
 from torch_denkf.transforms import DEnKFTransform
 
 TARGET_MS = 0.4
+LAST = ("quietest", "target", "met")
 
 
 class Reading(Transform):
@@ -59,14 +62,7 @@ class Reading(Transform):
 
 def kitti_filter() -> DEnKF:
     """The README's, with Table I's stochastic head on a reading in the place of the image sensor."""
-    return DEnKF(
-        transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
-        sensor=VectorSensor(2, 2, in_key="reading"),
-        observation=Select([3, 4]),
-        noise=DiagonalNoise(observation_dim=2),
-        analysis=EnsembleAnalysis("sensor"),
-        initial=AroundState([0.0, 0.0, 0.0, 0.3, 0.02]),
-    )
+    return car_filter(lambda: VectorSensor(2, 2, in_key="reading"))
 
 
 def kitti_env(folder: str) -> EnvBase:
@@ -97,19 +93,14 @@ def cases(folder: str) -> dict[str, tuple]:
 
 
 class Stepper:
-    """Goes on with an environment, some steps at a time."""
+    """Goes on with an environment."""
 
     def __init__(self, env: EnvBase):
         self.env, self.row = env, env.reset()
 
-    def seconds(self, steps: int) -> float:
-        """Processor time of a step."""
-        env, row = self.env, self.row
-        began = time.process_time()
-        for _ in range(steps):
-            _, row = env.step_and_maybe_reset(env.rand_action(row))
-        self.row = row
-        return (time.process_time() - began) / steps
+    def __call__(self) -> None:
+        """A step."""
+        _, self.row = self.env.step_and_maybe_reset(self.env.rand_action(self.row))
 
 
 def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
@@ -130,51 +121,41 @@ def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
     return {kind: Stepper(env) for kind, env in envs.items()}
 
 
-def measure(rounds: int = 41, steps: int = 50) -> dict[str, dict[str, list[float]]]:
+def measure(rounds: int = 41, steps: int = 50) -> dict[str, Timings]:
     """Seconds a step of every round, by case and by kind."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    out = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, makers in cases(folder).items():
-            candidates = steppers(*makers, folder)
-            seconds: dict[str, list[float]] = {kind: [] for kind in candidates}
-            for turn in range(rounds + 1):  # the first round warms up
-                for kind, stepper in candidates.items():
-                    value = stepper.seconds(steps)
-                    if turn:
-                        seconds[kind].append(value)
-            out[name] = seconds
-    return out
+        return {name: in_turn(steppers(*makers, folder), rounds, steps) for name, makers in cases(folder).items()}
 
 
-def cost_ms(seconds: dict[str, list[float]], kind: str) -> float:
+def cost_ms(timings: Timings, kind: str) -> float:
     """Median over the rounds of what the transform adds to a step."""
-    return 1e3 * median(b - a for a, b in zip(seconds["without"], seconds[kind], strict=True))
+    return 1e3 * median(b - a for a, b in zip(timings.rounds["without"], timings.rounds[kind], strict=True))
 
 
-def ratios(found: dict[str, dict[str, list[float]]] | None = None) -> list[dict]:
-    """Rows for ``make bench``: milliseconds that the transform adds to a step (no ratio but a time)."""
-    rows = []
-    for name, seconds in (measure() if found is None else found).items():
-        rates = {kind: 1 / median(values) for kind, values in seconds.items()}
-        for kind in ("filter", "packaged"):
-            value = cost_ms(seconds, kind)
-            rows.append(
-                {
-                    "name": f"DEnKFTransform ({kind}) on {name}, B=1: ms it adds to a step",
-                    "ratio": value,
-                    "target": TARGET_MS,
-                    "met": value <= TARGET_MS,
-                    "ours_us": 1e6 * median(seconds[kind]),
-                    "theirs_us": 1e6 * median(seconds["without"]),
-                    "note": f"not a ratio; {rates['without']:,.0f} steps a second without, {rates[kind]:,.0f} with",
-                }
-            )
-    return rows
+def rows_of(name: str, timings: Timings) -> dict[str, Row]:
+    """Milliseconds that the transform adds to a step (no ratio but a time), by kind."""
+    rates = {kind: f"{1e6 / timings.micro(kind):,.0f}" for kind in timings.rounds}
+    return {
+        kind: Row(
+            f"DEnKFTransform ({kind}) on {name}, B=1: ms it adds to a step",
+            cost_ms(timings, kind),
+            TARGET_MS,
+            ours_us=timings.micro(kind),
+            theirs_us=timings.micro("without"),
+            note=f"not a ratio; {rates['without']} steps a second without, {rates[kind]} with",
+        )
+        for kind in ("filter", "packaged")
+    }
 
 
-def table(found: dict[str, dict[str, list[float]]], command: str, elapsed: float) -> str:
+def rows(seconds: float) -> list[Row]:
+    """The same for ``make bench``, which takes as long as it takes."""
+    return [row for name, timings in measure().items() for row in rows_of(name, timings).values()]
+
+
+def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
     """The Markdown page."""
     lines = [
         "# What DEnKFTransform costs",
@@ -184,17 +165,13 @@ def table(found: dict[str, dict[str, list[float]]], command: str, elapsed: float
         "`DEnKFTransform(filter, packaged=load_step(export_step(filter, example, path)))`.",
         "Quietest: between the fastest rounds of either kind, which other work disturbed least.",
         "",
-        "| environment and filter | step | steps/s without | with | added, ms a step | quietest | target | met |",
-        "|---|---|---|---|---|---|---|---|",
+        *head("environment and filter", "step", "steps/s without", "with", "added, ms a step", *LAST),
     ]
-    rows = iter(ratios(found))
-    for name, seconds in found.items():
-        for kind in ("filter", "packaged"):
-            row = next(rows)
-            rates = " | ".join(f"{1 / median(seconds[key]):,.0f}" for key in ("without", kind))
-            met = "yes" if row["met"] else "**no**"
-            least = 1e3 * (min(seconds[kind]) - min(seconds["without"]))
-            lines.append(f"| {name} | {kind} | {rates} | {row['ratio']:.2f} | {least:.2f} | {TARGET_MS} | {met} |")
+    for name, timings in found.items():
+        for kind, row in rows_of(name, timings).items():
+            rates = [f"{1e6 / timings.micro(key):,.0f}" for key in ("without", kind)]
+            least = 1e3 * (min(timings.rounds[kind]) - min(timings.rounds["without"]))
+            lines.append(line(name, kind, *rates, f"{row.ratio:.2f}", f"{least:.2f}", TARGET_MS, row.met_text))
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[2]:.1f}"
     lines += [
         "",

@@ -6,6 +6,7 @@ Transition (5, 32, 32, 64, 64, 5) with dropout, residual; observation (5, 32, 32
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -13,9 +14,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf.applications.car import UnicycleTransition
 from torch_denkf.filters import EKF, UKF, DEnKF
 from torch_denkf.filters.base import Filter
 from torch_denkf.modules import (
+    AroundState,
     ConstantNoise,
     DiagonalNoise,
     EnsembleAnalysis,
@@ -23,7 +26,9 @@ from torch_denkf.modules import (
     LearnedObservation,
     LearnedTransition,
     MomentPrior,
+    Select,
     StochasticMLP,
+    SubModel,
 )
 
 STATE, OBSERVATION, MEMBERS = 5, 2, 32
@@ -50,6 +55,18 @@ def make_filter(scheme: str = "sensor") -> DEnKF:
         DiagonalNoise(OBSERVATION, r=STD, num_cells=NOISE_HIDDEN),
         EnsembleAnalysis(scheme),
         initial=GaussianPrior(torch.zeros(STATE), torch.ones(STATE), ensemble_size=MEMBERS),
+    )
+
+
+def car_filter(sensor: Callable[[], SubModel]) -> DEnKF:
+    """The README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's networks and noise."""
+    return DEnKF(
+        transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
+        sensor=sensor(),
+        observation=Select([3, 4]),
+        noise=DiagonalNoise(observation_dim=2),
+        analysis=EnsembleAnalysis("sensor"),
+        initial=AroundState([0.0, 0.0, 0.0, 0.3, 0.02]),
     )
 
 

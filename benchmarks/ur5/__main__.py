@@ -10,8 +10,8 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.ur5.frontier import draw
-from benchmarks.ur5.gallery import draw_all
 from benchmarks.ur5.limits import run
+from benchmarks.ur5.pictures import draw_all
 from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget

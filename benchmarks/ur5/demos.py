@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,10 +51,10 @@ class Collections:
         return UR5ExperienceReplay(self.root / name, split=split, cache=self.out / "cache", **kwargs)
 
 
-def sequences_of(data: UR5ExperienceReplay, chosen: Callable[[int], bool]) -> tuple[Tensor, Tensor]:
-    """States ``[N, T, 10]`` and actions ``[N, T, 7]`` of some demos: they need no pictures."""
-    rows = [data.storage[e.start : e.start + e.length] for e in data.episodes if chosen(e.demo)]
-    return tuple(torch.stack([row[key] for row in rows]) for key in ("state", "action"))
+def sequences_of(data: UR5ExperienceReplay, first: int) -> Tensor:
+    """States ``[N, T, 10]`` of demos from number ``first`` on: they need no pictures."""
+    parts = [data.storage[e.start : e.start + e.length]["state"] for e in data.episodes if e.demo >= first]
+    return torch.stack(parts)
 
 
 class FramePool:

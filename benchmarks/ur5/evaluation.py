@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from benchmarks.common.beliefs import save_belief
 from benchmarks.common.scores import cost, processor_ms
 from benchmarks.common.training import read_filter
 from benchmarks.ur5.demos import JOINTS, STATE
-from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all, with_hint, with_missing
+from benchmarks.ur5.readings import BLACK, CONDITIONS, blackouts, fail, read_all, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import WRIST, Preset
 from benchmarks.ur5.tables import BLACKOUT
 from benchmarks.ur5.training import filter_error, joint_coverage, run_filter
-from torch_denkf._files import write_bytes
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
 from torch_denkf.filters import Filter
 from torch_denkf.metrics import interval_coverage, state_errors
@@ -141,7 +139,6 @@ def size_rows(
 def processor_times(recipe: UR5Recipe, model: Filter, readings: TensorDict, chunk: int) -> dict[str, float]:
     """Milliseconds of the processor a step of one demo, eager and compiled in chunks; 0 compiles nothing."""
     row, behind, times = readings[:1, :TIMED], recipe.behind(model), {}
-    row = with_hint(row, row["state"][:, 0])
     for column, steps in (("eager_ms_per_step", 0), ("ms_per_step", chunk)):
         behind.compile(chunk=steps)
         times[column] = processor_ms(lambda: behind.sequence(row.copy()), row.shape[1])
@@ -163,22 +160,13 @@ def save_beliefs(
     name: str,
     conditions: Sequence[str] = ("clean", "black20"),
 ) -> None:
-    """Leaves beliefs and pictures of the first test demos for the plots: ``NAME-CONDITION-DEMO.npz``."""
+    """Leaves beliefs and pictures of the first test demos for the plots: ``NAME-CONDITION-DEMO.pt``."""
     for condition in conditions:
         out = run_filter(recipe, model, readings[condition][: len(demos)])
         for row, number in zip(out, demos, strict=True):
             episode = next(e for e in data.episodes if e.demo == number)
             pixels = data[torch.arange(episode.start, episode.start + episode.length)]["pixels"]
             pixels = (pixels * row["observed"][..., None, None] * 255).round().to(torch.uint8)
-            ensemble = row.get(("belief", "ensemble"), row["belief", "mean"].unsqueeze(-2))
-            memory = io.BytesIO()
-            np.savez_compressed(
-                memory,
-                pixels=pixels.permute(0, 2, 3, 1).numpy(),
-                truth=row["state"].numpy(),
-                mean=row["belief", "mean"][:, :STATE].numpy(),
-                var=row["belief", "var"][:, :STATE].numpy(),
-                ensemble=ensemble[..., :STATE].numpy(),
-                observed=row["observed"].squeeze(-1).numpy(),
-            )
-            write_bytes(folder / f"{name}-{condition}-{number}.npz", memory.getbuffer())
+            mean, var = (row["belief", key][:, :STATE] for key in ("mean", "var"))
+            file = folder / f"{name}-{condition}-{number}.pt"
+            save_belief(file, mean, var, row["state"], row["observed"], pixels=pixels)

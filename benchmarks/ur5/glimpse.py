@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample
 
+from benchmarks.common.close_look import FEATURES, CloseLook
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.modules import KeypointTrunk
 
@@ -31,7 +31,7 @@ class GlimpseTrunk(nn.Module):
     """A coarse trunk, and convolutions on a patch of the full resolution around the gripper.
 
     The gripper is a dozen pixels wide in a picture of 112: what its opening and its turn look like is lost in maps of
-    a sixteenth of that. The patch costs as much as the whole picture at a third of its resolution.
+    a sixteenth of that.
 
     Args:
         coarse: sees the whole picture, ``[N, 3, H, W]`` to ``[N, F]``.
@@ -47,23 +47,14 @@ class GlimpseTrunk(nn.Module):
         super().__init__()
         self.coarse = coarse
         self.centre = nn.Linear(size, 2)
-        self.close = nn.Sequential(
-            *_block(5, 32, 5, 2), *_block(32, 48, 3, 2), *_block(48, 64, 3, 1), *_block(64, 96, 3, 2), nn.Flatten()
-        )
-        patch = 8 * max(round(REACH * picture / 8), 1)  # about a pixel of the picture each
-        self.squeeze = nn.Sequential(nn.Linear(96 * (patch // 8) ** 2, 192), nn.ReLU())
-        self.mix = nn.Sequential(nn.Linear(size + 192 + 2, features), nn.ReLU())
-        side = torch.linspace(-1, 1, patch)
-        self.register_buffer("grid", torch.stack(torch.meshgrid(side, side, indexing="xy"), -1), persistent=False)
+        self.close = CloseLook(picture, REACH)
+        self.mix = nn.Sequential(nn.Linear(size + FEATURES + 2, features), nn.ReLU())
 
     def forward(self, images: Tensor) -> Tensor:
         """Features of images."""
         code = self.coarse(images)
         centre = self.centre(code)
-        grid = centre[:, None, None] + REACH * self.grid - self.grid.new_tensor([0.0, RAISE])
-        patch = grid_sample(images.contiguous(), grid, align_corners=False, padding_mode="border")
-        patch = torch.cat([patch, self.grid.permute(2, 0, 1).expand(len(images), -1, -1, -1)], 1)
-        return self.mix(torch.cat([code, self.squeeze(self.close(patch)), centre], -1))
+        return self.mix(torch.cat([code, self.close(images, centre, RAISE), centre], -1))
 
     @torch.no_grad()
     def aim(self, images: Tensor, goal: Tensor) -> float:
@@ -76,10 +67,6 @@ class GlimpseTrunk(nn.Module):
         self.centre.weight.copy_(solution[:-1].mT)
         self.centre.bias.copy_(solution[-1] - self.centre.weight @ mean)
         return float((self.centre(code) - goal).abs().mean()) * images.shape[-1] / 2
-
-
-def _block(before: int, after: int, side: int, stride: int) -> tuple[nn.Module, ...]:
-    return nn.Conv2d(before, after, side, stride, side // 2), nn.GroupNorm(8, after), nn.ReLU()
 
 
 class Shrink(nn.Module):

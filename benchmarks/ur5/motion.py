@@ -51,14 +51,12 @@ class ArmMotion(nn.Module):
 
     Args:
         facts: statistics of the training demos.
-        actions: whether the joints' targets of the last step are read: features 24 to 30 of the input.
     """
 
-    size, read, fading = SIZE, STATE, FADING
+    size, read, fading, actions = SIZE, STATE, FADING, False
 
-    def __init__(self, facts: Statistics, actions: bool = False):
+    def __init__(self, facts: Statistics):
         super().__init__()
-        self.actions = actions
         for name, value in {
             "loc": facts.loc[:JOINTS],
             "scale": facts.scale[:JOINTS],
@@ -73,9 +71,8 @@ class ArmMotion(nn.Module):
         self.lasting = nn.Parameter(torch.full((JOINTS,), 2.0))  # e, likewise
         self.keep = nn.Parameter(torch.zeros(3))  # likewise
         self.accelerate = nn.Sequential(
-            nn.Linear((3 + actions) * JOINTS, 48), nn.Tanh(), nn.Linear(48, 48), nn.Tanh(), nn.Linear(48, JOINTS)
+            nn.Linear(3 * JOINTS, 48), nn.Tanh(), nn.Linear(48, 48), nn.Tanh(), nn.Linear(48, JOINTS)
         )
-        self.pull = nn.Parameter(torch.full((JOINTS,), 0.5)) if actions else None  # share of the way to the target
         nn.init.zeros_(self.accelerate[-1].weight)
         nn.init.zeros_(self.accelerate[-1].bias)
         self.kinematics = nn.Sequential(nn.Linear(12, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU(), nn.Linear(96, 3))
@@ -86,16 +83,11 @@ class ArmMotion(nn.Module):
         features = torch.cat([angles.cos(), angles.sin()], -1)
         return self.place_loc + self.place_scale * self.kinematics(features)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 24]`` of states ``[*, 24]``, or of states and actions ``[*, 31]``."""
-        joints, place, rates, accelerations = features[..., :SIZE].split((JOINTS, 3, JOINTS, JOINTS), -1)
+    def forward(self, states: Tensor) -> Tensor:
+        """States ``[*, 24]`` of states ``[*, 24]``."""
+        joints, place, rates, accelerations = states.split((JOINTS, 3, JOINTS, JOINTS), -1)
         parts = [(joints - self.loc) / self.scale, rates / self.rate, accelerations / self.acceleration]
         wanted = self.damping.sigmoid() * rates + self.lasting.sigmoid() * accelerations
-        if self.actions:
-            way = features[..., SIZE:] - joints
-            # The fingers are often told to shut on an object: a way that they do not go.
-            parts.append((way / (3 * self.rate)).tanh())
-            wanted = wanted + self.pull * (way.clamp(-1, 1) - wanted) * (way.abs() < 5 * self.rate)
         faster = wanted + self.jerk * self.accelerate(torch.cat(parts, -1))
         moved = joints + faster
         place = self.place(moved) + self.keep.sigmoid() * (place - self.place(joints))
@@ -103,12 +95,11 @@ class ArmMotion(nn.Module):
 
 
 class BiasedReading(nn.Module):
-    """h: the table's ten numbers, and the sensor's errors of them where the state holds those."""
+    """h: the table's ten numbers, and the sensor's errors of them."""
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 10]`` of states ``[*, 24]`` or ``[*, 34]``."""
-        read = state[..., :STATE]
-        return read if state.shape[-1] == SIZE else read + state[..., SIZE:]
+        """Readings ``[*, 10]`` of states ``[*, 34]``."""
+        return state[..., :STATE] + state[..., SIZE:]
 
 
 class MotionLoss(nn.Module):
@@ -120,10 +111,10 @@ class MotionLoss(nn.Module):
 
     def forward(self, rows: TensorDict) -> dict[str, Tensor]:
         """Scores paths ``[N]`` of some rows each."""
-        path, actions, errors = rows["path"], rows["action"], []
+        path, errors = rows["path"], []
         moved = path[:, 0]
         for step, truth in enumerate(path.unbind(1)[1:], start=1):
-            moved = self.motion(torch.cat([moved, actions[:, step - 1]], -1) if self.motion.actions else moved)
+            moved = self.motion(moved)
             rates = (moved - truth)[..., RATES] / self.motion.acceleration
             errors.append(rates.abs().mean() / step)
         place = self.motion.place(path[:, 1, :JOINTS]) - path[:, 1, JOINTS:STATE]
@@ -131,38 +122,33 @@ class MotionLoss(nn.Module):
 
 
 @torch.no_grad()
-def open_loop(
-    motion: ArmMotion, states: Tensor, actions: Tensor, ahead: Sequence[int] = (1, 5, 10)
-) -> dict[str, float]:
+def open_loop(motion: ArmMotion, states: Tensor, ahead: Sequence[int] = (1, 5, 10)) -> dict[str, float]:
     """Mean absolute errors of the joints, degrees, so many steps after true states, without any reading.
 
     Args:
         motion: to be tested.
         states: sequences ``[N, T, 10]``.
-        actions: ``[N, T, 7]``.
         ahead: numbers of steps, rising.
     """
     full, last = with_rates(states), states.shape[-2] - max(ahead)
     moved, errors = full[:, :last], {}
     for step in range(max(ahead)):
-        moved = motion(torch.cat([moved, actions[:, step : step + last]], -1) if motion.actions else moved)
+        moved = motion(moved)
         if step + 1 in ahead:
             error = (moved - full[:, step + 1 : step + 1 + last])[..., :JOINTS].abs().mean()
             errors[f"after_{step + 1}_deg"] = float(error.rad2deg())
     return errors
 
 
-def train_motion(
-    motion: ArmMotion, states: Tensor, actions: Tensor, *, out: Path, seed: int, updates: int
-) -> ArmMotion:
-    """Trains the motion on true sequences ``[N, T, 10]`` and actions ``[N, T, 7]``, or reads it where that was done."""
+def train_motion(motion: ArmMotion, states: Tensor, *, out: Path, seed: int, updates: int) -> ArmMotion:
+    """Trains the motion on true sequences ``[N, T, 10]``, or reads it where that was done."""
     full, ahead = with_rates(states), min(AHEAD, states.shape[1] - 1)
     starts = full.shape[1] - ahead  # of a demo
     steps = torch.arange(ahead + 1)
 
     def paths(index: Tensor) -> TensorDict:
         demo, step = (index // starts).unsqueeze(-1), (index % starts).unsqueeze(-1) + steps
-        return TensorDict({"path": full[demo, step], "action": actions[demo, step]}, batch_size=index.shape)
+        return TensorDict({"path": full[demo, step]}, batch_size=index.shape)
 
     count = full.shape[0] * starts
     held = int(0.95 * full.shape[0]) * starts  # whole demos
@@ -173,7 +159,7 @@ def train_motion(
     unseen = slice(held // starts, held // starts + 60)
 
     def far() -> dict[str, float]:
-        return open_loop(motion, states[unseen], actions[unseen]) if states.shape[1] > 20 and held < count else {}
+        return open_loop(motion, states[unseen]) if states.shape[1] > 20 and held < count else {}
 
     loss = MotionLoss(motion)
     checked = (

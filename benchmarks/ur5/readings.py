@@ -37,7 +37,6 @@ def read_codes(
     ``observed``     [N,T,1]       False where the frame is black
     ``state``        [N,T,10]      the truth
     ``motion``       [N,T,24]      with rates and accelerations, see :func:`with_rates`
-    ``action``       [N,T,7]
     ================ ============= ====================================================================================
     """
     if file.exists():
@@ -49,7 +48,7 @@ def read_codes(
         episode = by_number[number]
         parts = []
         for rows in torch.arange(episode.start, episode.start + episode.length).split(64):
-            part = data[rows].select("pixels", "state", "action")
+            part = data[rows].select("pixels", "state")
             if condition == "salt_and_pepper":
                 part = SaltAndPepper(generator=torch.Generator().manual_seed(int(rows[0])))(part)
             part = check(part)
@@ -111,13 +110,6 @@ def blackouts(count: int, steps: int, seed: int = 0) -> Tensor:
     return torch.randint(low, high, (count,), generator=torch.Generator().manual_seed(seed))
 
 
-def with_hint(sequences: TensorDict, start: Tensor) -> TensorDict:
-    """Adds where the arm began, ``"hint"`` ``[*B, T, 11]``: in the first step after the start, and a one beside it."""
-    hint = torch.zeros(*sequences.batch_size, STATE + 1)
-    hint[..., 1, :] = torch.cat([start[..., :STATE], torch.ones_like(start[..., :1])], -1)
-    return sequences.set("hint", hint)
-
-
 class Windows:
     """Draws windows of readings, with failing cameras, that begin from a wrong state.
 
@@ -151,4 +143,4 @@ class Windows:
         windows["motion_and_bias"] = torch.cat([windows["motion"], unknown], -1)
         noise = torch.randn(batch, 1, len(self.start_std), generator=generator)
         windows["start"] = windows["motion"] + self.start_std * noise
-        return with_hint(windows, windows["start"][:, 0])
+        return windows

@@ -195,23 +195,17 @@ class NearForecast(SubModel):
     Args:
         preset: whose ``state_of`` turns readings into states.
         forecast_key: the forecast's ensemble ``[*B, E, S]``, or mean ``[*B, S]``.
-        log_weight_key: optional log-weights of the ensemble ``[*B, E]``.
     """
 
-    def __init__(
-        self,
-        preset: Preset,
-        forecast_key: NestedKey = ("forecast", "ensemble"),
-        log_weight_key: NestedKey = ("forecast", "log_weight"),
-    ):
-        super().__init__(nn.Identity(), [("sensor", "ensemble"), forecast_key], [NEAR], optional_keys=[log_weight_key])
+    def __init__(self, preset: Preset, forecast_key: NestedKey = ("forecast", "ensemble")):
+        super().__init__(nn.Identity(), [("sensor", "ensemble"), forecast_key], [NEAR])
         self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
 
-    def compute(self, samples, forecast, log_weights=None, *, batch_size):
+    def compute(self, samples, forecast, *, batch_size):
         """The states ``[*B, E, 10]``."""
         angle = forecast[..., WRIST]
         if angle.ndim > len(batch_size):
-            angle = angle.mean(-1) if log_weights is None else (log_weights.exp() * angle).sum(-1)
+            angle = angle.mean(-1)
         near = self.preset.side_of(samples.mean(-2), angle).detach().unsqueeze(-1).expand(samples.shape[:-1])
         states = self.preset.state_of(samples, near)
         if self.factor != 1.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal
 
@@ -30,10 +30,9 @@ from torch_denkf.filters import Filter
 from torch_denkf.modules import ImageSensor
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
-TRAININGS = ("sim", "real_like", "fine_tuned")
+TRAININGS = ("sim", "fine_tuned")
 SALTED = 3  # every third tuning demo is read with salt and pepper, too
 PICTURED = 3  # test demos whose beliefs are left for the plots
-SINGLE = ("dekf", "dukf", "bkf", "lstm")  # no ensemble
 
 
 @dataclass(frozen=True)
@@ -62,8 +61,7 @@ class Base:
     Args:
         study: the study.
         kind: name of the sensor.
-        training: ``"sim"``, ``"real_like"`` (a few demos there alone) or ``"fine_tuned"`` (first the one, then the
-            other).
+        training: ``"sim"`` or ``"fine_tuned"``, in the simulator and then on a few demos of ``real_like``.
         seed: of all random numbers.
     """
 
@@ -74,17 +72,12 @@ class Base:
         self.name = f"{training}-{kind}-{seed}"
         self.parent = Base(study, kind, "sim", seed) if training == "fine_tuned" else None
         self.roles: Roles = sim_roles(study) if training == "sim" else real_roles(study)
-        self.states, self.actions = self._truth()
         self.sensor, self.facts = self._sensor()
-        self._motions: dict[bool, ArmMotion] = {}
 
-    def _truth(self) -> tuple[Tensor, Tensor]:
-        """States and actions of the demos that the sensor may see."""
-        study, roles = self.study, self.roles
-        if self.training == "sim":
-            return sequences_of(study.replay("sim-frames", "train"), lambda demo: demo >= study.sequences)
-        chosen = {*roles.sensor, *roles.tune, *roles.validation}
-        return sequences_of(study.replay("real_like-sequences", "train"), chosen.__contains__)
+    @cached_property
+    def states(self) -> Tensor:
+        """States of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
+        return sequences_of(self.study.replay("sim-frames", "train"), self.study.sequences)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
         """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
@@ -105,15 +98,14 @@ class Base:
         held_out = set(sorted({*roles.tune, *roles.validation})[::2] if self.training == "sim" else roles.validation)
         pool, checked = FramePool(data, roles.sensor), FramePool(data, held_out)
         torch.manual_seed(self.seed)
-        # In the other domain as many as fine-tuning gets, of a third of the pictures.
-        updates, lr = budget.sensor if self.training == "sim" else budget.fine_tuning, 2e-3
-        look = SIM
         if self.parent is not None:
-            facts, sensor, lr = self.parent.facts, deepcopy(self.parent.sensor), 1e-3
+            facts, sensor = self.parent.facts, deepcopy(self.parent.sensor)
             pool, look = self._pasted(pool)
+            updates, lr = budget.fine_tuning, 1e-3
         else:
-            facts = Statistics.of(self.states, pool)
+            facts, look = Statistics.of(self.states, pool), SIM
             sensor = self.preset.build(facts, SAMPLES)
+            updates, lr = budget.sensor, 2e-3
         if self.preset.coarse is not None:
             coarse = SENSORS[self.preset.coarse]
             times = max(facts.size // COARSE, 1)
@@ -142,18 +134,14 @@ class Base:
         paste.close()
         return pool.joined(pixels, states), paste.look
 
-    def motion(self, actions: bool) -> ArmMotion:
+    @cached_property
+    def motion(self) -> ArmMotion:
         """The motion, trained on true states."""
         if self.parent is not None:
-            return self.parent.motion(actions)
-        if actions not in self._motions:
-            torch.manual_seed(self.seed)
-            motion = ArmMotion(self.facts, actions)
-            out = self.study.out / "motions" / f"{self.training}{'-actions' * actions}-{self.seed}"
-            self._motions[actions] = train_motion(
-                motion, self.states, self.actions, out=out, seed=self.seed, updates=self.study.budget.motion
-            )
-        return self._motions[actions]
+            return self.parent.motion
+        torch.manual_seed(self.seed)
+        motion, out = ArmMotion(self.facts), self.study.out / "motions" / f"{self.training}-{self.seed}"
+        return train_motion(motion, self.states, out=out, seed=self.seed, updates=self.study.budget.motion)
 
     def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
         """Features of the demos of a role, in a domain of which they may not be."""
@@ -167,9 +155,7 @@ class Base:
 
     def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
         """A filter's recipe, with a sensor of its own."""
-        kind = FILTERS[name]
-        motion, error = self.motion(kind.actions), self.error()
-        return kind(deepcopy(self.sensor), self.preset, self.facts, motion, error, size)
+        return FILTERS[name](deepcopy(self.sensor), self.preset, self.facts, self.motion, self.error(), size)
 
     def error(self) -> Tensor:
         """Root mean square error of the sensor on the validation demos, ``[10]``."""
@@ -225,14 +211,14 @@ def run_jobs(
         for name in filters if domain == base.domain else set(filters) & {"denkf"}:
             rows = partial(_filter, base, {**own, "filter": name, "ensemble_size": members_of(name)})
             once(folder / f"{name}-{base.name}-{domain}.json", rows)
-    if "denkf" in filters and training != "real_like":
+    if "denkf" in filters:
         own = {**names, "domain": base.domain, "filter": "denkf"}
         once(folder / f"sizes-{base.name}.json", partial(_sizes, base, own))
 
 
 def members_of(name: str) -> int:
-    """How many members or particles a filter has in the table."""
-    return 100 if "pf" in name else 1 if name in SINGLE else MEMBERS
+    """How many members a filter has in the table."""
+    return MEMBERS if name == "denkf" else 1
 
 
 def _sensor(base: Base, names: dict) -> list[dict]:
@@ -246,8 +232,7 @@ def _filter(base: Base, names: dict) -> list[dict]:
     rows = filter_rows(recipe, model, readings, names)
     own = read_all(recipe.sensor, base.codes("validation"), MEMBERS)
     rows[0]["validation_crps"] = validation_crps(recipe, model, own)
-    pictured = domain == "sim" or base.training == "fine_tuned"
-    if names["filter"] == "denkf" and pictured:
+    if names["filter"] == "denkf" and domain == base.domain:
         data = base.study.replay(f"{domain}-sequences", "test")
         demos, folder = base.roles.test[:PICTURED], base.study.out / "beliefs"
         save_beliefs(recipe, model, readings, data, demos, folder, f"denkf-{base.kind}-{domain}")

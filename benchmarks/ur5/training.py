@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from benchmarks.common.scores import belief_crps, counted, coverage
 from benchmarks.common.training import fit_filter
 from benchmarks.ur5.demos import JOINTS
-from benchmarks.ur5.readings import Windows, read_all, read_head, with_hint, with_missing
+from benchmarks.ur5.readings import Windows, read_all, read_head, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS, Preset, unit_of
 from torch_denkf.filters import Filter
@@ -24,7 +24,7 @@ from torch_denkf.training import Stage
 from torch_denkf.training.parts import parameters_without
 
 INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4)
-KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), ("belief", "log_weight"), "state", "observed")
+KEPT = (("belief", "mean"), ("belief", "var"), ("belief", "ensemble"), "state", "observed")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def run_filter(recipe: UR5Recipe, model: Filter, readings: TensorDict, chunk: in
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         for part in readings.split(chunk):
-            out = behind.sequence(with_hint(part.copy(), part["state"][:, 0]))
+            out = behind.sequence(part.copy())
             parts.append(out.select(*[key for key in KEPT if key in out.keys(True)]))
     return torch.cat(parts)
 

@@ -22,8 +22,8 @@ def test_options_of_the_kitti_study():
     study = parse(KITTI, ["--root", "KITTI", "--drives", "00", "02", "--filters", "dekf", "--size", "100", "300"])
     assert (study.command, study.root, study.drives, study.filters) == ("table", Path("KITTI"), ("00", "02"), ("dekf",))
     assert (study.size, study.seeds, study.out) == ((100, 300), 1, Path("runs/kitti"))
-    study = parse(KITTI, ["evaluate", "--checkpoint", "a", "--sensor", "7", "--fine-tuning", "8", "--end-to-end", "9"])
-    assert (study.command, study.checkpoint) == ("evaluate", Path("a"))
+    study = parse(KITTI, ["frontier", "--first", "a", "--sensor", "7", "--fine-tuning", "8", "--end-to-end", "9"])
+    assert (study.command, study.first) == ("frontier", Path("a"))
     budget = study.budget
     assert (budget.sensor, budget.fine_tuning, budget.filter, budget.end_to_end, budget.length) == (7, 8, 300, 9, 24)
 

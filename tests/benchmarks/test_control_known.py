@@ -1,6 +1,7 @@
 """Rows of a committed table that stand for their runs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from benchmarks.control import study
 from benchmarks.control.run import Budget, planned_tests, run
 from benchmarks.control.shift import SHIFTED
 from benchmarks.control.study import Study, complete, jobs, part
+from benchmarks.control.tasks import TASKS
 
 
 def test_known_rows_are_not_run_again(tmp_path):
@@ -67,10 +69,14 @@ def test_rows_of_whole_runs_alone_are_known(tmp_path):
     assert known(tmp_path, [*pole, *hike]) == 2
 
 
-def test_a_run_has_the_tests_that_were_planned():
+def test_a_run_has_the_tests_that_were_planned(monkeypatch):
     """What :func:`planned_tests` says, a tiny run does, where the noise changes afterwards and where it does not."""
-    budget = Budget(env_steps=3 * 32 * 75, tests=2, episodes=2, members=4, updates=0.02, every=2000)
-    for task, cell, arm in (("hike", (0.4, 0.0), "last reading"), ("cartpole", (0.1, 0.0), "physics")):
+    pole = TASKS["cartpole"]
+    monkeypatch.setitem(TASKS, "hike", replace(TASKS["hike"], count=4))
+    monkeypatch.setitem(TASKS, "cartpole", replace(pole, count=2, settings=replace(pole.settings, every=500)))
+    for task, cell, arm in (("hike", (0.4, 0.0), "last reading"), ("cartpole", (0.1, 0.0), "four readings")):
+        batch = TASKS[task].count * TASKS[task].steps
+        budget = Budget(env_steps=3 * batch, tests=2, episodes=2, members=4, updates=0.02, every=2000)
         rows = run(task, cell, arm, 0, budget)
         assert [(row["cell"], row["env_steps"]) for row in rows] == planned_tests(task, cell, arm, budget)
 

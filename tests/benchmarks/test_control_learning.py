@@ -11,6 +11,7 @@ from benchmarks.control.tasks import TASKS
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 
 
+@pytest.mark.slow
 def test_a_filter_that_learns_from_readings_alone_comes_near_the_kalman_filter():
     """On the hike: the innovations' likelihood within 0.04 nats a reading of the exact one's, from over 0.1."""
     torch.manual_seed(0)

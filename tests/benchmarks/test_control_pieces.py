@@ -44,3 +44,11 @@ def test_a_piece_is_left_out_where_the_cart_was_read_beyond_one_and_a_half_metre
     data["observation"][1, 130, 0] = position
     learner.add(data)
     assert len(learner.episodes) == kept
+
+
+def test_a_batch_of_which_nothing_is_kept_is_no_error(learner, data):
+    data["observation"][..., 0] = 1.6
+    data["observation"][1, :, 1] = 1.9  # angles are noisy, and are kept
+    learner.add(data)
+    learner.update(1)
+    assert len(learner.episodes) == 0

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.control import ppo, study
 from benchmarks.control import search as protocol
+from benchmarks.control import study
 from benchmarks.control.run import Budget, run
-from benchmarks.control.search import ARMS, CELLS, COLUMNS, FIRST, Search, best, complete, found, jobs, one, page
-from benchmarks.control.study import BELIEFS, Study
+from benchmarks.control.search import ARMS, CELLS, COLUMNS, FIRST, Search, best, complete, found, jobs, page
+from benchmarks.control.study import BELIEFS
 from benchmarks.control.tasks import RATES, TASKS
 
 
@@ -51,14 +51,6 @@ def test_all_arms_get_the_same_rates_and_the_largest_is_exceeded_where_it_is_bes
     assert [call.args[0].relative_to(tmp_path / "parts").as_posix() for call in jobs(search, tried)] == further
 
 
-def test_no_seed_of_the_study_chooses():
-    assert Study().seeds <= FIRST
-
-
-def test_the_search_is_of_all_tasks_of_ppo_in_their_first_cells():
-    assert {task: cells[0] for task, cells in study.CELLS.items() if TASKS[task].agent is ppo.PPO} == CELLS
-
-
 def test_a_run_has_its_rate(monkeypatch):
     """Of the task's learning rate 0.3 times; without one, what the search chose for the arm."""
     rates = []
@@ -79,14 +71,6 @@ def test_a_run_has_its_rate(monkeypatch):
     run("hike", (0.0, 0.0), "truth", 0, Budget(**tiny))
     run("hike", (0.0, 0.0), "last reading", 0, Budget(**tiny))
     assert rates == pytest.approx([0.3 * task.settings.lr, 3 * task.settings.lr, task.settings.lr])
-
-
-def test_a_row_says_its_rate(monkeypatch):
-    given = {"task": "hike", "cell": "noise 0.4", "arm": "LSTM", "seed": 100, "return": -1.0, "wall_s": 2.0}
-    monkeypatch.setattr(protocol, "run", lambda *_: [{**given, "env_steps": steps} for steps in (10, 20)])
-    assert one("hike", "LSTM", 0.3, 100) == [
-        {"task": "hike", "arm": "LSTM", "rate": 0.3, "seed": 100, "env_steps": 20, "return": -1.0, "wall_s": 2.0}
-    ]
 
 
 @pytest.fixture
@@ -146,13 +130,6 @@ def test_a_search_runs_all_first_rates_then_the_further_one_and_goes_on_where_it
     }
     assert runs == first | further
     assert all(row["return"] == (row["rate"] if row["arm"] == "GRU" else 10 - abs(row["rate"] - 1)) for row in written)
-
-
-def test_a_search_of_one_task_leaves_the_other_alone(search, tmp_path):
-    runs = search("--seeds", "1", "--tasks", "pendulum")
-    assert {task for task, *_ in runs} == {"pendulum"}
-    assert len(runs) == 6 * 3 + 1
-    assert "Mountain hike" not in (tmp_path / "search.md").read_text()
 
 
 def test_rates_are_compared_with_the_same_seeds(search):

@@ -274,37 +274,6 @@ def test_no_two_runs_share_a_file_and_each_is_planned_once(tmp_path):
     assert set(first) == {("pendulum", (0.2, 0.3))}
 
 
-def test_all_runs_are_in_one_list_seed_after_seed(tmp_path, monkeypatch):
-    """The same ones with each of five seeds; all are there before any is made, so that no process waits for another."""
-    lists = []
-    monkeypatch.setattr(study, "side_by_side", lambda calls, processes, title: lists.append((calls, processes)))
-    monkeypatch.setattr("sys.argv", ["control", "--processes", "3", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit, match="no cell"):
-        study.main()
-    ((calls, processes),) = lists
-    assert processes == 3
-    planned = [job.args[0] for seed in range(5) for job in jobs(Study(out=tmp_path), seed, Budget())]
-    assert [call.args[0] for call in calls] == planned
-    assert {call.args[1].args[-1] for call in calls} == {Budget()}
-    cells = [(file.stem.rpartition("-")[2], *file.parts[-3:-1]) for file in planned]  # each once, and not in between
-    assert [one for one, before in zip(cells, [None, *cells], strict=False) if one != before] == list(
-        dict.fromkeys(cells)
-    )
-
-
-@pytest.mark.parametrize("task", list(CELLS))
-def test_arms_of_cells(task):
-    """All in the first two, one that is slow in the first alone; then what the page compares."""
-    first, further, slow = CELLS[task][:2], CELLS[task][2:], {"belief mean, end to end"}
-    for cell in first:
-        arms = set(arms_of(task, cell)) - {"truth"}
-        assert arms == set(study.READERS[task]) - (set() if cell == first[0] else slow)
-    for cell in further:
-        assert {"belief mean", "LSTM"} <= set(arms_of(task, cell)) <= set(study.FEW)
-    least = (0.1, 0) if task.startswith("cartpole") else (0, 0)
-    assert [cell for cell in CELLS[task] if "truth" in arms_of(task, cell)] == [least]
-
-
 def test_a_seed_counts_where_all_arms_have_run(tmp_path):
     """Seeds 0 to 2 of the first hike, of which seed 1 lacks an arm; nothing of the second, which lacks that arm."""
     found = fill(
@@ -318,26 +287,6 @@ def test_a_seed_counts_where_all_arms_have_run(tmp_path):
     rows = complete(found)
     assert {(row["cell"], row["seed"]) for row in rows} == {("noise 0.4", 0), ("noise 0.4", 2)}
     assert len(rows) == 2 * len(arms_of("hike", (0.4, 0.0)))
-
-
-@pytest.mark.parametrize(
-    "wanted",
-    [
-        lambda task, number, arm, seed: True,
-        lambda task, number, arm, seed: seed == 0,
-        lambda task, number, arm, seed: (
-            task == "pendulum" and number != 1
-        ),  # GRU and others: only with missing readings
-        lambda task, number, arm, seed: task == "hike" and number > 1,
-    ],
-    ids=["all", "one seed", "no cell without noise", "no whole cell"],
-)
-def test_tables_of_what_is_there(wanted, tmp_path, monkeypatch, capsys):
-    fill(tmp_path, wanted)
-    monkeypatch.setattr("sys.argv", ["control", "--seeds", "0", "--out", str(tmp_path)])
-    study.main()
-    assert "nan" not in capsys.readouterr().out
-    assert all((tmp_path / f"control.{kind}").exists() for kind in ("csv", "md", "png"))
 
 
 def test_no_tables_of_nothing(tmp_path, monkeypatch):

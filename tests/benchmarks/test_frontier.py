@@ -40,7 +40,7 @@ def test_processor_time_does_not_count_sleep():
 
 @pytest.fixture(scope="module")
 def records():
-    truth, observations = (part.float().transpose(0, 1) for part in simulate(4, 120))
+    truth, observations = (part.float().transpose(0, 1) for part in simulate(4, 80))
     data = TensorDict({"state": truth, "observation": observations}, batch_size=truth.shape[:2])
     return dict(zip(("validation", "test"), data.split(2), strict=True))
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from benchmarks.kitti.folds import Fold, Statistics
 from benchmarks.kitti.recipes import FILTERS
@@ -14,7 +13,6 @@ from benchmarks.kitti.streams import LONGEST, Stream, spans
 from benchmarks.kitti.study import Job, Study
 from torch_denkf.applications.car import write_drives
 from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
-from torch_denkf.applications.car.odometry.streams import shortest_spans
 
 FRAMES = 14
 
@@ -60,16 +58,6 @@ def test_behind_a_box_what_is_read_is_nearer_to_the_street(drive):
     apart = [(each["road"] - clean["road"])[1:].float().abs().mean() for each in (plain, checked)]
     assert apart[1] < 0.6 * apart[0]
     assert len(spans(replace(box, repair=True), "flow")) == 1
-
-
-def test_the_shortest_span_that_is_seen():
-    seen = torch.tensor([[1, 1, 1], [0, 1, 1], [0, 0, 1], [0, 0, 0]]).bool().unsqueeze(-1)
-    entries = {"observed": seen, "ensemble": torch.arange(3.0).expand(4, 3)[..., None, None].expand(4, 3, 2, 2)}
-    readings = TensorDict({"spans": TensorDict({**entries, "encoding": torch.zeros(4, 3, 1)}, [4, 3])}, [4])
-    out = shortest_spans(readings.set("state", torch.zeros(4, 5)))
-    assert out["steps"].flatten().tolist() == [1, 2, 3, 0]
-    assert out["observed"].flatten().tolist() == [True, True, True, False]
-    assert out["sensor", "ensemble"][:3, 0, 0].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_the_filter_on_checked_pictures_takes_the_trained_weights(tmp_path, monkeypatch):

@@ -57,7 +57,7 @@ def test_other_sizes_and_updates_carry_the_weights_and_follow_the_drive(trained,
     assert row["window"] == 100
     assert row["translation_m_per_m"] < 0.05
     assert 0 < row["crps"] < 2  # readings are off by 2.8 on the average
-    times = processor_times(recipe, other, reading, smoke=True)
+    times = processor_times(recipe, other, reading[:10], smoke=True)
     assert set(times) == {"ms_per_step", "eager_ms_per_step"}
     assert min(times.values()) > 0
 

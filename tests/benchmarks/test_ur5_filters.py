@@ -55,8 +55,7 @@ def test_a_clear_picture_decides_the_half_turn_and_an_open_one_leaves_it_to_the_
     torch.testing.assert_close(other, state[:, 5] + math.pi, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast(weighted):
+def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast():
     state = states(2)
     state[:, 5] = torch.tensor([1.0, 1.0])
     samples = TurnedWrist()(state).unsqueeze(1).repeat(1, 4, 1)
@@ -64,10 +63,8 @@ def test_samples_that_leave_it_open_turn_to_the_side_of_the_forecast(weighted):
     forecast = torch.zeros(2, 3, SIZE)
     forecast[0, :, 5], forecast[1, :, 5] = torch.tensor([0.5, 1.0, 1.2]), torch.tensor([1.0, 4.0, 4.2])
     td = TensorDict({"sensor": {"ensemble": samples}, "forecast": {"ensemble": forecast}}, [2])
-    if weighted:  # all weight on the first particle, which is near 1 in both rows
-        td["forecast", "log_weight"] = torch.tensor([1.0, 1e-9, 1e-9]).log().expand(2, -1)
     near = NearForecast(SENSORS["keypoints"])(td)[NEAR]
-    expected = torch.tensor([1.0, 1.0 if weighted else 1.0 + math.pi])
+    expected = torch.tensor([1.0, 1.0 + math.pi])
     torch.testing.assert_close(near[..., 5], expected.unsqueeze(-1).expand(2, 4), atol=1e-5, rtol=0)
 
 
@@ -122,23 +119,12 @@ def test_open_loop_errors_are_those_of_a_constant_acceleration():
     motion.lasting.data.fill_(30.0)  # what moves goes on for ever
     time = torch.arange(30.0, dtype=torch.double)
     states = torch.cat([1e-5 * time.pow(3).unsqueeze(-1).expand(30, 7), torch.zeros(30, 3)], -1).unsqueeze(0)
-    found = open_loop(motion, states, torch.zeros(1, 30, 7, dtype=torch.double), ahead=(1, 5))
+    found = open_loop(motion, states, ahead=(1, 5))
     start = with_rates(states)[0, :25, [0, 10, 17]]
     for n in (1, 5):
         expected = start[:, 0] + n * start[:, 1] + n * (n + 1) / 2 * start[:, 2]
         error = (states[0, n : n + 25, 0] - expected).abs().mean().rad2deg()
         assert found[f"after_{n}_deg"] == pytest.approx(float(error), rel=1e-6)
-
-
-def test_an_arm_that_is_told_where_to_go_goes_there_but_does_not_shut_its_fingers_through_an_object():
-    motion = ArmMotion(FACTS, actions=True)
-    motion.pull.data.fill_(1.0)
-    state = torch.cat([states(1), torch.zeros(1, 14)], -1)
-    action = state[:, :7] + 0.02
-    action[:, 6] = state[:, 6] - 0.5
-    moved = motion(torch.cat([state, action], -1))
-    torch.testing.assert_close(moved[:, :6], action[:, :6])
-    torch.testing.assert_close(moved[:, 6], state[:, 6])
 
 
 def test_biases_fade_and_add_to_the_reading():
@@ -149,7 +135,6 @@ def test_biases_fade_and_add_to_the_reading():
     torch.testing.assert_close(moved[:, :SIZE], motion(state[:, :SIZE]))
     torch.testing.assert_close(moved[:, SIZE:], torch.full((3, 10), FADING))
     torch.testing.assert_close(BiasedReading()(state), state[:, :10] + 1)
-    torch.testing.assert_close(BiasedReading()(state[:, :SIZE]), state[:, :10])
 
 
 # ------------------------------------------------------------------------------------------------ sensors, filters
@@ -210,26 +195,19 @@ def readings():
 @pytest.mark.parametrize("name", sorted(FILTERS))
 def test_every_filter_carries_the_table_first_and_follows_a_sensor_that_is_right(name, readings):
     sensor, motion, td = readings
-    kind = FILTERS[name]
-    own = ArmMotion(FACTS, actions=True) if kind.actions else motion
     torch.manual_seed(0)
-    recipe = kind(copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, own, ERRORS)
+    recipe = FILTERS[name](copy.deepcopy(sensor), SENSORS["keypoints"], FACTS, motion, ERRORS)
     model = recipe.build()
     out = run_filter(recipe, model, td)
     assert out["belief", "mean"].shape[-1] >= 10
     assert torch.isfinite(out["belief", "mean"]).all()
-    if name in ("dekf", "dukf", "bkf", "denkf", "adenkf"):  # the others must be trained first
-        scores = errors(out["belief", "mean"][..., :10], td["state"])
-        assert scores["joint_mae_deg"] < 2.0, scores  # the start is 1 to 3 degrees off, in rates, too
+    scores = errors(out["belief", "mean"][..., :10], td["state"])
+    assert scores["joint_mae_deg"] < 2.0, scores  # the start is 1 to 3 degrees off, in rates, too
     wide = copy.deepcopy(model)
     recipe.set_inflation(wide, 1.5)
     tempered = run_filter(recipe, wide, td)
-    if ("belief", "log_weight") in out.keys(True):  # more of the particles count
-        less, more = (each["belief", "log_weight"][:, 10:].mul(2).logsumexp(-1).mean() for each in (tempered, out))
-        assert less < more
-    if name != "dpf_m_lrn":  # whose likelihood, untrained, does not prefer what is near
-        spread = [float(each["belief", "var"][:, 10:, :10].log().mean()) for each in (out, tempered)]
-        assert spread[1] > spread[0]
+    spread = [float(each["belief", "var"][:, 10:, :10].log().mean()) for each in (out, tempered)]
+    assert spread[1] > spread[0]
 
 
 def test_localisation_keeps_covariances_and_the_gripper_apart():

@@ -34,7 +34,8 @@ def test_a_rate_that_lasts_moves_the_number_and_noise_moves_both():
     torch.testing.assert_close(noise[1], torch.full((2, 2), 0.09))
 
 
-def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system():
+def test_a_fitted_filter_is_as_good_as_the_one_that_knows_the_system(monkeypatch):
+    monkeypatch.setattr("benchmarks.ur5.limits.LENGTH", 60)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randn(2, 60, 120, 1, generator=generator)
     truth = (0.02 * drawn[0]).cumsum(1).cumsum(1)  # a rate that wanders

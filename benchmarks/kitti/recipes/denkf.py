@@ -58,11 +58,3 @@ class DEnKF_Gated(DEnKF):
     """
 
     repair, weights_of = True, "denkf"
-
-
-@register
-class ADEnKF(DEnKF):
-    """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
-
-    def loss(self, model):
-        return self.likelihood_loss(model)

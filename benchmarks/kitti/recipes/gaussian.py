@@ -1,4 +1,4 @@
-"""The baselines that carry mean and covariance: dEKF, dUKF and Backprop-KF."""
+"""The baselines that carry mean and covariance: dEKF and Backprop-KF."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from torch_denkf.modules import (
     GaussianAround,
     ScaledNoise,
     SubModel,
-    UKFAnalysis,
-    UKFTransition,
 )
 
 
@@ -30,15 +28,13 @@ class _Gaussian(KITTIRecipe):
     the pose's variance in every step, too, which nothing observes: it would grow without bound.
     """
 
-    Transition, Analysis = EKFTransition, EKFAnalysis
-
     def modules(self):
         motion = ClonedTransition(self.transition(torch.zeros_like))
         process_noise = ScaledNoise(self.process_noise())
         return OrderedDict(
             noise=ScaledNoise(self.noise()),
-            transition=self.Transition(motion, UnicycleNoise(process_noise, self.facts.dt)),
-            analysis=self.Analysis(self.observation(history_key=None), observed_key=("forecast", "observed")),
+            transition=EKFTransition(motion, UnicycleNoise(process_noise, self.facts.dt)),
+            analysis=EKFAnalysis(self.observation(history_key=None), observed_key=("forecast", "observed")),
         )
 
     def process_noise(self) -> SubModel:
@@ -63,13 +59,6 @@ class DEKF_Gated(DEKF):
     """The dEKF as it was trained, on checked pictures like the DEnKF's."""
 
     repair, weights_of = True, "dekf"
-
-
-@register
-class DUKF(_Gaussian):
-    """Differentiable unscented Kalman filter (Kloss et al. 2021)."""
-
-    Transition, Analysis = UKFTransition, UKFAnalysis
 
 
 @register

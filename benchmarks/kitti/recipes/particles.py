@@ -1,4 +1,4 @@
-"""The baselines that carry weighted particles: DPF, dPF-M and dPF-M-lrn."""
+"""The baseline that carries weighted particles: dPF-M-lrn."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from torch_denkf.modules import AroundState, DiagonalNoise, NoisyTransition
 from torch_denkf.modules.particles import with_weights
 
 
-class _Particles(Particles, KITTIRecipe):
-    """Particles move by the known motion with learned noise of their velocities."""
+@register
+class DPF_M_LRN(Particles, KITTIRecipe):
+    """Kloss et al. 2021 with a learned likelihood; particles move by the known motion, their velocities with noise."""
 
+    learned = "clipped"
     likelihood_keys = {"observed_key": ("forecast", "observed")}  # noqa: RUF012
 
     def noisy_motion(self):
@@ -37,22 +39,3 @@ class _Particles(Particles, KITTIRecipe):
     def initial(self, std, state_key):
         around = AroundState(std, ensemble_size=self.particles, state_key=state_key)
         return with_weights(ClonedPrior(around, LONGEST - 1))
-
-
-@register
-class DPF(_Particles):
-    """Jonschkowski et al. 2018: learned likelihood, hard resampling in every step."""
-
-    resampling, learned, needs_training = "systematic", "scaled", True
-
-
-@register
-class DPF_M(_Particles):
-    """Kloss et al. 2021: Gaussian likelihood, soft resampling."""
-
-
-@register
-class DPF_M_LRN(_Particles):
-    """Kloss et al. 2021 with a learned likelihood."""
-
-    learned, needs_training = "clipped", True

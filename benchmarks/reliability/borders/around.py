@@ -139,40 +139,6 @@ def _no_moments(points: torch.Tensor) -> bool:
     return all(bool(value[1].isnan().all()) for value in moments) and torch.equal(points[0], sound)
 
 
-def _tracked(**given: Any) -> Any:
-    car = pretrained.LOADERS["car-odometry"](pretrained.FOLDERS["car-odometry"])
-    frames = [np.full((24, 72, 3), 40 * k, np.uint8) for k in range(4)]
-    settings: dict[str, Any] = {"frames": frames, "calibration": (41.7, 41.7, 35.5, 11.5), "fps": 10.0, **given}
-    if "times" in given:
-        settings["fps"] = None
-    return list(track(car, **settings))
-
-
-def _no_moments(points: torch.Tensor) -> bool:
-    """What functions of tensors promise where an element of a batch has no result: that it is NaN, and no other one.
-
-    They look at no values, which under ``torch.compile`` and on a GPU would cost more than they do. Of sigma points
-    without a covariance nothing finite may be left in their moments.
-    """
-    moments = unscented_moments(points, unscented_weights(2))
-    sound = sigma_points(torch.zeros(2), torch.eye(2))
-    return all(bool(value[1].isnan().all()) for value in moments) and torch.equal(points[0], sound)
-
-
-def car_settings() -> dict[str, d.Wrong]:
-    """Wrong settings of a car's filter."""
-    return {
-        "dt": d.POSITIVE,
-        "ensemble_size": d.LARGE_COUNT,
-        "velocity_std": d.vector(2, positive=True),
-        "velocity_mean": d.vector(2),
-        **dict.fromkeys(("lags", "longest", "features"), d.COUNT),
-        **dict.fromkeys(("reach", "focal", "inflation"), d.POSITIVE),
-        "size": d.SIZE,
-        "colour": d.Wrong({"no such setting": "red"}),
-    }
-
-
 def _track() -> dict[str, d.Wrong]:
     frame = np.zeros((24, 72, 3), np.uint8)
     frames = {

@@ -31,8 +31,6 @@ from torch_denkf.deployment import export_step, load_step
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
-__all__ = ["rows"]
-
 SMALL, LARGE = "size=64k", "size=400m"
 
 

@@ -28,8 +28,6 @@ from torch_denkf.applications.ur5 import UR5ExperienceReplay, collect_ur5_demos
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.training.checkpoint import read_checkpoint
 
-__all__ = ["JOBS", "rows"]
-
 LEFT = re.compile(r"^\.(writing|demo|collection|.*\.part)|\.part$|\.tmp$|-[0-9a-f]{8}$")
 GRACE = 90.0  # s in which workers of a killed process end themselves: they may be importing torch
 

@@ -25,8 +25,6 @@ from tests.filters.factories import linear_denkf
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import DEnKFTransform
 
-__all__ = ["LAYOUTS", "rows"]
-
 ENVIRONMENTS, ROWS = 4, 16  # processes of a ParallelEnv, and rows of each
 FRAMES = 6400  # steps of all rows in a batch
 WORKERS = 2  # processes of a collector

@@ -20,8 +20,6 @@ from torch_denkf.deployment.package import PackagedStep
 from torch_denkf.filters import Filter, LSTMFilter
 from torch_denkf.modules import GaussianPrior
 
-__all__ = ["FILTERS", "rows"]
-
 EVERY, STRETCH = 100_000, 10_000  # steps from one stretch without readings to the next, and its length
 CHUNK = 10_000
 SETTLE = 2_000  # steps after which a start is forgotten

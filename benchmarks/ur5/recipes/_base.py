@@ -71,7 +71,7 @@ class UR5Recipe(ArmRecipe):
     @property
     def noisy(self) -> list[int]:
         """Dimensions of the state that the process noise acts on."""
-        return [*NOISY, *range(SIZE, self.size)]
+        return [*NOISY, *range(SIZE, SIZE + STATE)]
 
     def observation(self) -> SubModel:
         """H of the near reading."""
@@ -81,16 +81,16 @@ class UR5Recipe(ArmRecipe):
     def process_std(self) -> Tensor:
         """What motion and bias do not know before training: 0.5 mm, usual jerks; biases stay as large."""
         slow = (1 - FADING**2) ** 0.5 * WHITE * self.error
-        return torch.cat([torch.full((3,), 0.0005), self.facts.jerk, slow])[: len(self.noisy)]
+        return torch.cat([torch.full((3,), 0.0005), self.facts.jerk, slow])
 
     def _process_noise(self) -> SubModel:
-        facts, blind = self.facts, self.size - SIZE
+        facts = self.facts
         return DiagonalNoise(
             len(self.noisy),
             r=self.process_std,
             in_features=self.size,
-            loc=torch.cat([facts.loc, torch.zeros(2 * JOINTS + blind)]),
-            scale=torch.cat([facts.scale, facts.rate, facts.acceleration, torch.full((blind,), torch.inf)]),
+            loc=torch.cat([facts.loc, torch.zeros(2 * JOINTS + STATE)]),
+            scale=torch.cat([facts.scale, facts.rate, facts.acceleration, torch.full((STATE,), torch.inf)]),
             in_key=("belief", "mean"),
             out_key=("forecast", "noise"),
         )
@@ -103,7 +103,7 @@ class UR5Recipe(ArmRecipe):
         return torch.cat([wrong, 0.3 * self.facts.rate, 0.5 * self.facts.acceleration])
 
     def _with_bias(self, std: Tensor) -> Tensor:
-        return torch.cat([std, WHITE * self.error])[: self.size]
+        return torch.cat([std, WHITE * self.error])
 
     def initial(self) -> TensorDictModuleBase:
         """The belief at the start of an episode: near the true state, at rest."""

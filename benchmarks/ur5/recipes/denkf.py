@@ -55,20 +55,5 @@ class DEnKF(UR5Recipe):
 
     def loss(self, model):
         loss = self.ensemble_loss(model)
-        loss.set_keys(state="motion_and_bias" if self.bias else "motion")
+        loss.set_keys(state="motion_and_bias")
         return loss
-
-
-@register
-class DEnKFActions(DEnKF):
-    """The same, told where the joints were sent."""
-
-    actions = True
-
-
-@register
-class ADEnKF(DEnKF):
-    """Chen, Sanz-Alonso & Willett 2022: the same filter, trained by its readings' likelihood, without the truth."""
-
-    def loss(self, model):
-        return self.likelihood_loss(model)
