@@ -8,7 +8,7 @@ of time, each of which begins with the hidden state that was collected there. PP
 of policy.py, but for a learning rate three times as large: at that of policy.py this LSTM returns -511.
 
 All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN writes
-NaN without an error. Then append ``torch_denkf.transforms.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
+NaN without an error. Then append ``torch_denkf.envs.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
 last reading that arrived, in the place of ``"observation"``.
 
 It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -236, on the belief -188 (one run each).

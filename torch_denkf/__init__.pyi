@@ -26,7 +26,10 @@ from .data.recordings.frames import Images, Video
 from .data.recordings.replay import Recording, RecordingReplay
 from .data.recordings.tables import Table
 from .deployment import export_step, load_step
+from .envs.disturbances import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+from .envs.hold import HoldReading
 from .envs.linear import LinearGaussianEnv
+from .envs.missing import MissingFrames
 from .envs.pendulum import NoisyPendulumEnv
 from .envs.replay import ReplayEnv
 from .filters import (
@@ -48,17 +51,7 @@ from .objectives import DEnKFLoss, GaussianLoss, MixtureLoss, ObservationLoss, S
 from .pretrained.folders import available, from_pretrained, save_pretrained
 from .smoothers import EnKS, EnRTS, FixedLag, IEnKS, ParticleSmoother, RTSSmoother
 from .training import FilterTrainer, Stage
-from .transforms import (
-    BlackFrames,
-    Blur,
-    Brightness,
-    DEnKFTransform,
-    HoldReading,
-    LastAction,
-    MissingFrames,
-    OccludingBox,
-    SaltAndPepper,
-)
+from .transforms import DEnKFTransform, LastAction
 
 __version__: str
 

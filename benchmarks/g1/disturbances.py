@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf.transforms import SaltAndPepper
+from torch_denkf.envs import SaltAndPepper
 
 BOX = 0.3  # side of a box over the hand, in widths of the picture
 SHIFT = 10 / 320  # of a camera that was pushed, in widths of the picture

@@ -21,10 +21,10 @@ from benchmarks.g1.recordings import ARM, HAND, targets
 from benchmarks.g1.sensors import code_of, read_code
 from benchmarks.g1.targets import Target
 from torch_denkf.data import LeRobotReplay
+from torch_denkf.envs import SaltAndPepper
 from torch_denkf.modules import ImageSensor
 from torch_denkf.monitoring import BlackIsMissing
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
-from torch_denkf.transforms import SaltAndPepper
 
 PICTURES = ("clean", "salt_and_pepper", "box", "shifted", "dark")  # conditions that change pictures
 CONDITIONS = ("clean", "black20", "black20_unannounced", "missing", *PICTURES[1:])

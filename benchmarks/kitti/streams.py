@@ -19,7 +19,7 @@ from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
 from torch_denkf.applications.car.kitti.gaps import steps_between
 from torch_denkf.applications.car.vision import static_region
 from torch_denkf.data.cache import cached
-from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
 LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing

@@ -21,9 +21,9 @@ from torch_denkf.applications.car.vision import PICTURE_SIGNS, flow_signs, pictu
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 from torch_denkf.applications.car.vision.signs import FLOW_SIGNS
 from torch_denkf.data.cache import cached
+from torch_denkf.envs import BlackFrames, Brightness, OccludingBox
 from torch_denkf.filters import Filter
 from torch_denkf.pretrained import from_pretrained
-from torch_denkf.transforms import BlackFrames, Brightness, OccludingBox
 
 LENGTH, PERIOD = 20, 60  # frames that a fault lasts, and between the beginnings of two
 SIGNS = (*PICTURE_SIGNS, *FLOW_SIGNS)

@@ -18,9 +18,9 @@ from benchmarks.ur5.demos import STATE
 from benchmarks.ur5.motion import with_rates
 from torch_denkf._files import write_bytes
 from torch_denkf.applications.ur5 import UR5ExperienceReplay
+from torch_denkf.envs import SaltAndPepper
 from torch_denkf.modules import ImageSensor
 from torch_denkf.monitoring import BlackIsMissing
-from torch_denkf.transforms import SaltAndPepper
 
 CONDITIONS = ("clean", "black20", "missing", "salt_and_pepper")
 BLACK, MISSING = 20, 0.3  # consecutive black frames; share of frames that do not arrive

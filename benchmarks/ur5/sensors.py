@@ -14,11 +14,11 @@ from benchmarks.common.scores import SensorLoss
 from benchmarks.ur5.demos import STATE, FramePool
 from benchmarks.ur5.glimpse import GlimpseTrunk, keypoint_trunk, project
 from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
+from torch_denkf.envs import Brightness, SaltAndPepper
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, SubModel, convolutional_trunk
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import train_part
-from torch_denkf.transforms import Brightness, SaltAndPepper
 
 SAMPLES = 32  # of a sensor while it is trained
 MEMBERS = 128  # of the ensemble filters, whose states are 27 numbers; they read as many samples

@@ -1,4 +1,7 @@
-"""Environments: toy systems, replays and a simulated arm. They know nothing about filters."""
+"""Environments: toy systems and replays; transforms that disturb frames, lose them, or hold the last one.
+
+They know nothing about filters.
+"""
 
 import lazy_loader
 

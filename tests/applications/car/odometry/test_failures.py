@@ -14,7 +14,7 @@ from torch_denkf.applications.car.odometry.failing_drive import drive_scores, tr
 from torch_denkf.applications.car.odometry.failures import CameraFailure, fail_frames
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.motion import image_motion
-from torch_denkf.transforms import OccludingBox
+from torch_denkf.envs import OccludingBox
 
 
 def test_black_frames_are_missing_frames(checkpoint, drive):

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.transforms import OccludingBox
+from torch_denkf.envs import OccludingBox
 
 __all__ = ["CameraFailure", "fail_frames"]
 
@@ -19,7 +19,7 @@ class CameraFailure(NamedTuple):
 
     Attributes:
         kind: ``"missing"`` (the frames do not arrive, and that is known), ``"black"`` (they arrive, black) or
-            ``"box"`` (:class:`torch_denkf.transforms.OccludingBox`: something hides a part of each picture).
+            ``"box"`` (:class:`torch_denkf.envs.OccludingBox`: something hides a part of each picture).
         first: number of the first frame.
         last: number of the last frame.
     """

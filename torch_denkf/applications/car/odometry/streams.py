@@ -19,7 +19,7 @@ from torch_denkf.applications.car.kitti.motion import with_motion
 from torch_denkf.applications.car.modules.flow_sensor import FlowSensor
 from torch_denkf.applications.car.odometry.filter import VELOCITIES
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.transforms import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
+from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
 __all__ = [
     "CONDITIONS",

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Binary, Composite
 
-from torch_denkf.transforms._frames import FrameTransform
+from torch_denkf.envs._frames import FrameTransform
 
 __all__ = ["MissingFrames"]
 
@@ -16,7 +16,7 @@ class MissingFrames(FrameTransform):
 
     This is the paper's test with missing observations (section IV-A, p = 0.3). Frames that are missing already stay
     so; the frame of a reset counts like any other. Black frames that nobody reports are
-    :class:`torch_denkf.transforms.BlackFrames`.
+    :class:`torch_denkf.envs.BlackFrames`.
 
     Args:
         p: probability that a frame is dropped.

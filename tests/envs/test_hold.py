@@ -12,7 +12,7 @@ from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.transforms import HoldReading, MissingFrames
+from torch_denkf.envs import HoldReading, MissingFrames
 
 NAN = float("nan")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torch_denkf._arguments import Checked
-from torch_denkf.filters._steps import where_rows
 
 __all__ = ["HoldReading"]
 
@@ -78,7 +78,8 @@ class HoldReading(Checked, Transform):
         masks = [tensordict.get(key, None) for key in (["_reset"] if self.parent is None else self.parent.reset_keys)]
         rows = [mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks if mask is not None]
         before, out = tensordict_reset.get(self.out_keys[0]), self._write(tensordict_reset, None)
-        return out.set(self.out_keys[0], where_rows(torch.stack(rows).any(0), out.get(self.out_keys[0]), before))
+        now = out.get(self.out_keys[0])
+        return out.set(self.out_keys[0], torch.where(expand_as_right(torch.stack(rows).any(0), now), now, before))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Does nothing to data that hold the reading already, as an environment's do.

@@ -18,7 +18,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torch_denkf.transforms._frames import ImageDisturbance, scale_of, to_dtype, to_float
+from torch_denkf.envs._frames import ImageDisturbance, scale_of, to_dtype, to_float
 
 __all__ = ["BlackFrames", "Blur", "Brightness", "OccludingBox", "SaltAndPepper"]
 

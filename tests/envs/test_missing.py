@@ -9,7 +9,7 @@ from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from tests.functional.checks import assert_refused
 from tests.transforms.envs_for_tests import base_env
-from torch_denkf.transforms import MissingFrames
+from torch_denkf.envs import MissingFrames
 
 
 @pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
