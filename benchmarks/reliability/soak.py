@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,28 +35,27 @@ class Soak:
     def __call__(self) -> None:
         """Runs the parts, and writes after each row."""
         if self.smoke:
-            for row in layouts.rows(2 * layouts.FRAMES, lambda name: name != "Collector"):
-                print(row)
+            print(layouts.soak("Collector", 2 * layouts.FRAMES))
             return
         for part in self.parts:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             if self.anew:
                 self._keep(part, [])
-            for row in self._rows(part):
+            for name, job in self._jobs(part).items():
+                if any(row["name"] == name for row in self._found(part)):
+                    continue
+                row = job()
                 print(part, json.dumps(row), flush=True)
                 with FileLock(self.out.with_suffix(".lock")):  # parts may run in processes of their own
                     self._keep(part, [*self._found(part), row])
         write_table(self.out)
 
-    def _rows(self, part: str) -> Iterator[dict[str, Any]]:
-        def done(name: str) -> bool:
-            return any(row["name"] == name for row in self._found(part))
-
-        made: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {
-            "steps": lambda: steps.rows(self.steps, done),
-            "kills": lambda: kills.rows(self.kills, done, self.seed),
-            "disks": lambda: disks.rows(done),
-            "layouts": lambda: layouts.rows(self.frames, done),
+    def _jobs(self, part: str) -> dict[str, Callable[[], dict[str, Any]]]:
+        made: dict[str, Callable[[], dict[str, Callable[[], dict[str, Any]]]]] = {
+            "steps": lambda: steps.jobs(self.steps),
+            "kills": lambda: kills.jobs(self.kills, self.seed),
+            "disks": disks.jobs,
+            "layouts": lambda: layouts.jobs(self.frames),
         }
         return made[part]()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.case import SECONDS, Case
 from torch_denkf._arguments import _signature
+
+Right = Callable[[Any], bool] | None  # whether a result is right; ``None`` where there may be none
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Target:
         act: does what a user would do with a wrong value of it, in an empty folder.
         wrong: its wrong values.
         right: whether a result is right, as the sound part of the input tells; ``None`` where it must be refused.
-        rights: returns ``right`` for one of the values, where it differs, given its name and itself.
+        rights: ``right`` for some of the values, by their names; or a function that returns it, given name and value.
         within: s in which it must be over.
         needs: makes what it starts from, in a process of its own; called once.
         slow: whether ``needs`` takes so long that small samples leave it out.
@@ -38,8 +41,8 @@ class Target:
     words: tuple[str, ...]
     act: Callable[[Any, Path], Any]
     wrong: d.Wrong
-    right: Callable[[Any], bool] | None = None
-    rights: Callable[[str, Any], Callable[[Any], bool] | None] | None = None
+    right: Right = None
+    rights: Mapping[str, Right] | Callable[[str, Any], Right] = field(default_factory=dict)
     within: float = SECONDS
     needs: Callable[[], Any] | None = None
     slow: bool = False
@@ -48,7 +51,8 @@ class Target:
     def case(self, one: tuple[str, Any]) -> Case:
         """The input with one of the wrong values."""
         what, value = one
-        right = self.right if self.rights is None else self.rights(what, value)
+        rights = self.rights
+        right = rights(what, value) if callable(rights) else rights.get(what, self.right)
         name = f"{self.name}: {what}"
         words = (*self.words, value) if self.said and isinstance(value, str) and value else self.words
         return Case(self.border, name, words, lambda folder: self.act(value, folder), right, self.within)
@@ -89,6 +93,14 @@ class Folder:
     sound: Callable[[], Path]
     read: Callable[..., Any]
 
+    def reference(self, **options: Any) -> Any:
+        """What is read without damage, once for all."""
+        return _reference(self, tuple(options.items()))
+
+    def equal(self, result: Any, **options: Any) -> bool:
+        """Whether a result is that."""
+        return d.same(result, self.reference(**options))
+
     def damaged(self, change: d.Change, folder: Path, file: str = "", **options: Any) -> Any:
         """What a user reads of a changed copy."""
         root = d.copied(self.sound(), folder)
@@ -99,7 +111,7 @@ class Folder:
         self,
         name: str,
         wrong: d.Wrong | Mapping[str, d.Change],
-        right: Callable[[Any], bool] | None = None,
+        right: Right = None,
         words: str | tuple[str, ...] = (),
         file: str = "",
         options: Mapping[str, Any] | None = None,
@@ -119,6 +131,11 @@ class Folder:
     def one(self, name: str, change: d.Change, words: str | tuple[str, ...], **more: Any) -> Target:
         """A target with one change."""
         return self.target(name, {"damaged": change}, words=words, **more)
+
+
+@cache
+def _reference(folder: Folder, options: tuple[tuple[str, Any], ...]) -> Any:
+    return folder.read(folder.sound(), **dict(options))
 
 
 #: Wrong values of arguments, by their annotation.

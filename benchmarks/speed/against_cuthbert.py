@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.speed.jax_networks import jax, jnp, mlp
 from benchmarks.speed.ours import sequences
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.pairs import Row, against
 from benchmarks.speed.workload import MEMBERS, STATE, STEPS, make_filter, make_frames, noise_floor, weights
 
 NOTE = "same networks and weights, perturbed readings; theirs draws dropout with threefry in each layer"
@@ -69,8 +69,7 @@ def rows(seconds: float) -> list[Row]:
     out = []
     for (batch, backward), (target, aim) in LIMITS.items():
         ours = sequences(batch, scheme="perturbed", backward=backward)
-        timings = interleave({**ours, "cuthbert": cuthbert_sequence(batch, backward)}, seconds=seconds)
-        for kind in ours:
-            name = f"{kind} sequence / cuthbert, {'gradients, ' * backward}B={batch}"
-            out.append(timings.row(name, kind, "cuthbert", per=STEPS, target=target, aim=aim, note=NOTE))
+        theirs, title = cuthbert_sequence(batch, backward), f"sequence / cuthbert, {'gradients, ' * backward}B={batch}"
+        fields = {"per": STEPS, "target": target, "aim": aim, "note": NOTE}
+        out += against(ours, "cuthbert", theirs, title, how={"seconds": seconds}, **fields)
     return out

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
 
 from benchmarks.common.lorenz96 import lorenz96_step
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.pairs import Row, against
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate
 
@@ -76,13 +77,12 @@ def rows(seconds: float) -> list[Row]:
             ours_error.append(float(error[SETTLED:].mean()))
 
         candidates = {kind: partial(our_call, cycle) for kind, cycle in cycles.items()}
-        timings = interleave({**candidates, "dapper": dapper_call}, seconds=seconds, rounds=7)
+        title, how = f"Lorenz-96 cycle / DAPPER {name}, E={size}", {"seconds": seconds, "rounds": 7}
+        found = against(candidates, "dapper", dapper_call, title, how=how, per=len(observations), target=0.4)
         their_error = float(theirs.stats.err.rms.a[SETTLED:].mean())
         note = (
             f"E={size}, inflation {inflation}, float64; RMSE {sum(ours_error) / len(ours_error):.3f} and "
             f"{their_error:.3f}; theirs keeps errors alone (its least), ours errors and spread"
         )
-        fields = {"per": len(observations), "target": 0.4, "note": note}
-        for kind in cycles:
-            out.append(timings.row(f"{kind} Lorenz-96 cycle / DAPPER {name}, E={size}", kind, "dapper", **fields))
+        out += [replace(row, note=note) for row in found]
     return out

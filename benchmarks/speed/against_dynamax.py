@@ -6,15 +6,14 @@ Both sides take the same readings from the same belief and give the same means a
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 
 import numpy as np
 import torch
 
 from benchmarks.speed.jax_networks import jax, jnp, mlp
-from benchmarks.speed.ours import CHUNK, compile_options, sequence
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.ours import filters, sequence
+from benchmarks.speed.pairs import Row, against
 from benchmarks.speed.workload import (
     OBSERVATION,
     POINTS,
@@ -91,25 +90,15 @@ def same_beliefs(filter: Filter, kind: str, batch: int) -> None:
         np.testing.assert_allclose(own.numpy(), other, rtol=1e-3, atol=5e-5, err_msg=f"{kind}, B={batch}: {name}")
 
 
-def filters(kind: str) -> dict[str, Filter]:
-    """An eager filter and, unless SPEED_COMPILE=0, a compiled one."""
-    eager = {"eager": make_gaussian_filter(kind)}
-    if os.environ.get("SPEED_COMPILE") == "0":
-        return eager
-    return {**eager, "compiled": make_gaussian_filter(kind).compile(chunk=CHUNK, **compile_options())}
-
-
 def rows(seconds: float) -> list[Row]:
     out = []
     for kind in ("EKF", "UKF"):
         for batch, (target, aim) in LIMITS.items():
-            ours = filters(kind)
+            ours = filters(make_gaussian_filter, kind)
             for filter in ours.values():
                 same_beliefs(filter, kind, batch)
             calls = {name: sequence(filter, batch, samples=False) for name, filter in ours.items()}
-            calls["dynamax"] = dynamax_sequence(kind, batch)
-            timings = interleave(calls, seconds=seconds, shortest=WARM_S)
-            for name in ours:
-                title = f"{name} {kind} sequence / dynamax, B={batch}"
-                out.append(timings.row(title, name, "dynamax", per=FRAMES, target=target, aim=aim, note=NOTE))
+            theirs, title = dynamax_sequence(kind, batch), f"{kind} sequence / dynamax, B={batch}"
+            how, fields = {"seconds": seconds, "shortest": WARM_S}, {"target": target, "aim": aim, "note": NOTE}
+            out += against(calls, "dynamax", theirs, title, how=how, per=FRAMES, **fields)
     return out

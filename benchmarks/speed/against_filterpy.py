@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.speed.ours import steps
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.pairs import Row, against
 from benchmarks.speed.workload import MEMBERS, OBSERVATION, RATE, STATE, make_filter, make_frames, noise_floor, weights
 
 NOTE = "same networks and weights; theirs calls them for each member, and adds a tiny Gaussian process noise of its own"
@@ -60,6 +60,5 @@ def rows(seconds: float) -> list[Row]:
         rtol=1e-4,
         atol=1e-5,
     )
-    ours = steps(1)
-    timings = interleave({**ours, "filterpy": filterpy_loop()}, seconds=seconds)
-    return [timings.row(f"{kind} step / filterpy, B=1", kind, "filterpy", target=0.3, note=NOTE) for kind in ours]
+    fields = {"how": {"seconds": seconds}, "target": 0.3, "note": NOTE}
+    return against(steps(1), "filterpy", filterpy_loop(), "step / filterpy, B=1", **fields)

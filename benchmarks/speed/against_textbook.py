@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from benchmarks.speed.ours import sequences
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.pairs import Row, against
 from benchmarks.speed.textbook import Textbook
 from benchmarks.speed.workload import STEPS, make_filter, make_frames, start
 
@@ -36,8 +36,7 @@ def rows(seconds: float) -> list[Row]:
     out = []
     for (batch, backward), (target, aim) in LIMITS.items():
         ours = sequences(batch, backward=backward)
-        timings = interleave({**ours, "textbook": textbook(batch, backward)}, seconds=seconds)
-        for kind in ours:
-            name = f"{kind} sequence / textbook torch, {'forward and backward, ' * backward}B={batch}"
-            out.append(timings.row(name, kind, "textbook", per=STEPS, target=target, aim=aim, note=NOTE))
+        title = f"sequence / textbook torch, {'forward and backward, ' * backward}B={batch}"
+        fields = {"per": STEPS, "target": target, "aim": aim, "note": NOTE}
+        out += against(ours, "textbook", textbook(batch, backward), title, how={"seconds": seconds}, **fields)
     return out

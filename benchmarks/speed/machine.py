@@ -48,10 +48,29 @@ def measure() -> dict:
     }
 
 
-def in_child(script: str) -> float:
-    """The number that a Python script prints in a process of its own, started in the repository's root."""
+PEAK = """
+import torch
+torch.set_num_threads(1)
+def kib(name):
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
+{prepare}
+before = kib("VmRSS")
+{inputs}
+open("/proc/self/clear_refs", "w").write("5")  # the peak starts anew: to make the inputs took more
+{act}
+print(1024 * (kib("VmHWM") - before))
+"""
+
+
+def resident_peak(prepare: str, act: str, inputs: str = "") -> float:
+    """Bytes that lines of Python take at most, in a process of their own, started in the repository's root.
+
+    Args:
+        prepare: what is there before, and does not count.
+        act: what is measured.
+        inputs: what it starts from, which counts as long as it is held.
+    """
+    script = PEAK.format(prepare=prepare, act=act, inputs=inputs)
+    command = [sys.executable, "-c", script]
     root = Path(__file__).parents[2]
-    process = subprocess.run(
-        [sys.executable, "-c", script], cwd=root, capture_output=True, text=True, timeout=600, check=True
-    )
-    return float(process.stdout)
+    return float(subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600, check=True).stdout)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.workload import MEMBERS, STEPS, make_filter, make_frames, start
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 
 #: Steps in one compiled graph.
@@ -19,25 +19,21 @@ CHUNK = 20
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
     """The sequence eagerly and, unless SPEED_COMPILE=0, compiled in chunks; names for the table."""
     fields = {"samples": scheme == "sensor", "backward": backward}
-    return {kind: sequence(filter, batch, **fields) for kind, filter in filters(scheme).items()}
+    return {kind: sequence(filter, batch, **fields) for kind, filter in filters(make_filter, scheme).items()}
 
 
 def steps(batch: int) -> dict[str, Callable[[], Tensor]]:
     """A step on a tensordict, eagerly and compiled likewise."""
-    return {kind: tensordict_loop(filter, batch) for kind, filter in filters("sensor").items()}
+    return {kind: tensordict_loop(filter, batch) for kind, filter in filters(make_filter).items()}
 
 
-def filters(scheme: str) -> dict[str, DEnKF]:
-    """An eager filter and, unless SPEED_COMPILE=0, a compiled one."""
-    eager = {"eager": make_filter(scheme)}
-    if os.environ.get("SPEED_COMPILE") == "0":
-        return eager
-    return {**eager, "compiled": make_filter(scheme).compile(chunk=CHUNK, **compile_options())}
-
-
-def compile_options() -> dict[str, str]:
-    """None, for this package's passes; with SPEED_PLAIN=1 inductor as it is."""
-    return {"backend": "inductor"} if os.environ.get("SPEED_PLAIN") == "1" else {}
+def filters(make: Callable[..., Filter], *options: str) -> dict[str, Filter]:
+    """An eager filter and, unless SPEED_COMPILE=0, a compiled one: with SPEED_PLAIN=1 by inductor as it is."""
+    found = {"eager": make(*options)}
+    if os.environ.get("SPEED_COMPILE") != "0":
+        backend = {"backend": "inductor"} if os.environ.get("SPEED_PLAIN") == "1" else {}
+        found["compiled"] = make(*options).compile(chunk=CHUNK, **backend)
+    return found
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
@@ -77,7 +73,7 @@ def functional_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
     return call
 
 
-def tensordict_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
+def tensordict_loop(filter: Filter, batch: int) -> Callable[[], Tensor]:
     """A step a call on one tensordict, each from the belief of the last."""
     row = make_frames(batch, 1)[:, 0].set(("belief", "ensemble"), start(filter, batch))
 
@@ -89,7 +85,7 @@ def tensordict_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
     return call
 
 
-def sequence(filter: DEnKF, batch: int, *, samples: bool = True, backward: bool = False) -> Callable[[], Tensor]:
+def sequence(filter: Filter, batch: int, *, samples: bool = True, backward: bool = False) -> Callable[[], Tensor]:
     """A whole sequence of STEPS steps a call, one frame more because the first is where it starts."""
     frames = make_frames(batch, STEPS + 1, samples=samples)
     parameters = list(filter.parameters())

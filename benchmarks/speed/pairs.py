@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from statistics import median
 
+Call = Callable[[], object]
 MET = {True: "yes", False: "**no**", None: ""}
 
 
@@ -52,7 +53,7 @@ class Row:
 
     def as_dict(self) -> dict:
         """What is written to JSON."""
-        return {**asdict(self), "met": self.met}
+        return {name: value for name, value in asdict(self).items() if name != "least"} | {"met": self.met}
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,21 @@ def interleave(
     finally:
         gc.enable()
     return Timings(times)
+
+
+def against(ours: Mapping[str, Call], name: str, theirs: Call, title: str, *, how: dict, **fields) -> list[Row]:
+    """A line for each of ours beside another package's.
+
+    Args:
+        ours: by kind.
+        name: of the other package.
+        theirs: its call.
+        title: of the lines, behind the kind.
+        how: of :func:`interleave`.
+        **fields: of the lines.
+    """
+    timings = interleave({**ours, name: theirs}, **how)
+    return [timings.row(f"{kind} {title}", kind, name, **fields) for kind in ours]
 
 
 def in_turn(calls: Mapping[str, Callable[[], object]], rounds: int, repeats: int = 1) -> Timings:

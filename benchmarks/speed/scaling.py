@@ -19,7 +19,7 @@ from torch import Tensor
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import head, line, write_page
-from benchmarks.speed.machine import in_child
+from benchmarks.speed.machine import resident_peak
 from benchmarks.speed.pairs import Row
 from torch_denkf.functional import analyse
 
@@ -80,24 +80,12 @@ def copies(size: int, scheme: str) -> float:
     return (held + allocated_peak(lambda: analyse(**arguments))) / arguments["forecast"].nbytes
 
 
-CHILD = """
-import torch
-from benchmarks.speed import scaling
-torch.set_num_threads(1)
-def kib(name):
-    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
-scaling.analyse(**scaling.problem(100_000, {scheme!r}, 0.5))
-before = kib("VmRSS")
-arguments = scaling.problem({size}, {scheme!r}, 0.5)
-open("/proc/self/clear_refs", "w").write("5")  # the peak starts anew: making the arguments took more
-scaling.analyse(**arguments)
-print(1024 * (kib("VmHWM") - before) / arguments["forecast"].nbytes)
-"""
-
-
 def resident_copies(size: int, scheme: str) -> float:
     """The same from the resident peak of a child process; its libraries and what they keep do not count."""
-    return in_child(CHILD.format(size=size, scheme=scheme))
+    warm, inputs = (f"scaling.problem({count}, {scheme!r}, {NOISES[0]})" for count in (100_000, size))
+    prepare = f"from benchmarks.speed import scaling\nscaling.analyse(**{warm})"
+    taken = resident_peak(prepare, "scaling.analyse(**arguments)", f"arguments = {inputs}")
+    return taken / (4 * MEMBERS * size)
 
 
 def times(scheme: str, rounds: int, sizes: tuple[int, ...]) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 
 from benchmarks.speed.ours import functional_loop, steps
-from benchmarks.speed.pairs import Row, interleave
+from benchmarks.speed.pairs import Row, against
 from benchmarks.speed.workload import make_filter
 
 NOTE = "one step each, the functions eager; both draw their noise and compute all outputs; pandas hidden"
@@ -28,9 +28,7 @@ def rows(seconds: float) -> list[Row]:
     without_pandas()
     out = []
     for batch, target in ((1, 1.15), (64, 1.05)):
-        ours = steps(batch)
-        timings = interleave({**ours, "functional": functional_loop(make_filter(), batch)}, seconds=seconds)
-        for kind in ours:
-            name = f"{kind} step on a tensordict / its functions, B={batch}"
-            out.append(timings.row(name, kind, "functional", target=target, note=NOTE))
+        plain, title = functional_loop(make_filter(), batch), f"step on a tensordict / its functions, B={batch}"
+        fields = {"how": {"seconds": seconds}, "target": target, "note": NOTE}
+        out += against(steps(batch), "functional", plain, title, **fields)
     return out

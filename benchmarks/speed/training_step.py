@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import head, line, write_page
-from benchmarks.speed.machine import in_child
+from benchmarks.speed.machine import resident_peak
 from benchmarks.speed.pairs import Row, Timings, in_turn
 from benchmarks.speed.workload import car_filter
 from torch_denkf.filters import DEnKF
@@ -100,25 +100,20 @@ def rows(seconds: float) -> list[Row]:
     return rows_of(measure())
 
 
-CHILD = """
-import torch
+PREPARE = """
 from benchmarks.speed import training_step as bench
-torch.set_num_threads(1)
-def kib(name):
-    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith(name))
 denkf, batch = bench.make_filter(**bench.OPTIONS[{name!r}]), bench.make_batch({batch}, {steps})
 bench.training_step(bench.make_filter(), bench.make_batch(1, 2))()
-before = kib("VmRSS")
-open("/proc/self/clear_refs", "w").write("5")  # the peak starts anew
+"""
+ACT = """
 step = bench.training_step(denkf, batch)
 step(), step()
-print((kib("VmHWM") - before) / 1024)
 """
 
 
 def resident_mib(name: str, batch: int, steps: int) -> float:
     """What a training step takes beyond model and batch, in MiB, in a process of its own."""
-    return in_child(CHILD.format(name=name, batch=batch, steps=steps))
+    return resident_peak(PREPARE.format(name=name, batch=batch, steps=steps), ACT) / 2**20
 
 
 def table(timings: Timings, memory: dict[str, float], command: str, elapsed: float) -> str:

@@ -115,7 +115,7 @@ def _environments() -> Iterator[Subject]:
         "batch_size": stretches["batch_size"],
     }
     yield Subject(envs.ReplayEnv, lambda: {"data": _rows()}, roll, {**data, **stretches})
-    yield Subject(KITTIReplayEnv, lambda: {"drive": kitti.reference()}, roll, {**stretches, "size": None})
+    yield Subject(KITTIReplayEnv, lambda: {"drive": kitti.DRIVES.reference()}, roll, {**stretches, "size": None})
     yield Subject(envs.LinearGaussianEnv, _linear, roll, linear)
 
 
@@ -190,7 +190,7 @@ def _car() -> Iterator[Subject]:
     yield Subject(_tracked, wrong=_track(), also={"frames": ("frame",), "times": ("time",)}, name="track")
     yield Subject(CanonicalCamera, lambda: {"focal": 40.0})
     yield Subject(Updates, wrong=updates, also=named)
-    yield Subject(bridge_gaps, lambda: {"drive": kitti.reference()})
+    yield Subject(bridge_gaps, lambda: {"drive": kitti.DRIVES.reference()})
     yield Subject(sigma_points, batch, wrong=points, right={"cov": _no_moments})
     yield Subject(lorenz96_step, lambda: {"state": torch.zeros(5)}, wrong=step)
 

@@ -42,37 +42,27 @@ def read(root: Path, drive: Any = DRIVE, **options: Any) -> TensorDict:
     return read_kitti_drive(root, drive, **{"size": SIZE, "cache": None, **options})
 
 
-@cache
-def reference() -> TensorDict:
-    """The drive without damage."""
-    return read(sound())
-
-
 DRIVES = Folder("kitti", sound, read)
 
 
 # -------------------------------------------------------------------------------------------------------- what is right
 
 
-def _equal(result: TensorDict) -> bool:
-    return same(result, reference())
-
-
 def _equal_so_far(result: TensorDict) -> bool:
-    return len(result) > 0 and same(result, reference()[: len(result)])
+    return len(result) > 0 and same(result, DRIVES.reference()[: len(result)])
 
 
 def _without_last(result: TensorDict) -> bool:
-    return same(result[: FRAMES - 1], reference()[: FRAMES - 1])
+    return same(result[: FRAMES - 1], DRIVES.reference()[: FRAMES - 1])
 
 
 def _equal_or_missing(result: TensorDict) -> bool:
-    return _equal(result) or same_but(result, reference(), [4], ["frame_valid"])
+    return DRIVES.equal(result) or same_but(result, DRIVES.reference(), [4], ["frame_valid"])
 
 
 def _true_times(change: Callable[[np.ndarray], np.ndarray], result: TensorDict, row: int = 5) -> bool:
     """Right where the motion at a gap is that of the true time between frames, or marked as unknown."""
-    expected = reference()
+    expected = DRIVES.reference()
     keep = [k for k in range(FRAMES) if k != row]
     others = len(result) == FRAMES and torch.equal(result["state"][keep], expected["state"][keep])
     masks = {"frame_valid", "state_valid", "motion_valid", "observed"} & set(result.keys())
@@ -89,7 +79,7 @@ def _times_masked(result: TensorDict) -> bool:
 
     A first time that is too early is a gap, after which no motion is known.
     """
-    expected, seen = reference(), result["frame_valid"].squeeze(-1)
+    expected, seen = DRIVES.reference(), result["frame_valid"].squeeze(-1)
     if len(result) != FRAMES or not finite(result):
         return False
     poses_kept = torch.equal(result["state"][:, :3], expected["state"][:, :3])
@@ -208,10 +198,9 @@ NO_PICTURES = {
 
 def _files() -> Iterator[Target]:
     yield DRIVES.target("poses", d.FILE, _equal_so_far, file=POSE_FILE)
-    optional = {"taken away": _times_as_told, "a link to nowhere": _times_as_told, "a link to itself": _times_as_told}
-    rights = lambda what, change: optional.get(what, _equal_so_far)  # noqa: E731
-    yield DRIVES.target("times.txt", d.FILE, file=TIME_FILE, rights=rights)
-    yield DRIVES.target("calib.txt", d.FILE, _equal, file=CALIBRATION_FILE)  # another row of it may be damaged
+    optional = dict.fromkeys(("taken away", "a link to nowhere", "a link to itself"), _times_as_told)
+    yield DRIVES.target("times.txt", d.FILE, _equal_so_far, file=TIME_FILE, rights=optional)
+    yield DRIVES.target("calib.txt", d.FILE, DRIVES.equal, file=CALIBRATION_FILE)  # another row of it may be damaged
     names = ("000004.png", "4.png", *RENAMED.values())
     yield DRIVES.target("picture", PICTURES, _equal_or_missing, names, PICTURE)
     yield DRIVES.target("picture of", NO_PICTURES, None, names, PICTURE)
@@ -228,7 +217,7 @@ def _files() -> Iterator[Target]:
 
 def _times_as_told(result: TensorDict) -> bool:
     """Without stamps, frames come ten times a second, and all that needs no time is as it was."""
-    expected = reference()
+    expected = DRIVES.reference()
     return same(result["state"][:, :3], expected["state"][:, :3]) and same(result["image"], expected["image"])
 
 
@@ -255,15 +244,11 @@ TOLD = {
 
 def _numbers() -> Iterator[Target]:
     for row in ROWS:
-        last = lambda what, change, row=row: (  # noqa: E731
-            _without_last if (row, what) == (FRAMES - 1, "an empty line") else None
-        )
+        last = {"an empty line": _without_last} if row == FRAMES - 1 else {}
         yield DRIVES.target(f"pose {row}", of_lines(POSES, row), file=POSE_FILE, rights=last)
         yield DRIVES.target(f"time {row}", of_lines(TIMES, row), _times_masked, file=TIME_FILE)
     yield DRIVES.target("calibration", of_lines(CALIBRATION, 2), file=CALIBRATION_FILE)
-    yield DRIVES.target(
-        "stamps", d.Wrong(STAMPS).each(_restamped), file=TIME_FILE, rights=lambda what, _: TOLD.get(what)
-    )
+    yield DRIVES.target("stamps", d.Wrong(STAMPS).each(_restamped), file=TIME_FILE, rights=TOLD)
 
 
 COUNTS = d.Wrong({"zero": 0, "negative": -4, "a fraction": 2.5, "text": "many"}, d.COUNT.others)
@@ -302,7 +287,7 @@ def _replayed(**given: Any) -> Any:
 
 
 def _moved(**given: Any) -> Any:
-    return with_motion(reference().clone(), cache=None, **given)
+    return with_motion(DRIVES.reference().clone(), cache=None, **given)
 
 
 def targets() -> Iterator[Target]:
@@ -319,5 +304,5 @@ def targets() -> Iterator[Target]:
         Subject(list_kitti_drives, wrong=nothing, also={"root": ("sequences",)}),
     )
     for key in ("image", "frame_valid", "calibration"):
-        act = lambda key, folder: with_motion(reference().exclude(key), cache=None)  # noqa: E731
+        act = lambda key, folder: with_motion(DRIVES.reference().exclude(key), cache=None)  # noqa: E731
         yield Target("kitti", f"with_motion without {key}", (key,), act, d.Wrong({"taken away": key}))

@@ -49,42 +49,28 @@ def read(root: Path, **options: Any) -> TensorDict:
     return data[:]
 
 
-@cache
-def reference(version: int) -> TensorDict:
-    """The rows without damage."""
-    return read(sound(version))
-
-
 V2, V3 = (Folder("lerobot", partial(sound, version), read) for version in (2, 3))
-
-
-def _equal(result: TensorDict) -> bool:
-    return same(result, reference(2))
 
 
 def _equal_times(result: TensorDict) -> bool:
     """Right where times without stamps are those of the frames' numbers; stamps are rounded."""
-    return same(result, reference(2), atol=1e-6)
-
-
-def _equal_3(result: TensorDict) -> bool:
-    return same(result, reference(3))
+    return same(result, V2.reference(), atol=1e-6)
 
 
 def _masked(result: TensorDict, rows: tuple[int, ...] = (ROW,)) -> bool:
     """Right where the rows are as without damage, or those that are damaged are marked."""
     masks = [key for key, value in leaves(result).items() if value.dtype == torch.bool and "observed" in key]
-    return _equal(result) or same_but(result, reference(2), rows, masks)
+    return V2.equal(result) or same_but(result, V2.reference(), rows, masks)
 
 
 def _hidden(result: TensorDict) -> bool:
     """Right where the picture counts as missing."""
-    return same_but(result, reference(2), [ROW], ["observed"])
+    return same_but(result, V2.reference(), [ROW], ["observed"])
 
 
 def _shown(result: TensorDict) -> bool:
     """Right where every row that counts as seen shows its own picture, but for a codec's rounding."""
-    expected = reference(3)
+    expected = V3.reference()
     seen = result["observed"].squeeze(-1)
     numbers = [key for key in expected.keys(True, True) if key != "pixels" and key != "observed"]
     equal = all(torch.equal(result[key], expected[key]) for key in numbers)
@@ -156,17 +142,14 @@ def _for_files(path: Any) -> Any:
 
 
 def _metadata() -> Iterator[Target]:
-    ends = lambda what, change: _equal if what == "cut by a byte" else None  # noqa: E731
     yield V2.target("info.json", d.FILE, file=INFO)
-    yield V2.target("episodes.jsonl", d.FILE, file=EPISODES, rights=ends)
-    yield V3.target("episodes of version 3", d.BYTES.but().each(d.written), _equal_3, file=EPISODES_3)
+    yield V2.target("episodes.jsonl", d.FILE, file=EPISODES, rights={"cut by a byte": V2.equal})
+    yield V3.target("episodes of version 3", d.BYTES.but().each(d.written), V3.equal, file=EPISODES_3)
     for path, values in FIELDS.items():
-        may_be = path[-1] == "dtype"
-        rights = lambda what, change, path=path, may_be=may_be: (  # noqa: E731
-            _equal if may_be or (path == ("chunks_size",) and "missing" in what) else None
-        )
+        may_be = V2.equal if path[-1] == "dtype" else None
         wrong, words = fields({path: values}), (*path, "info.json", "episode_000002.parquet")
-        yield V2.target(f"info.json, {'/'.join(path)}", wrong.each(in_json), None, words, INFO, rights=rights)
+        less = {"chunks_size missing": V2.equal}
+        yield V2.target(f"info.json, {'/'.join(path)}", wrong.each(in_json), may_be, words, INFO, rights=less)
     paths = fields({"video_path": PATHS.each(_for_files)}, missing=False).each(in_json)
     yield V3.target("info.json of version 3", paths, None, ("video_path", "info.json"), INFO)
     for name in ("", "data", "meta"):
@@ -299,12 +282,11 @@ def _data() -> Iterator[Target]:
     for key in ("observation.state", "action"):
         rights = {f"{key} {what}": _masked for what in CELL}
         rights[f"{key} all nan"] = partial(_masked, rows=tuple(range(6, 11)))
-        yield column(key, VECTORS, rights=lambda what, change, rights=rights: rights.get(what))
+        yield column(key, VECTORS, rights=rights)
     stamps = {f"timestamp {what}": _masked for what in STAMPS} | {"timestamp missing": _equal_times}
-    yield column("timestamp", {**STAMPS, **NO_STAMPS}, rights=lambda what, change: stamps.get(what))
+    yield column("timestamp", {**STAMPS, **NO_STAMPS}, rights=stamps)
     # What is not there, nothing is compared with.
-    less = lambda what, change: _equal if "missing" in what else None  # noqa: E731
-    yield column("frame_index", NUMBERS, rights=less)
+    yield column("frame_index", NUMBERS, rights={"frame_index missing": V2.equal})
     yield column("episode_index", NUMBERS.but("backwards"))
     picture = fields({CAMERA: d.Wrong(PICTURES).each(of_cell)}, missing=False).each(in_table)
     yield V2.target("picture", picture, _masked, (*words, CAMERA), DATA)

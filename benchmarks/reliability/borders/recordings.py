@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -57,26 +57,12 @@ def read(root: Path, *, camera: str = "", table: str = "table.csv", replay: Any 
     return RecordingReplay(Recording(**streams), **settings)[:]
 
 
-@cache
-def reference(camera: str = "") -> TensorDict:
-    """The rows without damage."""
-    return read(sound(), camera=camera)
-
-
 OWN = Folder("recordings", sound, read)
-
-
-def _equal(result: TensorDict) -> bool:
-    return same(result, reference())
-
-
-def _equal_video(result: TensorDict) -> bool:
-    return same(result, reference("video"))
 
 
 def _shown(result: TensorDict, camera: str = "images") -> bool:
     """Right where each row that counts as seen shows its own picture, and all numbers are as without damage."""
-    expected = reference(camera)
+    expected = OWN.reference(camera=camera)
     if same(result, expected):
         return True
     found, places = leaves(result), result["time"].squeeze(-1)
@@ -87,10 +73,6 @@ def _shown(result: TensorDict, camera: str = "images") -> bool:
     pictures = bool((found["pixels"][seen] == expected["pixels"][rows][seen]).all())
     black = not bool(found["pixels"][~seen].any())
     return finite(result) and equal and pictures and black and len(result) >= ROWS - 2
-
-
-def _shown_in_video(result: TensorDict) -> bool:
-    return _shown(result, "video")
 
 
 # ------------------------------------------------------------------------------------------------------------ tables
@@ -143,10 +125,10 @@ LINES: dict[str, Callable[[list[str]], list[str]]] = {
 
 
 def _tables() -> Iterator[Target]:
-    ends = lambda what, change: _equal if what == "cut by a byte" else None  # noqa: E731
+    ends = {"cut by a byte": OWN.equal}
     parquet_file, named = "table.parquet", {"table": "table.parquet"}
     yield OWN.target("table.csv", d.FILE, file="table.csv", rights=ends)
-    yield OWN.target(parquet_file, d.BYTES.but().each(d.written), _equal, file=parquet_file, options=named)
+    yield OWN.target(parquet_file, d.BYTES.but().each(d.written), OWN.equal, file=parquet_file, options=named)
     yield OWN.target(f"{parquet_file} in its place", d.PLACES, file=parquet_file, options=named)
     for row in (1, 5, ROWS):
         for column, name in enumerate(("time", "x", "y")):
@@ -154,10 +136,8 @@ def _tables() -> Iterator[Target]:
             yield OWN.target(f"{name} in row {row}", wrong, file="table.csv")
     times = d.Wrong(TIMES).each(lambda value: in_lines(on_row(5, cell(0, value))))
     # An hour's gap in a table is one: readings are as they stand there.
-    gap = lambda what, change: finite if what == "an hour on" else None  # noqa: E731
-    yield OWN.target("time goes on by", times, file="table.csv", rights=gap)
-    harmless = ("an empty name", "an empty line")  # a column is a column
-    rights = lambda what, change: _equal if what in harmless else None  # noqa: E731
+    yield OWN.target("time goes on by", times, file="table.csv", rights={"an hour on": finite})
+    rights = dict.fromkeys(("an empty name", "an empty line"), OWN.equal)  # a column is a column
     yield OWN.target(
         "table.csv's lines", d.Wrong(LINES).each(in_lines), None, ("table.csv", "table"), "table.csv", rights=rights
     )
@@ -182,8 +162,8 @@ def _pictures() -> Iterator[Target]:
     # A video has no checksum: of a flipped byte a picture may be wrong, and nothing can tell.
     flips = [what for what in d.BYTES.named if "flipped" in what]
     cut = d.BYTES.but(*flips).each(d.written)
-    ends = lambda what, change: _equal_video if what == "cut by a byte" else None  # noqa: E731
-    yield OWN.target("video", cut, _shown_in_video, ("run.mkv", "stamps.csv"), "run.mkv", video)
+    ends = {"cut by a byte": partial(OWN.equal, camera="video")}
+    yield OWN.target("video", cut, partial(_shown, camera="video"), ("run.mkv", "stamps.csv"), "run.mkv", video)
     yield OWN.target("video in its place", d.PLACES, None, ("run.mkv", "/dev/zero"), "run.mkv", video)
     yield OWN.target("video's stamps", d.FILE, None, "stamps.csv", "stamps.csv", video, rights=ends)
     words = ("images", "0.5.png", "half.png", "nan.png", "inf.png", "0.50.png")
@@ -298,7 +278,7 @@ def targets() -> Iterator[Target]:
         Subject(_trajectory, wrong=TRAJECTORY, name="write_trajectory"),
     )
     act = lambda change, folder: _rows(change)  # noqa: E731
-    right = lambda what, change: _row_masked if what.endswith("state nan") else None  # noqa: E731
+    right = {"observation/state nan": _row_masked}
     for path, changes in IN_MEMORY.items():
         wrong, word = d.fields({path: d.Wrong(changes)}), path[-1]
         yield Target("recordings", f"recording_from_rows: {word}", (word,), act, wrong, rights=right)

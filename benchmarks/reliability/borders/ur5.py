@@ -44,12 +44,6 @@ def read(root: Path, **options: Any) -> TensorDict:
     return UR5ExperienceReplay(root, **{"split": "all", "cache": None, "progress": False, **options})[:]
 
 
-@cache
-def reference() -> TensorDict:
-    """The rows without damage."""
-    return read(sound())
-
-
 def _warned(root: Path) -> tuple[TensorDict, list[str]]:
     """The rows, and what was said."""
     with warnings.catch_warnings(record=True) as caught:
@@ -58,18 +52,16 @@ def _warned(root: Path) -> tuple[TensorDict, list[str]]:
     return result, [str(warning.message) for warning in caught]
 
 
-def _equal(result: TensorDict) -> bool:
-    return same(result, reference())
+DEMOS = Folder("ur5", sound, read)
+LISTED = Folder("ur5", sound, _warned)
 
 
 def _all_or_said(result: tuple[TensorDict, list[str]]) -> bool:
     """Right where all demos are there, or the first ones, and a warning names the list that lacks the others."""
     rows, said = result
-    return _equal(rows) or (same(rows, reference()[: len(rows)]) and any(MANIFEST in message for message in said))
-
-
-DEMOS = Folder("ur5", sound, read)
-LISTED = Folder("ur5", sound, _warned)
+    return DEMOS.equal(rows) or (
+        same(rows, DEMOS.reference()[: len(rows)]) and any(MANIFEST in message for message in said)
+    )
 
 
 def signed(change: d.Change) -> d.Change:
@@ -132,7 +124,7 @@ def _manifest() -> Iterator[Target]:
     yield LISTED.target("manifest", d.FILE, _all_or_said, file=MANIFEST)
     yield DEMOS.target("manifest's line", LINES.each(partial(json_line, 1)), None, words, MANIFEST)
     failures = fields({"failures": d.types("text", "negative")})
-    yield DEMOS.target("manifest's line of", failures.each(partial(json_line, 1)), _equal, words, MANIFEST)
+    yield DEMOS.target("manifest's line of", failures.each(partial(json_line, 1)), DEMOS.equal, words, MANIFEST)
     yield LISTED.target("manifest's lines", d.Wrong(TEXTS).each(d.in_lines), _all_or_said, file=MANIFEST)
 
 
@@ -197,7 +189,9 @@ def _many(data: bytes) -> bytes:
 def _demos() -> Iterator[Target]:
     arrays = fields(ARRAYS) | {"an array more": lambda arrays: arrays.update(extra=np.zeros(3))}
     yield DEMOS.target("demo", d.SEALED.each(d.written) | d.PLACES, file=DEMO)
-    yield DEMOS.target("demo, checksum adapted", d.BYTES.but().each(signed), _equal, file=DEMO)  # nobody reads its date
+    yield DEMOS.target(
+        "demo, checksum adapted", d.BYTES.but().each(signed), DEMOS.equal, file=DEMO
+    )  # nobody reads its date
     yield DEMOS.target("demo's arrays", arrays.each(in_arrays), file=DEMO)
     hostile = {"with a pickle that runs code": lambda data: Bomb.npz("state"), "of 20,000 arrays": _many}
     hostile["that unpacks to a gigabyte"] = lambda data: npz_of_zeros(1 << 30)

@@ -1,1 +1,1 @@
-"""Runs that last: a module for each part, with a function ``rows`` that yields the rows of its table."""
+"""Runs that last: a module for each part, with a function ``jobs``: what makes each row of its table, by name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +48,21 @@ class Writer:
     words: tuple[str, ...]
 
 
+@cache
+def _scratch() -> Path:
+    """A folder for what writers start from."""
+    return Path(tempfile.mkdtemp(prefix="disks-"))
+
+
 def _large_drive() -> Path:
-    root = Path(tempfile.gettempdir()) / f"disks-{os.getpid()}" / "kitti"
+    root = _scratch() / "kitti"
     if not root.exists():
         apart(lambda: render_drives(root, names=["a"], frames=40, size=(100, 300)))
     return root
 
 
 def _large_demos() -> Path:
-    root = Path(tempfile.gettempdir()) / f"disks-{os.getpid()}" / "demos"
+    root = _scratch() / "demos"
     if not root.exists():
         root.mkdir(parents=True)
         write_folder(root, [make_demo(number, 60, frames=30, size=(96, 96)) for number in range(6)])
@@ -230,11 +237,8 @@ PAIRS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], bool]] = {
 }
 
 
-def rows(done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
-    """A row a writer and kind of disk, and one for each pair.
-
-    Args:
-        done: whether a row of a name is there already.
+def jobs() -> dict[str, Callable[[], dict[str, Any]]]:
+    """Each writer on each kind of disk, and each pair; what they start from is made here, before any is forked.
 
     Raises:
         PermissionError: where one may not mount file systems.
@@ -243,13 +247,7 @@ def rows(done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
         raise PermissionError("small disks are mounted, which needs root; leave out the part 'disks'")
     for sound in (kitti.sound, ur5.sound, recordings.sound, partial(lerobot.sound, 2), _large_drive, _large_demos):
         sound()
-    try:
-        for name in WRITERS:
-            for kind in ("full", "read-only"):
-                if not done(f"{name}, {kind} disk"):
-                    yield _on_disk(name, kind)
-        for name, (work, result, may) in PAIRS.items():
-            if not done(f"{name}, two processes"):
-                yield _two(name, work, result, may)
-    finally:
-        shutil.rmtree(Path(tempfile.gettempdir()) / f"disks-{os.getpid()}", ignore_errors=True)
+    atexit.register(shutil.rmtree, _scratch(), ignore_errors=True)  # not in forked children, which leave by os._exit
+    kinds = ("full", "read-only")
+    alone = {f"{name}, {kind} disk": partial(_on_disk, name, kind) for name in WRITERS for kind in kinds}
+    return alone | {f"{name}, two processes": partial(_two, name, *pair) for name, pair in PAIRS.items()}

@@ -11,8 +11,9 @@ import signal
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -237,14 +238,6 @@ def soak(name: str, kills: int, seed: int) -> dict[str, Any]:
         shutil.rmtree(root, ignore_errors=True)
 
 
-def rows(kills: int, done: Callable[[str], bool], seed: int = 0) -> Iterator[dict[str, Any]]:
-    """A row a job.
-
-    Args:
-        kills: of each job.
-        done: whether a row of a name is there already.
-        seed: of the moments.
-    """
-    for name in JOBS:
-        if not done(name):
-            yield soak(name, kills, seed)
+def jobs(kills: int, seed: int) -> dict[str, Callable[[], dict[str, Any]]]:
+    """So many kills of each job, at moments of a seed."""
+    return {name: partial(soak, name, kills, seed) for name in JOBS}

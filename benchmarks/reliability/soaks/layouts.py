@@ -149,29 +149,25 @@ def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
     return bool(same.all())
 
 
-def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
-    """A row a layout.
+def soak(name: str, steps: int) -> dict[str, Any]:
+    """A row of the table: a layout, for so many steps of all its environments together."""
+    torch.manual_seed(0)
+    reference, began = Reference(), time.time()
+    for batch in LAYOUTS[name](steps):
+        reference.look(batch)
+    worst = {f"largest error, {what}": value for what, value in reference.worst.items()}
+    right = reference.frames >= steps and all(value < CLOSE for value in worst.values())
+    return {
+        "name": name,
+        "steps": reference.frames,
+        "resets": reference.resets,
+        "missing readings": reference.missing,
+        **worst,
+        "right": right and len(reference.ends) == (WORKERS if "as they come" in name else 1),
+        "seconds": round(time.time() - began, 1),
+    }
 
-    Args:
-        steps: of all environments together, in each layout.
-        done: whether a row of a name is there already.
-    """
-    for name, batches in LAYOUTS.items():
-        if done(name):
-            continue
-        torch.manual_seed(0)
-        reference, began = Reference(), time.time()
-        for batch in batches(steps):
-            reference.look(batch)
-        worst = {f"largest error, {what}": value for what, value in reference.worst.items()}
-        yield {
-            "name": name,
-            "steps": reference.frames,
-            "resets": reference.resets,
-            "missing readings": reference.missing,
-            **worst,
-            "right": reference.frames >= steps
-            and all(value < CLOSE for value in worst.values())
-            and len(reference.ends) == (WORKERS if "as they come" in name else 1),
-            "seconds": round(time.time() - began, 1),
-        }
+
+def jobs(steps: int) -> dict[str, Callable[[], dict[str, Any]]]:
+    """So many steps in each layout."""
+    return {name: partial(soak, name, steps) for name in LAYOUTS}

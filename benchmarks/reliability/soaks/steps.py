@@ -5,7 +5,8 @@ from __future__ import annotations
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -169,13 +170,6 @@ def soak(name: str, steps: int) -> dict[str, Any]:
     }
 
 
-def rows(steps: int, done: Callable[[str], bool]) -> Iterator[dict[str, Any]]:
-    """A row a filter.
-
-    Args:
-        steps: of each filter.
-        done: whether a row of a name is there already.
-    """
-    for name in FILTERS:
-        if not done(name):
-            yield soak(name, steps)
+def jobs(steps: int) -> dict[str, Callable[[], dict[str, Any]]]:
+    """So many steps of each filter."""
+    return {name: partial(soak, name, steps) for name in FILTERS}
