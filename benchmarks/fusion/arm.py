@@ -103,8 +103,8 @@ def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: boo
                 LinearObservation(readings[name]),
                 parts[name],
                 delay=late[name] if heed else 0,
-                late=f"{name}_late" if heed else None,
-                features=None if weights is None else f"{name}_features",
+                late_key=f"{name}_late" if heed else None,
+                features_key=None if weights is None else f"{name}_features",
             )
             for name in names
         }

@@ -134,8 +134,8 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
                 model,
                 parts[name],
                 delay=longest[name] if heed else 0,
-                late=f"{name}_late" if heed else None,
-                features=None if weights is None else f"{name}_features",
+                late_key=f"{name}_late" if heed else None,
+                features_key=None if weights is None else f"{name}_features",
             )
             for name, model in models.items()
         }

@@ -285,7 +285,7 @@ def test_scores_leave_out_what_does_not_count():
 
 def test_a_run_leaves_the_readings_as_they_are():
     one, size = torch.eye(ARM.size), ARM.size
-    camera = FusedSensor(Select(range(size)), torch.ones(size), reading=("sensor", "ensemble"))
+    camera = FusedSensor(Select(range(size)), torch.ones(size), observation_key=("sensor", "ensemble"))
     model = FusedFilter(LinearTransition(one, one), {"camera": camera}, initial=MomentPrior(torch.zeros(size), one))
     given = readings()
     before = set(given.keys(True))

@@ -61,7 +61,7 @@ def fused(kind, *, late=False, **kwargs):
     else:
         motion = NoisyLinear(F, torch.linalg.cholesky(Q))
         initial = GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=8)
-    shared = {"reading": "observation", "observed": "observed"}
+    shared = {"observation_key": "observation", "observed_key": "observed"}
     sensors = {
         "first": FusedSensor(LinearObservation(H), R.sqrt(), **shared),
         "second": FusedSensor(Select([0, 1]), 2 * R.sqrt(), delay=2 * late, **shared),

@@ -67,7 +67,7 @@ class Doubt(nn.Module):
 def build(features):
     has = features.__contains__
     camera = TensorDictSequential(BlackIsMissing(), OfPicture()) if has("black picture") else OfPicture()
-    late = {"delay": 2, "late": "wheel_late"} if has("late reading") else {}
+    late = {"delay": 2, "late_key": "wheel_late"} if has("late reading") else {}
     if has("inflation"):
         late["analysis"] = partial(EKFAnalysis, inflation=INFLATION)
     filter = FusedFilter(

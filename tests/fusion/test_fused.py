@@ -153,7 +153,7 @@ PATTERNS = {
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_late_readings_give_what_they_give_in_order(float64, kind, joint, pattern):
     frames, late = readings(), PATTERNS[pattern]
-    key = {} if pattern == "three steps late" else {"late": "late"}
+    key = {} if pattern == "three steps late" else {"late_key": "late"}
     out = fused(kind, joint=joint, delay=DELAY, **key).sequence(arriving(frames, late))
     for now in range(T):
         expected = linear_kalman().sequence(as_kalman(arrived(frames, late, now)))
@@ -167,7 +167,7 @@ def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, patt
     frames, late = readings(), PATTERNS[pattern]
     members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
     given = {"members": members, "noisy": False}
-    key = {} if pattern == "three steps late" else {"late": "late"}
+    key = {} if pattern == "three steps late" else {"late_key": "late"}
     out = fused("ensemble", joint=joint, delay=DELAY, **key, **given).sequence(arriving(frames, late))
     for now in range(T):
         expected = fused("ensemble", **given).sequence(arrived(frames, late, now))
@@ -226,7 +226,7 @@ def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_
         motion, initial = NoisyLinear(F), FixedEnsemble(members)
         prior = {"mean": members.mean(0), "cov": members.mT.cov(), "noise": 0.0}
     delay = 3
-    own = sensors(delay=delay, late="late")
+    own = sensors(delay=delay, late_key="late")
     filter = FusedFilter(motion, own, initial=initial, update_at_reset=update_at_reset)
     used = []
     for steps in range(not update_at_reset, 6):
@@ -570,7 +570,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="beyond lag=2"):
         FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, delay=3)}, initial=members, lag=2)
     with pytest.raises(ValueError, match="how late"):
-        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late="age")}, initial=members)
+        FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late_key="age")}, initial=members)
     with pytest.raises(TypeError, match="carries a past already"):
         FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
     own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
@@ -584,9 +584,9 @@ def test_what_is_refused():
 def test_a_mask_that_the_sensor_would_not_read_is_refused(marker, observed):
     """The mask of the data goes through the one that the sensor makes, and neither is dropped."""
     camera = TensorDictSequential(marker, VectorSensor(3, 1, ensemble_size=4, in_key="pixels"))
-    with pytest.raises(ValueError, match=f"observed= names '{observed}', which it would not read"):
+    with pytest.raises(ValueError, match=f"observed_key= names '{observed}', which it would not read"):
         FusedFilter(
             NoisyLinear(torch.eye(1), 0.1 * torch.eye(1)),
-            {"camera": FusedSensor(Select([0]), [1.0], sensor=camera, observed=observed)},
+            {"camera": FusedSensor(Select([0]), [1.0], sensor=camera, observed_key=observed)},
             initial=GaussianPrior([0.0], [1.0], ensemble_size=4),
         )

@@ -57,7 +57,7 @@ def test_a_mean_and_a_covariance_as_by_the_joint_state(float64, kind):
     late = PATTERNS["out of order"]
     assert_in_order(fused(kind), late, BELIEF)
     out = Refiltering(fused(kind), LATE, DELAY).sequence(arriving(readings(), late))
-    expected = fused(kind, delay=DELAY, late="late").sequence(arriving(readings(), late))
+    expected = fused(kind, delay=DELAY, late_key="late").sequence(arriving(readings(), late))
     for key in BELIEF:
         assert_close(out[key], expected[key], rtol=0, atol=1e-10)
 
@@ -160,7 +160,7 @@ def test_an_entry_or_a_filter_that_would_be_misread_is_refused(float64):
     for keys in (("second", "late"), ("third", "second_observed")):
         with pytest.raises(ValueError, match="does not read"):
             Refiltering(filter, {"late": keys}, DELAY)
-    for options in ({"delay": DELAY}, {"delay": DELAY, "late": "late"}):
+    for options in ({"delay": DELAY}, {"delay": DELAY, "late_key": "late"}):
         for kind, joint in (("Kalman", False), ("Kalman", True), ("ensemble", False)):
             with pytest.raises(ValueError, match="late twice"):
                 Refiltering(fused(kind, members=MEMBERS, joint=joint, **options), LATE, DELAY)

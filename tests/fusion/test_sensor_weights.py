@@ -230,7 +230,7 @@ def walker(weights):
     return FusedFilter(
         NoisyTransition(LearnedTransition(still.requires_grad_(False), residual=False), step),
         {
-            "good": FusedSensor(Select([0]), [0.05], features="light" if weights is not None else None),
+            "good": FusedSensor(Select([0]), [0.05], features_key="light" if weights is not None else None),
             "fair": FusedSensor(Select([0]), [0.3]),
         },
         initial=GaussianPrior([0.0], [0.3], ensemble_size=32),

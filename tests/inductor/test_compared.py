@@ -98,7 +98,7 @@ def ekf():
 def fused():
     """The same numbers forget each step what they were, and are anew with a variance of .1."""
     motion = LinearTransition(0.0 * torch.eye(4), 0.1 * torch.eye(4))
-    sensor = FusedSensor(Select([0, 1]), [0.5, 0.5], reading="observation")
+    sensor = FusedSensor(Select([0, 1]), [0.5, 0.5], observation_key="observation")
     return FusedFilter(motion, {"gps": sensor}, initial=MomentPrior(torch.zeros(4), torch.eye(4)))
 
 

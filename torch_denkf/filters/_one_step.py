@@ -46,6 +46,7 @@ def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey
             "predict() and step(without=...) leave readings out.",
             "Hide what is missing with a mask instead, which keeps the step compiled.",
         )
+        entries = {key: value for key, value in entries.items() if key not in without}
         written = filter.steps().take(entries, Call(tensordict.batch_size), missing=without)
         lost = [key for key in structure.carry if key in structure.step_keys and key not in written]
         if lost:

@@ -101,10 +101,10 @@ class Steps(NamedTuple):
             call: batch size and whether noise is drawn.
             reset: rows that start anew; ``None`` for none.
             start_of: the initial belief from entries, the frame modules' among them; for ``reset``.
-            missing: readings that are not there, see :meth:`run`.
+            missing: readings that are not among the entries, see :meth:`run`.
         """
         lost = set(missing)
-        entries = self.usable({key: value for key, value in entries.items() if key not in lost}, call)
+        entries = self.usable(entries, call)
         written = self.frames(entries, call, lost)
         entries = {**entries, **written}
         start = None if reset is None or start_of is None else start_of(entries)

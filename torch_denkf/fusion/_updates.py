@@ -90,7 +90,7 @@ class Updates:
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")
         # Without a delay only the mask of a state with a past must be told apart; a past elsewhere is not looked at.
-        late = self.lag > 0 and (sensor.delay > 0 or sensor.late is not None or self.gaussian)
+        late = self.lag > 0 and (sensor.delay > 0 or sensor.late_key is not None or self.gaussian)
         return StateObservation(
             sensor.observation,
             ensemble,
@@ -98,7 +98,7 @@ class Updates:
             reading_keys=[wired.reading, wired.noise],
             observed_key=wired.observed,
             delay=sensor.delay,
-            late_key=sensor.late,
+            late_key=sensor.late_key,
             past_key=None if self.gaussian or not late else ("forecast", "past"),
             state_dim=self.size if late else None,
             # An update of a mean and a covariance runs the model inside, and reads the mask behind it.

@@ -181,8 +181,8 @@ def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
     """L: what is given, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
-        if sensor.late is not None and sensor.delay < 1:
-            raise ValueError(f"{name!r} has late={sensor.late!r}; say how late its readings can be: delay=...")
+        if sensor.late_key is not None and sensor.delay < 1:
+            raise ValueError(f"{name!r} has late_key={sensor.late_key!r}; say how late its readings can be: delay=...")
     longest = max(sensor.delay for sensor in sensors.values())
     if lag is not None and lag < longest:
         raise ValueError(f"A reading comes up to {longest} steps late, beyond lag={lag}.")

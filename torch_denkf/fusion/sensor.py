@@ -28,29 +28,29 @@ class FusedSensor:
         noise: R: standard deviations ``[O]``, or a module that writes variances ``[*B, O]``.
         sensor: a module that reads frames and writes the reading, such as an image sensor; ``None`` where the reading
             is in the data.
-        reading: its key in the data, ``[*B, O]``; by default the sensor's name.
-        observed: its mask, ``[*B, 1]`` or ``[*B, O]``, True where there is a reading; by default NAME_observed. A
+        observation_key: its key in the data, ``[*B, O]``; by default the sensor's name.
+        observed_key: its mask, ``[*B, 1]`` or ``[*B, O]``, True where there is a reading; by default NAME_observed. A
             sensor with a lower rate than the filter's has it True in every n-th step. It is the mask of the *data*:
             where ``sensor`` makes a further one of it, as :class:`~torch_denkf.monitoring.BlackIsMissing` does, the
             update reads that one by itself.
         delay: by how many steps its readings come late. Each then corrects the state that it belongs to, and through
             the covariances all since.
-        late: key of an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
+        late_key: an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
         angles: components of the reading that are angles in radians.
-        features: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the data,
-            or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
+        features_key: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the
+            data, or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
     """
 
     observation: TensorDictModuleBase
     noise: TensorDictModuleBase | Sequence[float] | torch.Tensor
     sensor: TensorDictModuleBase | None = None
-    reading: NestedKey | None = None
-    observed: NestedKey | None = None
+    observation_key: NestedKey | None = None
+    observed_key: NestedKey | None = None
     delay: int = 0
-    late: NestedKey | None = None
+    late_key: NestedKey | None = None
     angles: Sequence[int] = ()
-    features: NestedKey | None = None
+    features_key: NestedKey | None = None
     analysis: Callable[..., TensorDictModuleBase] | None = None
 
 
@@ -67,8 +67,8 @@ class Wired:
 
 def wire(name: str, sensor: FusedSensor) -> Wired:
     """Puts what a sensor's modules write under ``("sensor", name, ...)``."""
-    reading = unravel_key(name if sensor.reading is None else sensor.reading)
-    observed = unravel_key(f"{name}_observed" if sensor.observed is None else sensor.observed)
+    reading = unravel_key(name if sensor.observation_key is None else sensor.observation_key)
+    observed = unravel_key(f"{name}_observed" if sensor.observed_key is None else sensor.observed_key)
     names: dict[NestedKey, NestedKey] = {"observed": observed}
     modules: dict[str, TensorDictModuleBase] = {}
     if sensor.sensor is None:
@@ -82,8 +82,8 @@ def wire(name: str, sensor: FusedSensor) -> Wired:
         marks = marks_of(sensor.sensor)
         if observed in marks or any(read not in ("observed", observed, *marks) for read in marks.values()):
             raise ValueError(
-                f"The sensor {name!r} makes the mask {list(marks)} of {list(marks.values())}, and observed= names "
-                f"{observed!r}, which it would not read. observed= is the mask of the data, by default "
+                f"The sensor {name!r} makes the mask {list(marks)} of {list(marks.values())}, and observed_key= names "
+                f"{observed!r}, which it would not read. That is the mask of the data, by default "
                 f"'{name}_observed'; leave observed_key of the module that makes the mask at its default."
             )
         observed = next((names[key] for key in marks), observed)
@@ -91,5 +91,5 @@ def wire(name: str, sensor: FusedSensor) -> Wired:
     noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
     names[writes(noise)[0]] = own
     modules[f"{name}_noise"] = Renamed(noise, names)
-    features = None if sensor.features is None else unravel_key(sensor.features)
+    features = None if sensor.features_key is None else unravel_key(sensor.features_key)
     return Wired(modules, reading, own, observed, names.get(features, features))
