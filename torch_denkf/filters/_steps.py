@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
@@ -16,7 +16,7 @@ from torch_denkf.filters._rejection import REJECTED, usable
 from torch_denkf.filters._structure import Placed, Structure, previous_key
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
-from torch_denkf.modules._running import named_modules_of, run_module
+from torch_denkf.modules._running import is_sequence, named_modules_of, run_module
 
 __all__ = ["Steps", "blank", "where_rows"]
 
@@ -64,7 +64,7 @@ class Steps(NamedTuple):
         entries, written = dict(entries), {}
         for place, module in modules:
             if missing and not missing.isdisjoint(module.in_keys):
-                if type(module) is TensorDictSequential:
+                if is_sequence(module):
                     out = self.run(named_modules_of(module), entries, call.part(place), missing)
                 else:
                     out = _without_reading(module, entries)

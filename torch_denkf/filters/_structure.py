@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import declared, in_sequences, marks_of, reads, reads_of, writes
+from torch_denkf.modules._running import declared, in_sequences, is_sequence, marks_of, reads, reads_of, writes
 
 __all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
 
@@ -38,7 +38,7 @@ def all_modules(sequence: TensorDictSequential) -> Iterator[TensorDictModuleBase
     """The modules of a filter, and those of the plain sequences among them."""
     for module in sequence._modules["module"]._modules.values():
         yield module
-        if type(module) is TensorDictSequential:
+        if is_sequence(module):
             yield from all_modules(module)
 
 

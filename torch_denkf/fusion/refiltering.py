@@ -83,7 +83,9 @@ class Refiltering:
             raise ValueError("The filter has update_at_reset=True, and a reading of the first frame could come late.")
         models = [module for module in filter.modules() if isinstance(module, StateObservation)]
         if any(model.delay or model.late_key is not None for model in models):
-            raise ValueError("A sensor of the filter has a delay= or late_key=, and would be late twice; leave them out.")
+            raise ValueError(
+                "A sensor of the filter has a delay= or late_key=, and would be late twice; leave them out."
+            )
         self.filter, self.lag = filter, lag
         self.late = {unravel_key(key): _read_with(key, keys, filter) for key, keys in late.items()}
 

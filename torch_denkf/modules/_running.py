@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any, cast
+from typing import Any, TypeGuard, cast
 
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -17,6 +17,7 @@ __all__ = [
     "check_network",
     "declared",
     "in_sequences",
+    "is_sequence",
     "marks_of",
     "named_modules_of",
     "random_parts",
@@ -57,7 +58,7 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
     if not (module._forward_hooks or module._forward_pre_hooks):
         if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
             return module.run(entries, call)
-        if type(module) is TensorDictSequential:
+        if is_sequence(module):
             return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)
     tensordict = TensorDict({}, batch_size=call.batch_size)
@@ -90,6 +91,14 @@ def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: En
     return written
 
 
+def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
+    """Whether a module is a plain sequence of others, and not a filter, for example.
+
+    Torch's tracer shows modules as objects of a class of its own, which inherits theirs: their type alone says nothing.
+    """
+    return isinstance(module, TensorDictSequential) and type(module).forward is TensorDictSequential.forward
+
+
 def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
     """The modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
     return list(sequence.module._modules.items())
@@ -97,7 +106,7 @@ def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDi
 
 def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey]]:
     """What a module must find, and what it uses where it is there."""
-    if type(module) is not TensorDictSequential:
+    if not is_sequence(module):
         may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
         must = [key for key in map(unravel_key, module.in_keys) if key not in may]
         return list(dict.fromkeys(must)), list(dict.fromkeys(may))
@@ -124,7 +133,7 @@ def writes(module: TensorDictModuleBase) -> list[NestedKey]:
 
 def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
     """The module, or those of a plain sequence."""
-    if type(module) is TensorDictSequential:
+    if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from in_sequences(part)
     else:
@@ -150,6 +159,6 @@ def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str
             yield place, module
         parts = module.parts().items()
     else:
-        parts = named_modules_of(module) if type(module) is TensorDictSequential else ()
+        parts = named_modules_of(module) if is_sequence(module) else ()
     for name, part in parts:
         yield from random_parts(part, name if place == "self" else f"{place}.{name}")

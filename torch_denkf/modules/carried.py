@@ -8,11 +8,11 @@ from typing import Protocol
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import check_module, declared, named_modules_of, reads, run_module
+from torch_denkf.modules._running import check_module, declared, is_sequence, named_modules_of, reads, run_module
 
 __all__ = ["AnalysisAround", "Beside", "InPlaceOf", "Stateful", "with_state"]
 
@@ -35,7 +35,7 @@ class InPlaceOf(SubModel):
 
     def parts(self):
         """Those of the module inside."""
-        if type(self.module) is TensorDictSequential:
+        if is_sequence(self.module):
             return dict(named_modules_of(self.module))
         return self.module.parts() if isinstance(self.module, SubModel) else {}
 

@@ -17,7 +17,7 @@ from torch_denkf.modules import KalmanAnalysis
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
-from torch_denkf.modules._running import check_module, named_modules_of
+from torch_denkf.modules._running import check_module, is_sequence, named_modules_of
 from torch_denkf.modules.carried import with_state
 from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions
 from torch_denkf.monitoring.monitor import InnovationMonitor
@@ -208,7 +208,7 @@ def _check_filter(name: str, filter: object) -> None:
 
 def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
     """The analyses of a module of a filter that can be gated."""
-    if type(module) is TensorDictSequential:
+    if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from _analyses(part)
     elif isinstance(module, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis | LaggedAnalysis):
@@ -217,7 +217,7 @@ def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
     """The module, or a plain sequence in which one module is replaced."""
-    if type(module) is not TensorDictSequential:
+    if not is_sequence(module):
         return new if module is old else module
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 

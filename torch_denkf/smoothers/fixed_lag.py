@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters._options import options_of
-from torch_denkf.modules._running import declared, named_modules_of
+from torch_denkf.modules._running import declared, is_sequence, named_modules_of
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.particles import ResampledTransition
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedAnalysis, LaggedBelief, with_past
@@ -156,7 +156,7 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
 
     def lagged(module: TensorDictModuleBase) -> TensorDictModuleBase:
         nonlocal found
-        if type(module) is TensorDictSequential:
+        if is_sequence(module):
             return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
         if isinstance(module, AnalysisAround):
             return module.around(lagged(module.module))
