@@ -48,6 +48,7 @@ setup(
         "safetensors>=0.4",  # weights that are data only
         "lazy_loader>=0.4",  # `import torch_denkf` stays cheap
         "tqdm>=4.60",
+        "tyro>=1.0",  # the options of `denkf`: a megabyte, imported when one of its commands runs
     ],
     extras_require={
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobot and own recordings.
@@ -62,7 +63,6 @@ setup(
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
-            "tyro",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",
@@ -80,7 +80,6 @@ setup(
         ],
         "test": [
             "evo",
-            "tyro",
             "pyarrow>=15",
             "av>=14",
             "huggingface_hub>=1.0",

@@ -33,6 +33,6 @@ def test_mistakes_of_the_demo(tmp_path, capsys):
     assert main(["demo", "--root", str(tmp_path)]) == 2
     assert "pass --root and --drive together, or neither" in capsys.readouterr().err
     assert main(["demo", "--frames", "3"]) == 2
-    assert "--frames is at least 30" in capsys.readouterr().err
+    assert "--frames must be a whole number, at least 30; got 3" in capsys.readouterr().err
     assert main(["demo", "--root", str(tmp_path), "--drive", "09", "--out", str(tmp_path)]) == 2
     assert "error: " in capsys.readouterr().err

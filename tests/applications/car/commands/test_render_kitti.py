@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torch_denkf.applications.car import read_kitti_drive
-from torch_denkf.applications.car.commands.render_kitti import main
+from torch_denkf.applications.car.commands.render_kitti import RenderKITTI
 from torch_denkf.applications.car.kitti import writer
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.files import write_poses
@@ -117,7 +117,7 @@ def test_errors_name_the_file_and_the_remedy(recorded, tmp_path, capsys):
         render_drives(tmp_path / "out", names="a", frames=3, size=(12, 36))
     capsys.readouterr()
     words = ["--out", str(tmp_path / "out"), "--poses", str(tmp_path / "bad"), "--processes", "1"]
-    assert main(words) == 2
+    assert RenderKITTI.main(words) == 2
     assert re.match(r"error: .*03\.txt:2: ", capsys.readouterr().err)
 
 
@@ -136,7 +136,7 @@ def test_the_command_writes_what_the_function_does(recorded, tmp_path):
         "1",
         "--no-traffic",
     ]
-    assert main(words) == 0
+    assert RenderKITTI.main(words) == 0
     render_drives(
         tmp_path / "b", poses=recorded, names=["01"], size=(12, 36), frames=4, seed=5, camera="image_0", focal=0.7,
         traffic=False,
