@@ -23,9 +23,9 @@ from torch_denkf.cli._command import Command, alone_in, say
 __all__ = ["Demo"]
 
 _NAMES = {
-    "missing": "lost frames\n(announced)",
-    "black": "black frames\n(unannounced)",
-    "box": "box in the way\n(unannounced)",
+    "missing": "lost frames (announced)",
+    "black": "black frames (unannounced)",
+    "box": "box in the way (unannounced)",
 }
 
 
@@ -57,6 +57,8 @@ class Demo(Command):
             self._leave()
 
     def _leave(self) -> None:
+        import numpy as np
+
         from torch_denkf.applications.car.commands._car import load_car, set_threads
         from torch_denkf.applications.car.kitti.drive import read_kitti_drive
         from torch_denkf.applications.car.kitti.render import render_drives
@@ -66,7 +68,8 @@ class Demo(Command):
             usual_failures,
         )
         from torch_denkf.applications.car.odometry.failures import fail_frames
-        from torch_denkf.applications.car.pictures import NamedSpan, drive_animation, drive_picture
+        from torch_denkf.applications.car.pictures import BANDS, NamedSpan, drive_picture, named_frames, path_options
+        from torch_denkf.plots import belief_video
 
         set_threads(self.threads)
         out, root, name, size = self.out, self.root, self.drive, (100, 300)
@@ -87,9 +90,18 @@ class Demo(Command):
         title = "Where is the car? One camera, which fails three times"
         with replacing(out / "demo.png") as beside:
             drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)
-        with progress_bar("drawing", None, unit=" frames", every=3) as bar:
-            moving = {"title": title, "every": self.every, "progress": bar.update}
-            drive_animation(out / "demo.gif", tracked, shown, spans, **moving)
+        belief_video(
+            out / "demo.gif",
+            tracked,
+            np.stack(named_frames(shown, spans)),
+            time=tracked["time"],
+            path=path_options(tracked),
+            bands=BANDS,
+            title=title,
+            every=self.every,
+            fps=6,
+            size=(8, 5),
+        )
         say(_table(drive_scores(tracked)))
         say(f"{out}: demo.png, demo.gif")
 
