@@ -77,7 +77,7 @@ def test_bytes_depend_neither_on_processes_nor_on_interruptions(recorded, tmp_pa
     first = tmp_path / "three/sequences/00/image_2/000001.png"
     before = first.stat().st_mtime_ns
     # What a killed run leaves is no drive, and goes once nobody has written to it for a while.
-    half = tmp_path / "three/.01-0123abcd"
+    half = tmp_path / "three/.writing-0123abcd"
     (half / "image_2").mkdir(parents=True)
     for folder in (half / "image_2", half):
         os.utime(folder, (0, 0))

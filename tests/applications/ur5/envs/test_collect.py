@@ -137,7 +137,6 @@ def test_a_killed_run_goes_on_with_other_processes(unbroken, tmp_path):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
-    (root / ".demo-000001.npz-01234567").write_bytes(b"half")
     with (root / MANIFEST).open("a") as file:
         file.write('{"demo": 39, "file": "demo-0000')  # killed while writing the line
     stamps = {entry.file: (root / entry.file).stat().st_mtime_ns for entry in made.values()}
