@@ -56,8 +56,6 @@ setup(
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],
         "examples": ["matplotlib", "tensorboard"],
-        # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
-        "hub": ["huggingface_hub>=1.0"],
         # Collection over machines, torchrl's RayCollector, in examples/many_machines.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
@@ -82,7 +80,6 @@ setup(
             "evo",
             "pyarrow>=15",
             "av>=14",
-            "huggingface_hub>=1.0",
             "hypothesis",
             "pytest",
             "pytest-xdist",
