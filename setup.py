@@ -48,6 +48,7 @@ setup(
         "safetensors>=0.4",  # weights that are data only
         "lazy_loader>=0.4",  # `import torch_denkf` stays cheap
         "tqdm>=4.60",
+        "tyro>=1.0",  # the options of `denkf`: a megabyte, imported when one of its commands runs
     ],
     extras_require={
         # Parquet files, and AV1 videos, which OpenCV's wheels do not decode: 280 MB, for LeRobot and own recordings.
@@ -55,14 +56,11 @@ setup(
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],
         "examples": ["matplotlib", "tensorboard"],
-        # torch_denkf.pretrained.HubFilter: weights from and to the Hugging Face hub.
-        "hub": ["huggingface_hub>=1.0"],
         # Collection over machines, torchrl's RayCollector, in examples/many_machines.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
         "bench": [
             "matplotlib",
-            "tyro",
             "filterpy==2.0.0",
             "dapper==1.7.1",
             "cuthbert==0.1.1",
@@ -80,10 +78,8 @@ setup(
         ],
         "test": [
             "evo",
-            "tyro",
             "pyarrow>=15",
             "av>=14",
-            "huggingface_hub>=1.0",
             "hypothesis",
             "pytest",
             "pytest-xdist",

@@ -57,7 +57,7 @@ def test_a_failure_leaves_what_was_there(tmp_path):
 
 def fail_half_way(file, error):
     with replacing(file) as beside:
-        assert (beside.parent, beside.suffix) == (file.parent, ".csv")
+        assert (beside.parent.parent, beside.name) == (file.parent, file.name)
         beside.write_text("half")
         raise error
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import re
-import uuid
+import shutil
+import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,9 +15,20 @@ from typing import IO
 
 from torch_denkf._lock import take_lock
 
-__all__ = ["clear_errors", "free_space", "replacing", "reserve", "sync", "write_bytes", "write_text"]
+__all__ = [
+    "clear_errors",
+    "free_space",
+    "place_beside",
+    "replacing",
+    "reserve",
+    "sweep",
+    "sync",
+    "write_bytes",
+    "write_text",
+]
 
-_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\.[^.]*)?")  # .NAME.TOKEN.part.SUFFIX
+_WRITING, _LOCK = ".writing-", "lock"
+_UNLOCKED = 3600.0  # s without a change, after which a half written place without a lock is a dead process's
 _BLOCK = 1 << 24
 #: Errors of the disk, not of the path.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -80,7 +92,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
         file: result; its folder is made. What is no plain file, such as ``/dev/stdout``, is written to directly.
 
     Yields:
-        A path in the same folder, with the same suffix, of an empty file.
+        The path of an empty file of the same name, in a folder beside it.
 
     Raises:
         OSError: if the file cannot be written; names it and the free space.
@@ -106,20 +118,12 @@ def replacing(file: str | Path) -> Iterator[Path]:
         if file.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
         file.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(file.parent)
-    beside, held = _claim(file)
-    with clear_errors(file, beside=beside):
-        try:
-            yield beside
-            sync(beside)  # else a power failure could put an empty file in the place of a good one
-            os.replace(beside, file)
-            sync(file.parent)
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
-        finally:
-            if held is not None:
-                os.close(held)
+    with clear_errors(file, beside=file.parent / _WRITING), place_beside(file) as beside:
+        beside.touch()
+        yield beside
+        sync(beside)  # else a power failure could put an empty file in the place of a good one
+        os.replace(beside, file)
+        sync(file.parent)
 
 
 def write_bytes(file: str | Path, data: bytes | bytearray | memoryview) -> None:
@@ -167,27 +171,88 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _claim(file: Path) -> tuple[Path, int | None]:
-    """A new file beside ``file``, and its lock: who sweeps sees that it is in use."""
+@contextmanager
+def place_beside(target: Path) -> Iterator[Path]:
+    """A place of the target's name in a folder of its own beside it, on the same disk.
+
+    What is there at the end goes, or is swept once this process is gone.
+
+    Example:
+        >>> import tempfile
+        >>> target = Path(tempfile.mkdtemp()) / "drive"
+        >>> with place_beside(target) as beside:
+        ...     beside.mkdir()
+        ...     _ = beside.rename(target)
+        >>> [path.name for path in target.parent.iterdir()]
+        ['drive']
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    sweep(target.parent)
+    folder, held = _claim(target.parent)
+    try:
+        yield folder / target.name
+    finally:
+        _remove(folder, held)
+
+
+def sweep(folder: Path) -> int:
+    """Removes what killed processes left half written beside the files and folders in a folder.
+
+    Returns:
+        How many places that were.
+    """
+    swept = 0
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder):
+            if name.startswith(_WRITING):
+                with contextlib.suppress(OSError):
+                    swept += _sweep(folder / name)
+    return swept
+
+
+def _sweep(left: Path) -> bool:
+    """Removes a place whose process is gone."""
+    with contextlib.suppress(OSError):
+        left.rmdir()  # an empty one: its process was killed at the first or at the last moment
+        return True
+    held, locks = None, (left / _LOCK).exists()
+    try:
+        held = take_lock(left / _LOCK, create=False)
+    except OSError:
+        locks = False
+    if held is None and (
+        locks or time.time() - max(path.stat().st_mtime for path in (left, *left.rglob("*"))) < _UNLOCKED
+    ):
+        return False
+    _remove(left, held)
+    return True
+
+
+def _remove(left: Path, held: int | None) -> None:
+    """Removes a place, its lock last: whatever a kill leaves of it is known as dead."""
+    with contextlib.suppress(OSError):
+        for path in left.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name != _LOCK:
+                path.unlink(missing_ok=True)
+    shutil.rmtree(left, ignore_errors=True)
+    if held is not None:
+        os.close(held)
+
+
+def _claim(parent: Path) -> tuple[Path, int | None]:
+    """A new folder to write to, and its lock; None on a file system without locks, where its age says if it is dead."""
     while True:
-        token = uuid.uuid4().hex[:8]
-        beside = file.with_name(f".{file.name[:100]}.{token}.part{file.suffix}")
-        with clear_errors(file, beside=beside):
-            os.close(os.open(beside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-            try:
-                held = take_lock(beside, create=False)
-            except OSError:  # no locks here: nobody sweeps, either
-                return beside, None
-            if held is not None:
-                return beside, held
-
-
-def _sweep(folder: Path) -> None:
-    """Removes what killed processes left half written."""
-    for name in os.listdir(folder):
-        if _PART.fullmatch(name):
-            with contextlib.suppress(OSError):
-                held = take_lock(folder / name, create=False)
-                if held is not None:
-                    (folder / name).unlink(missing_ok=True)
-                    os.close(held)
+        folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
+        try:
+            held = take_lock(folder / _LOCK)
+        except FileNotFoundError:  # swept while it was empty
+            continue
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            return folder, None
+        if held is not None:
+            return folder, held

@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["locked", "remove_locked", "take_lock"]
+__all__ = ["locked", "take_lock"]
 
 
 def take_lock(file: Path, *, create: bool = True) -> int | None:
@@ -47,17 +46,6 @@ def take_lock(file: Path, *, create: bool = True) -> int | None:
         raise
     os.close(descriptor)
     return None
-
-
-def remove_locked(folder: Path, name: str) -> None:
-    """Removes a folder, the file that is its lock last: what a kill leaves of it is still known as a dead process's."""
-    with contextlib.suppress(OSError):
-        for path in folder.iterdir():
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            elif path.name != name:
-                path.unlink(missing_ok=True)
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

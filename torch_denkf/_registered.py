@@ -31,7 +31,7 @@ def builders() -> dict[str, Callable[..., Any]]:
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """Modules whose ``main`` runs a command of the terminal, and what it does, by the command's name."""
+    """Where the commands of the terminal are, and what they do, by name."""
     return {name: command for each in _all() for name, command in each.COMMANDS.items()}
 
 

@@ -25,7 +25,7 @@ def test_an_empty_name_is_not_the_working_folder(command, option, capsys):
 
 def test_numbers_that_another_option_hides(capsys):
     assert main(["collect-ur5", "--out", "x", "--no-pixels", "--frames", "-1"]) == 2
-    assert "argument --frames: must be at least 0, got -1" in capsys.readouterr().err
+    assert "error: --frames must be a whole number, at least 0; got -1" in capsys.readouterr().err
 
 
 def test_drives_without_a_root(tmp_path, capsys):

@@ -18,9 +18,10 @@ import tensordict
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.cli.cache import main as denkf_cache
+from torch_denkf._files import sweep
+from torch_denkf.cli.cache import Cache
 from torch_denkf.data import cache_entry
-from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget, sweep
+from torch_denkf.data.cache import cached, cached_in_place, entries_of, forget
 from torch_denkf.data.cache_entry import END, MANIFEST, CachedTensor, DamagedEntry, check_entry, is_entry, open_entry
 
 ROOT = Path(__file__).parents[2]
@@ -237,11 +238,11 @@ def test_every_byte_counts_for_the_whole_check(entry, capsys):
     with pytest.raises(DamagedEntry, match=r"pixels.bin does not have its checksum"):
         check_entry(entry)
     words = ["--folder", str(entry.parent)]
-    assert denkf_cache(["check", *words]) == 1
+    assert Cache.main(["check", *words]) == 1
     assert "pixels.bin does not have its checksum" in capsys.readouterr().out
-    assert denkf_cache(["clear", "--damaged", *words]) == 0
+    assert Cache.main(["clear", "--damaged", *words]) == 0
     assert os.listdir(entry.parent) == []
-    assert denkf_cache(["check", *words]) == 0
+    assert Cache.main(["check", *words]) == 0
 
 
 @pytest.mark.parametrize("writable", [True, False])
@@ -366,25 +367,25 @@ def test_a_sound_entry_of_another_process_is_not_taken_for_damaged(entry, monkey
 
 def test_the_command_lists_and_clears(entry, capsys):
     folder = entry.parent
-    earlier = folder / "drive-fedcba9876543210"  # of a version without manifests
-    earlier.mkdir()
-    (earlier / "meta.json").write_text("{}")
+    damaged = folder / "drive-fedcba9876543210"
+    shutil.copytree(entry, damaged)
+    (damaged / "time.bin").unlink()
     foreign = folder / "holiday-pictures"
     foreign.mkdir()
-    assert entries_of(folder) == [entry, earlier]
-    assert denkf_cache(["list", "--folder", str(folder)]) == 0
+    assert entries_of(folder) == [entry, damaged]
+    assert Cache.main(["list", "--folder", str(folder)]) == 0
     out = capsys.readouterr().out
     assert f"{NAME}\n" in out
-    assert f"2 entries, 0.3 MB, in {folder}\n" in out
-    assert denkf_cache(["check", "--folder", str(folder)]) == 1
+    assert f"2 entries, 0.6 MB, in {folder}\n" in out
+    assert Cache.main(["check", "--folder", str(folder)]) == 1
     assert f"{NAME}: sound\n" in capsys.readouterr().out
-    assert denkf_cache(["clear", "--older-than", "1", "--folder", str(folder)]) == 0
-    assert entries_of(folder) == [entry, earlier]
+    assert Cache.main(["clear", "--older-than", "1", "--folder", str(folder)]) == 0
+    assert entries_of(folder) == [entry, damaged]
     opened = open_entry(entry)
-    assert denkf_cache(["clear", "--folder", str(folder)]) == 0
-    assert f"0.3 MB removed from {folder}\n" in capsys.readouterr().out
+    assert Cache.main(["clear", "--folder", str(folder)]) == 0
+    assert f"0.6 MB removed from {folder}\n" in capsys.readouterr().out
     assert os.listdir(folder) == [foreign.name]
     assert same(opened, content())  # who has it open keeps it
     forget(entry)  # is gone: no error
-    assert denkf_cache(["list", "--damaged"]) == 2
-    assert denkf_cache(["list", "--folder", str(folder / "none")]) == 0
+    assert Cache.main(["list", "--damaged"]) == 2
+    assert Cache.main(["list", "--folder", str(folder / "none")]) == 0

@@ -2,82 +2,65 @@
 
 from __future__ import annotations
 
-import argparse
+import contextlib
+import inspect
+import io
+import re
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NoReturn
+from typing import ClassVar
 
 from torch_denkf._lock import locked
 
-__all__ = ["Command", "alone_in", "filled", "path", "say", "whole"]
+__all__ = ["Command", "alone_in", "say"]
 
-
-class _Parser(argparse.ArgumentParser):
-    """Reports a mistake in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Write the message and leave with status 2."""
-        self.exit(2, f"error: {message}; see {self.prog} --help\n")
-
-
-class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults, but not those that say nothing."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        if any(action.default is silent for silent in (None, False, argparse.SUPPRESS)) or action.default == []:
-            return action.help
-        return super()._get_help_string(action)
+_FRAME = re.compile("[\u2500-\u257f]")  # what tyro draws around a mistake
 
 
 class Command:
-    """A sub-command: call it with its words.
+    """The base of all sub-commands, which are dataclasses: fields are options, their comments the help.
 
-    Args:
+    What :meth:`run` raises as ``ImportError``, ``OSError``, ``ValueError`` or one of ``mistakes``, or as a ``KeyError``
+    with a message, is told to the user in a line.
+
+    Attributes:
         name: what comes after ``denkf``.
-        summary: what it does, in a line.
         example: one whole command line.
-        arguments: adds the arguments to a parser.
-        run: does the work; returns the exit status, ``None`` for 0.
         resumable: whether a repeated command goes on where an interrupted one stopped.
-        mistakes: exceptions whose message is for the user, beside ``ImportError``, ``OSError``, ``ValueError`` and a
-            ``KeyError`` with a message.
+        mistakes: further exceptions whose message is for the user.
+        command_line: the words that were given, for the record.
 
     Example:
-        >>> def run(args):
-        ...     if args.count < 1:
-        ...         raise ValueError("count must be positive")
-        >>> count = Command("count", "Count.", "denkf count 3", lambda p: p.add_argument("count", type=int), run)
-        >>> count(["3"]), count(["0"]), count(["three"])
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Count(Command):
+        ...     "Count."
+        ...     to: int = 3  # the last number
+        ...     name, example = "count", "denkf count --to 3"
+        ...
+        ...     def run(self):
+        ...         if self.to < 1:
+        ...             raise ValueError("--to must be positive")
+        >>> Count.main(["--to", "4"]), Count.main(["--to", "0"]), Count.main(["--to", "three"])
         (0, 2, 2)
     """
 
-    def __init__(
-        self,
-        name: str,
-        summary: str,
-        example: str,
-        arguments: Callable[[argparse.ArgumentParser], object],
-        run: Callable[[argparse.Namespace], int | None],
-        *,
-        resumable: bool = False,
-        mistakes: tuple[type[Exception], ...] = (),
-    ):
-        self.name, self.run, self.resumable = name, run, resumable
-        self.mistakes: tuple[type[Exception], ...] = (ImportError, OSError, ValueError, *mistakes)
-        self.parser = _Parser(
-            allow_abbrev=False,
-            prog=f"denkf {name}",
-            description=summary,
-            epilog=f"example:\n  {example}",
-            formatter_class=_Formatter,
-        )
-        arguments(self.parser)
+    name: ClassVar[str]
+    example: ClassVar[str]
+    resumable: ClassVar[bool] = False
+    mistakes: ClassVar[tuple[type[Exception], ...]] = ()
+    command_line = ""
 
-    def __call__(self, arguments: Sequence[str] | None = None) -> int:
+    def run(self) -> int | None:
+        """Does the work; returns the exit status, ``None`` for 0."""
+        raise NotImplementedError
+
+    @classmethod
+    def main(cls, arguments: Sequence[str] | None = None) -> int:
         """Run the command.
 
         Args:
@@ -89,15 +72,16 @@ class Command:
         """
         words = list(sys.argv[1:] if arguments is None else arguments)
         try:
-            args = self.parser.parse_args(words)
+            command = cls.read(words)
         except SystemExit as left:  # after --help, or a mistake
             return int(left.code or 0)
-        args.command_line = shlex.join(["denkf", *self.name.split(), *words])
+        command.command_line = shlex.join(["denkf", cls.name, *words])
+        mistakes: tuple[type[Exception], ...] = (ImportError, OSError, ValueError, *cls.mistakes)
         try:
             with warnings.catch_warnings():
                 warnings.showwarning = _show
-                return self.run(args) or 0
-        except self.mistakes as error:
+                return command.run() or 0
+        except mistakes as error:
             return _mistake(str(error))
         except KeyError as error:
             message = str(error.args[0]) if error.args else ""
@@ -105,48 +89,37 @@ class Command:
                 raise
             return _mistake(message)
         except KeyboardInterrupt:
-            sys.stderr.write(f"interrupted{'; the same command goes on from here' if self.resumable else ''}\n")
+            sys.stderr.write(f"interrupted{'; the same command goes on from here' if cls.resumable else ''}\n")
             return 130
 
+    @classmethod
+    def read(cls, words: Sequence[str]) -> Command:
+        """The options that some words ask for.
 
-def whole(least: int) -> Callable[[str], int]:
-    """The type of an argument that is a whole number, at least so large.
+        Raises:
+            SystemExit: after the help, with status 0; after a line on stderr that tells a mistake, with status 2.
+        """
+        import tyro  # here: `denkf --help` does not need it
 
-    Example:
-        >>> whole(1)("3")
-        3
-    """
-
-    def read(text: str) -> int:
-        number = int(text)
-        if number < least:
-            raise argparse.ArgumentTypeError(f"must be at least {least}, got {number}")
-        return number
-
-    read.__name__ = "whole number"  # argparse names it for what is no number
-    return read
-
-
-def filled(text: str) -> str:
-    """The type of an argument that must not be empty, as that of a variable of the shell that is not set.
-
-    Example:
-        >>> filled("runs/car")
-        'runs/car'
-    """
-    if not text:
-        raise argparse.ArgumentTypeError("must not be empty")
-    return text
-
-
-def path(text: str) -> Path:
-    """The type of an argument that names a file or folder.
-
-    Example:
-        >>> path("runs/car").name
-        'car'
-    """
-    return Path(filled(text))
+        drawn = io.StringIO()
+        try:
+            _refuse_empty(words)
+            with contextlib.redirect_stderr(drawn):
+                return tyro.cli(
+                    cls,
+                    prog=f"denkf {cls.name}",
+                    args=words,
+                    description=f"{inspect.getdoc(cls)}\n\nexample: {cls.example}",
+                    config=(tyro.conf.FlagCreatePairsOff,),  # --overwrite, and no --no-overwrite
+                )
+        except ValueError as error:
+            drawn.write(str(error))
+        except SystemExit as left:
+            if not left.code:
+                raise
+        told = _FRAME.sub(" ", drawn.getvalue()).partition("For full helptext")[0]
+        sys.stderr.write(f"error: {_in_line(told)}; see denkf {cls.name} --help\n")
+        raise SystemExit(2)
 
 
 def alone_in(out: Path) -> AbstractContextManager[None]:
@@ -171,10 +144,21 @@ def say(text: str) -> None:
     sys.stdout.write(f"{text}\n")
 
 
+def _refuse_empty(words: Sequence[str]) -> None:
+    """An empty word is a variable of the shell that is not set; as a path it would be the working folder."""
+    for before, word in zip(["", *words], words, strict=False):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            raise ValueError(f"argument {word.rstrip('=') or before}: must not be empty")
+
+
 def _mistake(message: str) -> int:
-    sys.stderr.write(f"error: {' '.join(message.split())}\n")
+    sys.stderr.write(f"error: {_in_line(message)}\n")
     return 2
 
 
+def _in_line(text: str) -> str:
+    return " ".join(text.split())
+
+
 def _show(message, category, filename, lineno, file=None, line=None) -> None:
-    sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")
+    sys.stderr.write(f"warning: {_in_line(str(message))}\n")

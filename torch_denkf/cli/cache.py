@@ -10,68 +10,75 @@
 Entries are decoded pictures and optical flow: all can be made again, from the recordings. From Python:
 
 >>> import tempfile
->>> main(["list", "--folder", tempfile.mkdtemp()])
+>>> Cache.main(["list", "--folder", tempfile.mkdtemp()])
 0 entries, 0.0 MB, in ...
 0
 """
 
 from __future__ import annotations
 
-import argparse
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from torch_denkf.cli._command import Command, path, say
+from tyro.conf import Positional
 
-__all__ = ["main"]
+from torch_denkf.cli._command import Command, say
+
+__all__ = ["Cache"]
 
 _DAY = 86400.0
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "what",
-        choices=("list", "check", "clear"),
-        help="list entries, compare them with their checksums, or remove them",
-    )
-    add("--folder", type=path, help="of the cache; $TORCH_DENKF_CACHE, or else ~/.cache/torch_denkf, by default")
-    add("--damaged", action="store_true", help="clear: only what is damaged, or of an earlier version")
-    add("--older-than", type=float, metavar="DAYS", help="clear: only what was written before so many days")
+@dataclass
+class Cache(Command):
+    """List, check or clear what is kept of earlier runs: decoded pictures and optical flow."""
 
+    what: Positional[
+        Literal["list", "check", "clear"]
+    ]  # list entries, compare them with their checksums, or remove them
+    folder: Path | None = None  # of the cache; $TORCH_DENKF_CACHE, or else ~/.cache/torch_denkf, by default
+    damaged: bool = False  # clear: only what is damaged
+    older_than: float | None = None  # clear: only what was written before so many days
 
-def _run(args: argparse.Namespace) -> int:
-    from torch_denkf.data.cache import entries_of, forget, sweep, usual_folder
+    name, example = "cache", "denkf cache check"
 
-    if args.what != "clear" and (args.damaged or args.older_than is not None):
-        raise ValueError("--damaged and --older-than belong to denkf cache clear")
-    folder = (args.folder or usual_folder()).expanduser()
-    swept = sweep(folder) if folder.is_dir() else 0
-    if swept:
-        say(f"removed what {swept} killed processes left half written")
-    entries, damaged, size = entries_of(folder), 0, 0
-    for entry in entries:
-        bytes_, age = _size(entry), (time.time() - entry.stat().st_mtime) / _DAY
-        text = f"{bytes_ / 1e6:10.1f} MB  {age:7.1f} days  {entry.name}"
-        if args.what == "list":
-            say(text)
-        elif args.what == "check":
-            wrong = _wrong(entry)
-            damaged += wrong is not None
-            say(f"{text}: {wrong or 'sound'}")
-        else:
-            if (args.older_than is not None and age < args.older_than) or (args.damaged and _wrong(entry) is None):
-                continue
-            forget(entry)
-            say(f"{text}: removed")
-        size += bytes_
-    if args.what == "clear":
-        say(f"{size / 1e6:.1f} MB removed from {folder}")
-        return 0
-    say(f"{len(entries)} entries, {size / 1e6:.1f} MB, in {folder}")
-    if damaged:
-        say(f"{damaged} damaged: each is made anew when it is next used, or goes with denkf cache clear --damaged")
-    return 1 if damaged else 0
+    def run(self) -> int:
+        """Goes over all entries."""
+        from torch_denkf._files import sweep
+        from torch_denkf.data.cache import entries_of, forget, usual_folder
+
+        if self.what != "clear" and (self.damaged or self.older_than is not None):
+            raise ValueError("--damaged and --older-than belong to denkf cache clear")
+        folder = (self.folder or usual_folder()).expanduser()
+        swept = sweep(folder) if folder.is_dir() else 0
+        if swept:
+            say(f"removed what {swept} killed processes left half written")
+        entries, damaged, size = entries_of(folder), 0, 0
+        for entry in entries:
+            bytes_, age = _size(entry), (time.time() - entry.stat().st_mtime) / _DAY
+            text = f"{bytes_ / 1e6:10.1f} MB  {age:7.1f} days  {entry.name}"
+            if self.what == "list":
+                say(text)
+            elif self.what == "check":
+                wrong = _wrong(entry)
+                damaged += wrong is not None
+                say(f"{text}: {wrong or 'sound'}")
+            else:
+                young = self.older_than is not None and age < self.older_than
+                if young or (self.damaged and _wrong(entry) is None):
+                    continue
+                forget(entry)
+                say(f"{text}: removed")
+            size += bytes_
+        if self.what == "clear":
+            say(f"{size / 1e6:.1f} MB removed from {folder}")
+            return 0
+        say(f"{len(entries)} entries, {size / 1e6:.1f} MB, in {folder}")
+        if damaged:
+            say(f"{damaged} damaged: each is made anew when it is next used, or goes with denkf cache clear --damaged")
+        return 1 if damaged else 0
 
 
 def _size(entry: Path) -> int:
@@ -86,15 +93,3 @@ def _wrong(entry: Path) -> str | None:
     except (DamagedEntry, FileNotFoundError) as error:
         return str(error)
     return None
-
-
-main = Command(
-    "cache",
-    "List, check or clear what is kept of earlier runs: decoded pictures and optical flow.",
-    "denkf cache check",
-    _arguments,
-    _run,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

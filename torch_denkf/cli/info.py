@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
 from torch_denkf.cli._command import Command, say
 
-__all__ = ["main"]
+__all__ = ["Info"]
 
 _PACKAGES = ("torch_denkf", "torch", "torchrl", "tensordict", "mujoco", "dm_control", "opencv-python-headless")
 #: Optional extras by name: the modules that they bring, and what for.
@@ -89,21 +89,20 @@ def _extra(name: str) -> str:
     return f'no {", ".join(missing)}, for {what}: pip install "torch_denkf[{name}]"'
 
 
-def _run(args: argparse.Namespace) -> None:
-    lines = {package: _version(package) for package in _PACKAGES}
-    lines |= {"Python": f"{platform.python_version()}, {platform.platform()}", "devices": _devices()}
-    lines |= {"OpenGL": _opengl(), "C++ compiler": _compiler(), "cache": _cache()}
-    lines |= {f"extra {name}": _extra(name) for name in _EXTRAS}
-    import torch_denkf
+@dataclass
+class Info(Command):
+    """Versions, devices, OpenGL, cache, C++ compiler, optional extras."""
 
-    lines["installed in"] = str(Path(torch_denkf.__file__).parent)
-    for name, text in lines.items():
-        say(f"{name:<24}{text}")
+    name, example = "info", "denkf info"
 
+    def run(self) -> None:
+        """Looks at everything and says it."""
+        lines = {package: _version(package) for package in _PACKAGES}
+        lines |= {"Python": f"{platform.python_version()}, {platform.platform()}", "devices": _devices()}
+        lines |= {"OpenGL": _opengl(), "C++ compiler": _compiler(), "cache": _cache()}
+        lines |= {f"extra {name}": _extra(name) for name in _EXTRAS}
+        import torch_denkf
 
-main = Command(
-    "info", "Versions, devices, OpenGL, cache, C++ compiler, optional extras.", "denkf info", lambda parser: None, _run
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        lines["installed in"] = str(Path(torch_denkf.__file__).parent)
+        for name, text in lines.items():
+            say(f"{name:<24}{text}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib import import_module
+from pkgutil import resolve_name
 
 import torch_denkf
 from torch_denkf import _registered
@@ -12,13 +12,13 @@ from torch_denkf import _registered
 __all__ = ["commands", "main"]
 
 _OWN = {
-    "info": ("torch_denkf.cli.info", "versions, devices, OpenGL, cache, optional extras"),
-    "cache": ("torch_denkf.cli.cache", "list, check or clear what is kept of earlier runs"),
+    "info": ("torch_denkf.cli.info:Info", "versions, devices, OpenGL, cache, optional extras"),
+    "cache": ("torch_denkf.cli.cache:Cache", "list, check or clear what is kept of earlier runs"),
 }
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """By name: the module whose ``main`` runs a command, and what it does; applications register theirs.
+    """By name: where the command is, and what it does; applications register theirs.
 
     Example:
         >>> sorted(commands())[:2]
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"error: unknown command {words[0]!r}; there are {', '.join(known)}\n")
         return 2
     try:
-        command = import_module(known[words[0]][0])
+        command = resolve_name(known[words[0]][0])
     except KeyboardInterrupt:
         return 130
     return command.main(words[1:])

@@ -6,27 +6,19 @@ import contextlib
 import errno
 import logging
 import os
-import re
-import shutil
-import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from tensordict import TensorDict
 
-from torch_denkf._files import clear_errors, sync
-from torch_denkf._lock import remove_locked, take_lock
+from torch_denkf._files import clear_errors, place_beside, sweep, sync
 from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, reserve_entry, seal_entry, write_entry
 
-__all__ = ["cache_folder", "cached", "cached_in_place", "entries_of", "forget", "stamp", "sweep", "usual_folder"]
+__all__ = ["cache_folder", "cached", "cached_in_place", "entries_of", "forget", "stamp", "usual_folder"]
 
 _LOG = logging.getLogger("torch_denkf")
-_WRITING, _LOCK = ".writing-", "lock"
 _TRIES = 3  # to open what was just written: another process may clear the cache at that moment
-_UNLOCKED = 3600.0  # s without a change, after which a half entry without a lock is a dead process's
-_EARLIER = re.compile(r".+-[0-9a-f]{16,20}")  # entries of versions that had no manifest
 
 
 def usual_folder() -> Path:
@@ -107,57 +99,13 @@ def entries_of(folder: Path) -> list[Path]:
     """The entries in a folder, sound or not, by name; what is not the cache's is left out."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.is_dir() and (is_entry(path) or _is_earlier(path)))
+    return sorted(path for path in folder.iterdir() if path.is_dir() and is_entry(path))
 
 
 def forget(entry: Path) -> None:
     """Removes an entry. Who has it open keeps it."""
-    with _errors_of(entry), _beside(entry) as aside, contextlib.suppress(FileNotFoundError):
+    with _errors_of(entry), place_beside(entry) as aside, contextlib.suppress(FileNotFoundError):
         entry.rename(aside)
-
-
-def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written in a cache.
-
-    Returns:
-        How many entries that were.
-    """
-    swept = 0
-    with contextlib.suppress(OSError):
-        for name in os.listdir(folder):
-            if name.startswith(_WRITING):
-                with contextlib.suppress(OSError):
-                    swept += _sweep(folder / name)
-    return swept
-
-
-def _sweep(left: Path) -> bool:
-    """Removes a half entry whose process is gone."""
-    with contextlib.suppress(OSError):
-        left.rmdir()  # an empty one: its process was killed at the first or at the last moment
-        return True
-    held, locks = None, (left / _LOCK).exists()
-    try:
-        held = take_lock(left / _LOCK, create=False)
-    except OSError:
-        locks = False
-    if held is None and (
-        locks or time.time() - max(path.stat().st_mtime for path in (left, *left.rglob("*"))) < _UNLOCKED
-    ):
-        return False
-    _remove(left, held)
-    return True
-
-
-def _remove(left: Path, held: int | None) -> None:
-    """Removes a half entry, its lock last: whatever a kill leaves of it is known as dead."""
-    remove_locked(left, _LOCK)
-    if held is not None:
-        os.close(held)
-
-
-def _is_earlier(folder: Path) -> bool:
-    return bool(_EARLIER.fullmatch(folder.name)) and (folder / "meta.json").is_file()
 
 
 def _load(entry: Path) -> TensorDict | None:
@@ -174,7 +122,7 @@ def _load(entry: Path) -> TensorDict | None:
 
 def _set_aside(entry: Path) -> None:
     """Removes a damaged entry, but not the sound one that another process may have put in its place meanwhile."""
-    with _errors_of(entry), _beside(entry) as aside, contextlib.suppress(DamagedEntry, FileNotFoundError):
+    with _errors_of(entry), place_beside(entry) as aside, contextlib.suppress(DamagedEntry, FileNotFoundError):
         entry.rename(aside)
         open_entry(aside)
         with contextlib.suppress(OSError):  # there is one again
@@ -191,7 +139,7 @@ def _check_writable(entry: Path) -> None:
 @contextmanager
 def _writing(entry: Path) -> Iterator[Path]:
     """A folder to write to beside an entry, which is renamed when it is complete: an entry that exists is complete."""
-    with _errors_of(entry), _beside(entry) as beside:
+    with _errors_of(entry), place_beside(entry) as beside:
         yield beside
         try:
             beside.rename(entry)
@@ -199,34 +147,6 @@ def _writing(entry: Path) -> Iterator[Path]:
         except OSError:
             if not entry.is_dir():  # otherwise another process was faster, with the same content
                 raise
-
-
-@contextmanager
-def _beside(entry: Path) -> Iterator[Path]:
-    """A place beside an entry; what is there at the end goes, or is swept once this process is gone."""
-    entry.parent.mkdir(parents=True, exist_ok=True)
-    folder, held = _claim(entry.parent)
-    try:
-        yield folder / "entry"
-    finally:
-        _remove(folder, held)
-
-
-def _claim(parent: Path) -> tuple[Path, int | None]:
-    """A new folder to write to, and its lock; None on a file system without locks, where its age says if it is dead."""
-    while True:
-        folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
-        try:
-            held = take_lock(folder / _LOCK)
-        except FileNotFoundError:  # swept while it was empty
-            continue
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                shutil.rmtree(folder, ignore_errors=True)
-                raise
-            return folder, None
-        if held is not None:
-            return folder, held
 
 
 def _errors_of(entry: Path):

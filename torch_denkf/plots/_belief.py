@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -60,21 +61,19 @@ def read_belief(
     """
     if isinstance(belief, Tensor):
         parts: dict[str, Tensor] = {"mean": number(belief)}
-        source = None
     else:
-        source = belief
         root = belief.get("belief", None)
         root = belief if root is None else root
         names = ("mean", "var", "cov", "ensemble", "log_weight")
         parts = {name: number(root[name]) for name in names if name in set(root.keys())}
         if not {"mean", "ensemble"} & parts.keys():
             raise KeyError(
-                f'no ("belief", "mean") and no ("belief", "ensemble") among {list(source.keys(True, True))}; pass what '
+                f'no ("belief", "mean") and no ("belief", "ensemble") among {list(belief.keys(True, True))}; pass what '
                 'a filter\'s sequence or a roll-out of an environment with DEnKFTransform gives, or its "next"'
             )
     parts = _summarise(parts)
-    optional = {"truth": _entry(source, truth, "state"), "observed": _entry(source, observed, "observed")}
-    read = Belief(**parts, **{name: value for name, value in optional.items() if value is not None})
+    optional = {"truth": entry_of(belief, truth, "state"), "observed": entry_of(belief, observed, "observed")}
+    read = Belief(**parts, **{name: number(value) for name, value in optional.items() if value is not None})
     batch = read.mean.shape[:-1]
     if one_sequence and len(batch) != 1:
         raise ValueError(f"one sequence [T, S] is drawn at a time, got means {list(read.mean.shape)}; index the batch")
@@ -136,20 +135,22 @@ def with_truth(read: Belief, dims: list[int]) -> Tensor:
     return read.truth[..., dims]
 
 
-def _entry(source: TensorDictBase | None, value: Truth, default: str) -> Tensor | None:
-    if isinstance(value, Tensor):
-        return number(value)
-    if source is None:
+def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
+    """A tensor or array that is passed as such, that of a key, or the ``default`` entry where the roll-out has it.
+
+    Raises:
+        KeyError: if there is no such key, or nothing that could have keys.
+    """
+    if isinstance(value, (Tensor, np.ndarray)):
+        return value
+    if isinstance(source, Tensor):
         if value is not None:
             raise KeyError(f"{value!r} is a key, but the belief is a tensor; pass a tensor")
         return None
-    if value is None:
-        found = source.get(default, None)
-        return None if found is None else number(found)
-    found = source.get(value, None)
-    if found is None:
+    found = source.get(default if value is None else value, None)
+    if found is None and value is not None:
         raise KeyError(f"no {value!r} among {list(source.keys(True, True))}")
-    return number(found)
+    return found
 
 
 def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from torch_denkf._files import replacing
 from torch_denkf.plots._axes import times_of
-from torch_denkf.plots._belief import Truth, read_belief
+from torch_denkf.plots._belief import Truth, entry_of, read_belief
 from torch_denkf.plots._frames import as_picture, write_gif, write_mp4
-from torch_denkf.plots._pixels import find_pixels
 from torch_denkf.plots._scene import Scene
 from torch_denkf.plots.bands import plot_bands
 from torch_denkf.plots.path import plot_path
@@ -109,7 +108,9 @@ def belief_video(
         >>> file = belief_video(f"{tempfile.mkdtemp()}/walk.gif", walk, path={}, bands={}, size=(3, 2))
     """
     read = read_belief(belief, truth, observed, one_sequence=True)
-    pictures = find_pixels(belief, pixels, len(read.mean))
+    pictures = entry_of(belief, pixels, "pixels")
+    if pictures is not None and len(pictures) != len(read.mean):
+        raise ValueError(f"pixels must have a picture a step, {len(read.mean)}; got {len(pictures)}")
     if every < 1:
         raise ValueError(f"every counts steps and must be at least 1; got {every}")
     if pictures is None and path is None and bands is None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_denkf import from_pretrained
-from torch_denkf.applications.reacher.commands import main
+from torch_denkf.applications.reacher.commands import TrainReacher
 from torch_denkf.applications.reacher.train import evaluate_reacher, train_reacher
 
 
@@ -24,7 +24,7 @@ def test_reacher(tmp_path):
 
 
 def test_the_filter_of_the_library_scores_as_its_card_says(tmp_path, capsys):
-    assert main(["--out", str(tmp_path), "--evaluate"]) == 0
+    assert TrainReacher.main(["--out", str(tmp_path), "--evaluate"]) == 0
     scores = json.loads(capsys.readouterr().out)
     assert scores["rates, RMSE rad/s"]["filter"] == pytest.approx(0.40, abs=0.02)
     assert scores["angles, RMSE rad"]["filter"] == pytest.approx(0.040, abs=0.002)

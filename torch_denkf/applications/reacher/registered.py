@@ -1,4 +1,6 @@
 """What the reacher adds to the library's registers."""
 
 BUILDERS = {"reacher": "torch_denkf.applications.reacher.filter:reacher"}
-COMMANDS = {"train-reacher": ("torch_denkf.applications.reacher.commands", "train or test the reacher's filter")}
+COMMANDS = {
+    "train-reacher": ("torch_denkf.applications.reacher.commands:TrainReacher", "train or test the reacher's filter")
+}

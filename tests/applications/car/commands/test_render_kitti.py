@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torch_denkf.applications.car import read_kitti_drive
-from torch_denkf.applications.car.commands.render_kitti import main
+from torch_denkf.applications.car.commands.render_kitti import RenderKITTI
 from torch_denkf.applications.car.kitti import writer
 from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.files import write_poses
@@ -77,7 +77,7 @@ def test_bytes_depend_neither_on_processes_nor_on_interruptions(recorded, tmp_pa
     first = tmp_path / "three/sequences/00/image_2/000001.png"
     before = first.stat().st_mtime_ns
     # What a killed run leaves is no drive, and goes once nobody has written to it for a while.
-    half = tmp_path / "three/.01-0123abcd"
+    half = tmp_path / "three/.writing-0123abcd"
     (half / "image_2").mkdir(parents=True)
     for folder in (half / "image_2", half):
         os.utime(folder, (0, 0))
@@ -117,7 +117,7 @@ def test_errors_name_the_file_and_the_remedy(recorded, tmp_path, capsys):
         render_drives(tmp_path / "out", names="a", frames=3, size=(12, 36))
     capsys.readouterr()
     words = ["--out", str(tmp_path / "out"), "--poses", str(tmp_path / "bad"), "--processes", "1"]
-    assert main(words) == 2
+    assert RenderKITTI.main(words) == 2
     assert re.match(r"error: .*03\.txt:2: ", capsys.readouterr().err)
 
 
@@ -136,7 +136,7 @@ def test_the_command_writes_what_the_function_does(recorded, tmp_path):
         "1",
         "--no-traffic",
     ]
-    assert main(words) == 0
+    assert RenderKITTI.main(words) == 0
     render_drives(
         tmp_path / "b", poses=recorded, names=["01"], size=(12, 36), frames=4, seed=5, camera="image_0", focal=0.7,
         traffic=False,

@@ -10,97 +10,100 @@ The filter ``car-odometry`` comes with the library; it has not seen the drive.
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
+from torch_denkf._checks import check_count
 from torch_denkf._files import replacing
 from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, say
 
-__all__ = ["main"]
+__all__ = ["Demo"]
 
 _NAMES = {
-    "missing": "lost frames\n(announced)",
-    "black": "black frames\n(unannounced)",
-    "box": "box in the way\n(unannounced)",
+    "missing": "lost frames (announced)",
+    "black": "black frames (unannounced)",
+    "box": "box in the way (unannounced)",
 }
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--out", type=path, default=Path("runs/demo"), help="folder for demo.png and demo.gif")
-    add("--root", type=path, help="folder in KITTI's layout; without it a drive is rendered")
-    add("--drive", help="name of a drive below --root")
-    add("--height", type=float, default=KITTI_HEIGHT, help="of the camera of --root over the road, m")
-    add("--frames", type=int, default=240, help="of the drive, at most")
-    add("--seed", type=whole(0), default=2032, help="of the rendered drive; the training's was 0")
-    add("--every", type=int, default=4, help="n-th frame that the animation shows")
-    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
+@dataclass
+class Demo(Command):
+    """Track a car by one camera that fails, with a filter that comes with the library: a picture and an animation."""
 
+    out: Path = Path("runs/demo")  # folder for demo.png and demo.gif
+    root: Path | None = None  # folder in KITTI's layout; without it a drive is rendered
+    drive: str | None = None  # name of a drive below --root
+    height: float = KITTI_HEIGHT  # of the camera of --root over the road, m
+    frames: int = 240  # of the drive, at most
+    seed: int = 2032  # of the rendered drive; the training's was 0
+    every: int = 4  # n-th frame that the animation shows
+    threads: int = 1  # of torch and OpenCV
 
-def _run(args: argparse.Namespace) -> None:
-    if (args.root is None) != (args.drive is None):
-        raise ValueError("pass --root and --drive together, or neither")
-    if args.frames < 30 or args.every < 1:
-        raise ValueError(f"--frames is at least 30, --every at least 1; got {args.frames} and {args.every}")
-    from importlib.util import find_spec
+    name, example = "demo", "denkf demo --out runs/demo"
 
-    if find_spec("matplotlib") is None or find_spec("PIL") is None:  # before a minute of work
-        raise ImportError('pictures need matplotlib and pillow: pip install "torch_denkf[plots]"')
-    with alone_in(args.out):
-        _leave(args)
+    def run(self) -> None:
+        """Renders, tracks and draws."""
+        if (self.root is None) != (self.drive is None):
+            raise ValueError("pass --root and --drive together, or neither")
+        check_count("--frames", self.frames, least=30)
+        check_count("--every", self.every)
+        check_count("--seed", self.seed, least=0)
+        if find_spec("matplotlib") is None or find_spec("PIL") is None:  # before a minute of work
+            raise ImportError('pictures need matplotlib and pillow: pip install "torch_denkf[plots]"')
+        with alone_in(self.out):
+            self._leave()
 
+    def _leave(self) -> None:
+        import numpy as np
 
-def _leave(args: argparse.Namespace) -> None:
-    """Renders, tracks and draws."""
-    import cv2
-    import torch
-
-    from torch_denkf.applications.car.commands._car import load_car
-    from torch_denkf.applications.car.kitti.drive import read_kitti_drive
-    from torch_denkf.applications.car.kitti.render import render_drives
-    from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
-    from torch_denkf.applications.car.odometry.failures import fail_frames
-    from torch_denkf.applications.car.pictures import NamedSpan, drive_animation, drive_picture
-
-    torch.set_num_threads(args.threads)
-    cv2.setNumThreads(args.threads)
-    size = (100, 300)
-    if args.root is None:
-        args.root, args.drive = args.out / "drives", "demo"
-        with progress_bar("rendering a drive", args.frames, unit=" frames", every=3) as bar:
-            render_drives(
-                args.root,
-                names=args.drive,
-                frames=args.frames,
-                size=size,
-                seed=args.seed,
-                overwrite=True,
-                progress=bar.update,
-            )
-    drive = read_kitti_drive(args.root, args.drive, size=size, cache=None)[: args.frames]
-    failures = usual_failures(len(drive))
-    with progress_bar("tracking the car", len(drive), unit=" frames", every=3) as bar:
-        tracked = track_failing_drive(
-            load_car("car-odometry"),
-            drive,
-            failures,
-            height=args.height,
-            progress=bar.update,
+        from torch_denkf.applications.car.commands._car import load_car, set_threads
+        from torch_denkf.applications.car.kitti.drive import read_kitti_drive
+        from torch_denkf.applications.car.kitti.render import render_drives
+        from torch_denkf.applications.car.odometry.failing_drive import (
+            drive_scores,
+            track_failing_drive,
+            usual_failures,
         )
-    images = [image.permute(1, 2, 0).numpy() for image in drive["image"]]
-    shown = [image if image is not None else 0 * images[0] + 225 for image in fail_frames(images, failures)]
-    spans = [NamedSpan(_NAMES[failure.kind], failure.first, failure.last) for failure in failures]
-    title = "Where is the car? One camera, which fails three times"
-    with replacing(args.out / "demo.png") as beside:
-        drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)
-    with progress_bar("drawing", None, unit=" frames", every=3) as bar:
-        drive_animation(
-            args.out / "demo.gif", tracked, shown, spans, title=title, every=args.every, progress=bar.update
+        from torch_denkf.applications.car.odometry.failures import fail_frames
+        from torch_denkf.applications.car.pictures import BANDS, NamedSpan, drive_picture, named_frames, path_options
+        from torch_denkf.plots import belief_video
+
+        set_threads(self.threads)
+        out, root, name, size = self.out, self.root, self.drive, (100, 300)
+        if root is None or name is None:
+            root, name = out / "drives", "demo"
+            with progress_bar("rendering a drive", self.frames, unit=" frames", every=3) as bar:
+                options = {"size": size, "seed": self.seed, "overwrite": True, "progress": bar.update}
+                render_drives(root, names=name, frames=self.frames, **options)
+        drive = read_kitti_drive(root, name, size=size, cache=None)[: self.frames]
+        failures = usual_failures(len(drive))
+        car = load_car("car-odometry")
+        with progress_bar("tracking the car", len(drive), unit=" frames", every=3) as bar:
+            tracked = track_failing_drive(car, drive, failures, height=self.height, progress=bar.update)
+        images = [image.permute(1, 2, 0).numpy() for image in drive["image"]]
+        # A lost frame is drawn as a grey one.
+        shown = [image if image is not None else 0 * images[0] + 225 for image in fail_frames(images, failures)]
+        spans = [NamedSpan(_NAMES[failure.kind], failure.first, failure.last) for failure in failures]
+        title = "Where is the car? One camera, which fails three times"
+        with replacing(out / "demo.png") as beside:
+            drive_picture(tracked, shown, spans, title).savefig(beside, dpi=90)
+        belief_video(
+            out / "demo.gif",
+            tracked,
+            np.stack(named_frames(shown, spans)),
+            time=tracked["time"],
+            path=path_options(tracked),
+            bands=BANDS,
+            title=title,
+            every=self.every,
+            fps=6,
+            size=(8, 5),
         )
-    say(_table(drive_scores(tracked)))
-    say(f"{args.out}: demo.png, demo.gif")
+        say(_table(drive_scores(tracked)))
+        say(f"{out}: demo.png, demo.gif")
 
 
 def _table(scores: dict[str, float]) -> str:
@@ -116,15 +119,3 @@ def _table(scores: dict[str, float]) -> str:
         f"{100 * scores['held_v']:.0f} % of the true speeds, {100 * scores['held_theta_dot']:.0f} % of the turn rates"
     )
     return "\n".join([*lines, f"The DEnKF's 90 % intervals hold {held}."])
-
-
-main = Command(
-    "demo",
-    "Track a car by one camera that fails, with a filter that comes with the library: a picture and an animation.",
-    "denkf demo --out runs/demo",
-    _arguments,
-    _run,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

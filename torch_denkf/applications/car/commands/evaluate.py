@@ -9,87 +9,73 @@ See :func:`torch_denkf.applications.car.odometry.evaluation.evaluate_car_filter`
 
 from __future__ import annotations
 
-import argparse
 from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 
+from torch_denkf._checks import check_count
 from torch_denkf._files import write_text
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, filled, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, say
 
-__all__ = ["main"]
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--checkpoint",
-        type=filled,
-        default="car-odometry",
-        help="that of the library, or a folder that denkf train left",
-    )
-    add("--root", required=True, type=path, help="folder in KITTI's layout, with sequences/ and poses/")
-    add("--drives", nargs="+", metavar="NAME", help="drives below --root; all by default")
-    add("--out", type=path, help="folder for evaluation.csv and evaluation.md, and a cache of the optical flow")
-    add("--camera", help="folder of the images; the first that has any by default")
-    add("--size", nargs=2, type=int, metavar=("H", "W"), help="to scale images to; that of the training by default")
-    add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m")
-    add("--pitch", type=float, default=0.0, help="how far the camera looks up, rad")
-    add("--missing", type=float, default=0.0, help="share of the frames to lose")
-    add("--draws", type=whole(1), default=8, help="of the filter's noise, over which errors are averaged")
-    add("--window", type=whole(1), default=100, help="steps of the end point errors")
-    add("--seed", type=whole(0), default=0, help="of the noise")
-    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
+__all__ = ["Evaluate"]
 
 
-def _run(args: argparse.Namespace) -> None:
-    import cv2
-    import torch
+@dataclass
+class Evaluate(Command):
+    """Errors of a trained car filter on drives with known poses, beside dead reckoning on the same readings."""
 
-    from torch_denkf.applications.car.commands._car import load_car
-    from torch_denkf.applications.car.kitti.drive import list_kitti_drives
-    from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
+    root: Path  # folder in KITTI's layout, with sequences/ and poses/
+    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    drives: tuple[str, ...] = ()  # names below --root; all by default
+    out: Path | None = None  # folder for evaluation.csv and evaluation.md, and a cache of the optical flow
+    camera: str | None = None  # folder of the images; the first that has any by default
+    size: tuple[int, int] | None = None  # (height, width) to scale images to; that of the training by default
+    height: float = KITTI_HEIGHT  # of the camera over the road, m
+    pitch: float = 0.0  # how far the camera looks up, rad
+    missing: float = 0.0  # share of the frames to lose
+    draws: int = 8  # of the filter's noise, over which errors are averaged
+    window: int = 100  # steps of the end point errors
+    seed: int = 0  # of the noise
+    threads: int = 1  # of torch and OpenCV
 
-    torch.set_num_threads(args.threads)
-    cv2.setNumThreads(args.threads)
-    car = load_car(args.checkpoint)
-    drives = args.drives or list_kitti_drives(args.root)
-    if not drives:
-        lacking = ", ".join(sorted(f"poses/{folder.name}.txt" for folder in (args.root / "sequences").glob("*/")))
-        raise FileNotFoundError(
-            f"no drive below --root {args.root} has both images and poses; expected images in sequences/NAME/image_2 "
-            f"and {lacking or 'poses/NAME.txt'}"
-        )
-    with nullcontext() if args.out is None else alone_in(args.out):
-        rows, _ = evaluate_car_filter(
-            car,
-            args.root,
-            drives,
-            cache=True if args.out is None else args.out / "cache",
-            camera=args.camera,
-            size=None if args.size is None else tuple(args.size),
-            height=args.height,
-            pitch=args.pitch,
-            missing=args.missing,
-            draws=args.draws,
-            window=args.window,
-            seed=args.seed,
-        )
-        table = markdown_table(rows)
-        say(table)
-        if args.out is not None:
-            write_rows(rows, args.out / "evaluation.csv")
-            write_text(args.out / "evaluation.md", f"`{args.command_line}`\n\n{table}")
-            say(f"{args.out / 'evaluation.csv'}, {args.out / 'evaluation.md'}")
+    name, resumable = "evaluate", True
+    example = "denkf evaluate --checkpoint runs/car --root KITTI --drives 09 10 --out runs/car/evaluation"
 
+    def run(self) -> None:
+        """Evaluates, and writes what was found."""
+        from torch_denkf.applications.car.commands._car import load_car, set_threads
+        from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+        from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
 
-main = Command(
-    "evaluate",
-    "Errors of a trained car filter on drives with known poses, beside dead reckoning on the same readings.",
-    "denkf evaluate --checkpoint runs/car --root KITTI --drives 09 10 --out runs/car/evaluation",
-    _arguments,
-    _run,
-    resumable=True,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        set_threads(self.threads)
+        check_count("--seed", self.seed, least=0)
+        car = load_car(self.checkpoint)
+        drives = self.drives or list_kitti_drives(self.root)
+        if not drives:
+            lacking = ", ".join(sorted(f"poses/{folder.name}.txt" for folder in (self.root / "sequences").glob("*/")))
+            raise FileNotFoundError(
+                f"no drive below --root {self.root} has both images and poses; expected images in "
+                f"sequences/NAME/image_2 and {lacking or 'poses/NAME.txt'}"
+            )
+        with nullcontext() if self.out is None else alone_in(self.out):
+            rows, _ = evaluate_car_filter(
+                car,
+                self.root,
+                drives,
+                cache=True if self.out is None else self.out / "cache",
+                camera=self.camera,
+                size=self.size,
+                height=self.height,
+                pitch=self.pitch,
+                missing=self.missing,
+                draws=self.draws,
+                window=self.window,
+                seed=self.seed,
+            )
+            table = markdown_table(rows)
+            say(table)
+            if self.out is not None:
+                write_rows(rows, self.out / "evaluation.csv")
+                write_text(self.out / "evaluation.md", f"`{self.command_line}`\n\n{table}")
+                say(f"{self.out / 'evaluation.csv'}, {self.out / 'evaluation.md'}")

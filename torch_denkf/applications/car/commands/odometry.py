@@ -13,89 +13,85 @@ work.
 
 from __future__ import annotations
 
-import argparse
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
+from tyro.conf import Positional
+
+from torch_denkf._checks import check_count
 from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, filled, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, say
 
-__all__ = ["main"]
+__all__ = ["Odometry"]
 
 #: Share of the usual time between frames by which one may be off; containers round to milliseconds.
 _UNEVEN = 0.2
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("frames", type=path, metavar="FRAMES_OR_VIDEO", help="folder of images, in the order of names; or a video")
-    add(
-        "--calibration",
-        required=True,
-        type=path,
-        metavar="FILE",
-        help="KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels",
-    )
-    add(
-        "--checkpoint",
-        type=filled,
-        default="car-odometry",
-        help="that of the library, or a folder that denkf train left",
-    )
-    add("--out", required=True, type=path, help="folder for path.csv, trajectory files and pictures")
-    add("--camera", metavar="NAME", help="of calib.txt; the name of the folder, where that is image_0 to image_3")
-    add("--fps", type=float, help="frames in a second; by default that of a video, or the times of its frames")
-    add("--times", type=path, metavar="FILE", help="a time in s for each frame, a row each")
-    add("--height", type=float, default=KITTI_HEIGHT, help="of the camera over the road, m: it scales the path")
-    add("--pitch", type=float, default=0.0, help="how far the camera looks up from the road, rad")
-    add("--seed", type=whole(0), default=0, help="of the filter's noise")
-    add("--black-level", type=int, help="frames none of whose pixels is brighter, of 255, count as missing")
-    add("--no-pictures", action="store_true", help="leave the pictures out")
-    add("--threads", type=whole(1), default=1, help="of torch and OpenCV")
+@dataclass
+class Odometry(Command):
+    """The path of a car, with its uncertainty, from the images of one camera whose calibration and height are known."""
 
+    frames: Positional[Path]  # folder of images, in the order of names; or a video
+    calibration: Path  # KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels
+    out: Path  # folder for path.csv, trajectory files and pictures
+    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    camera: str | None = None  # of calib.txt; the name of the folder, where that is image_0 to image_3
+    fps: float | None = None  # frames in a second; by default that of a video, or the times of its frames
+    times: Path | None = None  # file with a time in s for each frame, a row each
+    height: float = KITTI_HEIGHT  # of the camera over the road, m: it scales the path
+    pitch: float = 0.0  # how far the camera looks up from the road, rad
+    seed: int = 0  # of the filter's noise
+    black_level: int | None = None  # frames none of whose pixels is brighter, of 255, count as missing
+    pictures: bool = True  # leave the pictures out
+    threads: int = 1  # of torch and OpenCV
 
-def _run(args: argparse.Namespace) -> None:
-    if args.fps is not None and args.times is not None:
-        raise ValueError("pass --fps or --times, not both")
-    given = {"frames": args.frames, "calibration": args.calibration, "times": args.times}
-    missing = [f"{name} {path}" for name, path in given.items() if path is not None and not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"there is no such file or folder: {', '.join(missing)}")
-    import cv2
-    import torch
+    name = "odometry"
+    example = "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive"
 
-    from torch_denkf.applications.car.commands._car import load_car
-    from torch_denkf.applications.car.odometry.images import read_camera, read_frames
-    from torch_denkf.applications.car.odometry.tracking import track
+    def run(self) -> None:
+        """Reads what is given, tracks, and writes the path as it comes."""
+        if self.fps is not None and self.times is not None:
+            raise ValueError("pass --fps or --times, not both")
+        given = {"frames": self.frames, "calibration": self.calibration, "times": self.times}
+        missing = [f"{name} {path}" for name, path in given.items() if path is not None and not path.exists()]
+        if missing:
+            raise FileNotFoundError(f"there is no such file or folder: {', '.join(missing)}")
+        check_count("--seed", self.seed, least=0)
+        from torch_denkf.applications.car.commands._car import load_car, set_threads
+        from torch_denkf.applications.car.odometry.images import read_camera, read_frames
+        from torch_denkf.applications.car.odometry.tracking import track
 
-    torch.set_num_threads(args.threads)
-    cv2.setNumThreads(args.threads)
-    source = read_frames(args.frames)
-    folder = args.frames.name if args.frames.name in {f"image_{n}" for n in range(4)} else None
-    calibration = read_camera(args.calibration, args.camera or folder)
-    times, fps = _times(args.times, source), source.fps if args.fps is None else args.fps
-    if times is None and args.fps is None:
-        times = _uneven(source)
-    if times is None and fps is None:
-        raise ValueError(f"{args.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE")
-    beliefs = track(
-        load_car(args.checkpoint),
-        _counted(source),
-        calibration,
-        times=times,
-        fps=None if times is not None else fps,
-        height=args.height,
-        pitch=args.pitch,
-        black_level=args.black_level,
-        seed=args.seed,
-    )
-    with alone_in(args.out):
-        _leave(beliefs, args.out, pictures=not args.no_pictures)
+        set_threads(self.threads)
+        source = read_frames(self.frames)
+        folder = self.frames.name if self.frames.name in {f"image_{n}" for n in range(4)} else None
+        calibration = read_camera(self.calibration, self.camera or folder)
+        times, fps = _times(self.times, source), source.fps if self.fps is None else self.fps
+        if times is None and self.fps is None:
+            times = _uneven(source)
+        if times is None and fps is None:
+            raise ValueError(
+                f"{self.frames} does not say when its frames were taken; pass --fps NUMBER or --times FILE"
+            )
+        beliefs = track(
+            load_car(self.checkpoint),
+            _counted(source),
+            calibration,
+            times=times,
+            fps=None if times is not None else fps,
+            height=self.height,
+            pitch=self.pitch,
+            black_level=self.black_level,
+            seed=self.seed,
+        )
+        with alone_in(self.out):
+            _leave(beliefs, self.out, pictures=self.pictures)
 
 
 def _leave(beliefs, out: Path, *, pictures: bool) -> None:
@@ -167,15 +163,3 @@ def _counted(source):
         for frame in source:
             yield frame
             bar.update()
-
-
-main = Command(
-    "odometry",
-    "The path of a car, with its uncertainty, from the images of one camera whose calibration and height are known.",
-    "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive",
-    _arguments,
-    _run,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

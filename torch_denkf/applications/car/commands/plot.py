@@ -10,18 +10,37 @@ See :mod:`torch_denkf.plots`, which draws.
 
 from __future__ import annotations
 
-import argparse
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tyro.conf import Positional
+
 from torch_denkf._files import replacing
-from torch_denkf.cli._command import Command, path, say
+from torch_denkf.cli._command import Command, say
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw", "main"]
+__all__ = ["Plot", "draw"]
+
+
+@dataclass
+class Plot(Command):
+    """Draw the path that denkf odometry found, with ellipses, and its velocities, with bands."""
+
+    path: Positional[Path]  # folder or CSV file that denkf odometry left
+    out: Path | None = None  # folder for path.png and bands.png; that of the path by default
+    level: float = 0.9  # probability of the bands and ellipses
+
+    name, example = "plot", "denkf plot runs/drive"
+
+    def run(self) -> None:
+        """Draws."""
+        file = self.path / "path.csv" if self.path.is_dir() else self.path
+        for written in draw(file, self.out or file.parent, self.level):
+            say(str(written))
 
 
 def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
@@ -57,28 +76,3 @@ def _save(axes: Axes, file: Path) -> None:
     assert figure is not None
     with replacing(file) as beside:
         figure.savefig(beside, dpi=120)
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("path", type=path, metavar="FOLDER_OR_CSV", help="that denkf odometry left")
-    add("--out", type=path, help="folder for path.png and bands.png; that of the path by default")
-    add("--level", type=float, default=0.9, help="probability of the bands and ellipses")
-
-
-def _run(args: argparse.Namespace) -> None:
-    file = args.path / "path.csv" if args.path.is_dir() else args.path
-    for written in draw(file, args.out or file.parent, args.level):
-        say(str(written))
-
-
-main = Command(
-    "plot",
-    "Draw the path that denkf odometry found, with ellipses, and its velocities, with bands.",
-    "denkf plot runs/drive",
-    _arguments,
-    _run,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -10,84 +10,76 @@ See :func:`torch_denkf.applications.car.odometry.training.train_car_filter`, whi
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
+from pathlib import Path
 
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.cli._command import Command, alone_in, path, say, whole
+from torch_denkf.cli._command import Command, alone_in, say
 
-__all__ = ["main"]
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--out", required=True, type=path, help="folder of the filter, with everything that its training needs")
-    add("--root", type=path, help="folder of recorded drives in KITTI's layout, with sequences/ and poses/")
-    add("--drives", nargs="+", metavar="NAME", help="drives below --root to learn from; all by default")
-    add("--test", nargs="+", default=[], metavar="NAME", help="drives below --root that must not be seen")
-    add("--rendered", type=int, default=0, metavar="N", help="drives to render and learn from, too")
-    add("--frames", type=int, default=160, help="of a rendered drive")
-    add("--size", nargs=2, type=int, default=(100, 300), metavar=("H", "W"), help="that images are scaled to")
-    add("--height", type=float, default=KITTI_HEIGHT, help="of the recording camera over the road, m")
-    add("--sensor-updates", type=int, default=3000, help="training steps of the sensor alone")
-    add("--filter-updates", type=int, default=300, help="of the filter on its readings")
-    add("--end-to-end-updates", type=int, default=40, help="of both together")
-    add("--length", type=int, default=24, help="steps of the windows that the filter learns from")
-    add("--seed", type=whole(0), default=0, help="of all random numbers")
-    add("--device", default="cpu", help="that the networks run on")
-    add("--threads", type=whole(1), default=1, help="of torch and OpenCV; the networks are small")
-    add("--processes", type=int, default=1, help="that render at a time")
+__all__ = ["Train"]
 
 
-def _run(args: argparse.Namespace) -> None:
-    if args.root is None and args.rendered < 3:
-        raise ValueError("nothing to learn from: pass --root FOLDER, or --rendered N with three drives or more")
-    import cv2
-    import torch
+@dataclass
+class Train(Command):
+    """Train a car's filter on recorded drives, rendered ones, or both; a repeated command goes on where it stopped."""
 
-    from torch_denkf.applications.car.odometry.checkpoint import read_config
-    from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
+    out: Path  # folder of the filter, with everything that its training needs
+    root: Path | None = None  # folder of recorded drives in KITTI's layout, with sequences/ and poses/
+    drives: tuple[str, ...] = ()  # names below --root to learn from; all by default
+    test: tuple[str, ...] = ()  # names of drives below --root that must not be seen
+    rendered: int = 0  # drives to render and learn from, too
+    frames: int = 160  # of a rendered drive
+    size: tuple[int, int] = (100, 300)  # (height, width) that images are scaled to
+    height: float = KITTI_HEIGHT  # of the recording camera over the road, m
+    sensor_updates: int = 3000  # training steps of the sensor alone
+    filter_updates: int = 300  # of the filter on its readings
+    end_to_end_updates: int = 40  # of both together
+    length: int = 24  # steps of the windows that the filter learns from
+    seed: int = 0  # of all random numbers
+    device: str = "cpu"  # that the networks run on
+    threads: int = 1  # of torch and OpenCV; the networks are small
+    processes: int = 1  # that render at a time
 
-    try:
-        torch.empty(0, device=args.device)
-    except (AssertionError, RuntimeError) as error:
-        raise ValueError(f"--device {args.device} cannot be used here: {str(error).splitlines()[0]}") from error
-    torch.set_num_threads(args.threads)
-    cv2.setNumThreads(args.threads)
-    with alone_in(args.out):
-        train_car_filter(
-            args.out,
-            root=args.root,
-            drives=args.drives,
-            leave_out=args.test,
-            rendered=args.rendered,
-            frames=args.frames,
-            size=tuple(args.size),
-            height=args.height,
-            updates=Updates(args.sensor_updates, args.filter_updates, args.end_to_end_updates, args.length),
-            seed=args.seed,
-            device=args.device,
-            processes=args.processes,
-            command=args.command_line,
+    name, resumable = "train", True
+    example = "denkf train --rendered 20 --out runs/car"
+
+    def run(self) -> None:
+        """Trains, and says how good the filter is."""
+        if self.root is None and self.rendered < 3:
+            raise ValueError("nothing to learn from: pass --root FOLDER, or --rendered N with three drives or more")
+        import torch
+
+        from torch_denkf.applications.car.commands._car import set_threads
+        from torch_denkf.applications.car.odometry.checkpoint import read_config
+        from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
+
+        try:
+            torch.empty(0, device=self.device)
+        except (AssertionError, RuntimeError) as error:
+            raise ValueError(f"--device {self.device} cannot be used here: {str(error).splitlines()[0]}") from error
+        set_threads(self.threads)
+        with alone_in(self.out):
+            train_car_filter(
+                self.out,
+                root=self.root,
+                drives=self.drives,
+                leave_out=self.test,
+                rendered=self.rendered,
+                frames=self.frames,
+                size=self.size,
+                height=self.height,
+                updates=Updates(self.sensor_updates, self.filter_updates, self.end_to_end_updates, self.length),
+                seed=self.seed,
+                device=self.device,
+                processes=self.processes,
+                command=self.command_line,
+            )
+        config = read_config(self.out)
+        training = config["training"]
+        say(f"{self.out}: trained; roles: " + "; ".join(f"{k}: {' '.join(v)}" for k, v in training["roles"].items()))
+        say(
+            f"validation CRPS {training['validation_crps']:.3g} of a good sensor's error, inflation "
+            f"{config['settings']['inflation']:g}"
         )
-    config = read_config(args.out)
-    training = config["training"]
-    say(f"{args.out}: trained; roles: " + "; ".join(f"{k}: {' '.join(v)}" for k, v in training["roles"].items()))
-    say(
-        f"validation CRPS {training['validation_crps']:.3g} of a good sensor's error, inflation "
-        f"{config['settings']['inflation']:g}"
-    )
-    tests = f" --root {args.root} --drives {' '.join(args.test)}" if args.test else " --root KITTI"
-    say(f"next: denkf evaluate --checkpoint {args.out}{tests} --out {args.out}/evaluation")
-
-
-main = Command(
-    "train",
-    "Train a car's filter on recorded drives, rendered ones, or both; a repeated command goes on where it stopped.",
-    "denkf train --rendered 20 --out runs/car",
-    _arguments,
-    _run,
-    resumable=True,
-)
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        tests = f" --root {self.root} --drives {' '.join(self.test)}" if self.test else " --root KITTI"
+        say(f"next: denkf evaluate --checkpoint {self.out}{tests} --out {self.out}/evaluation")

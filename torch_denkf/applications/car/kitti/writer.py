@@ -5,21 +5,17 @@ from __future__ import annotations
 import contextlib
 import json
 import multiprocessing
-import os
 import shutil
-import time
-import uuid
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from torch_denkf._files import clear_errors, sync
-from torch_denkf._lock import remove_locked, take_lock
+from torch_denkf._files import clear_errors, place_beside, sync
 from torch_denkf._workers import follow_parent
 from torch_denkf.applications.car.kitti.files import write_poses
 from torch_denkf.applications.car.street.camera import Camera
@@ -32,8 +28,6 @@ MARKER = "drive.json"
 STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene anew
 REPORTED = 40  # frames after which the only process says how far it is
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
-LOCK = ".writing"  # in a half drive: its process holds the lock
-ABANDONED = 600.0  # s without a new image, after which a half drive without a lock is a killed run's
 
 
 @dataclass
@@ -58,10 +52,7 @@ class Job:
     folder: str
     traffic: bool
     options: dict
-    beside: Path = field(init=False)
-
-    def __post_init__(self):
-        self.beside = self.root / f".{self.name}-{uuid.uuid4().hex[:8]}"
+    beside: Path = Path()
 
     @property
     def target(self) -> Path:
@@ -134,7 +125,6 @@ class Job:
         if self.target.exists():
             shutil.rmtree(self.target)
         beside.rename(self.target)
-        (self.target / LOCK).unlink(missing_ok=True)
         sync(self.target.parent)
 
 
@@ -151,17 +141,20 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
     """
     if not jobs:
         return
-    root, held = jobs[0].root, []
-    try:
-        for folder in (root / "sequences", root / "poses"):
-            folder.mkdir(parents=True, exist_ok=True)
-        for job in jobs:
-            _sweep(root, job.name)
-            job.beside.mkdir()
-            with contextlib.suppress(OSError):  # a file system without locks
-                held.append(take_lock(job.beside / LOCK))
-    except OSError as error:
-        raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
+    root = jobs[0].root
+    with contextlib.ExitStack() as places:
+        try:
+            for folder in (root / "sequences", root / "poses"):
+                folder.mkdir(parents=True, exist_ok=True)
+            for job in jobs:
+                job.beside = places.enter_context(place_beside(root / job.name))
+                job.beside.mkdir()
+        except OSError as error:
+            raise OSError(f"cannot write to {root} ({error}); choose another folder") from error
+        _write(jobs, processes, progress)
+
+
+def _write(jobs: list[Job], processes: int, progress: Callable[[int], object] | None) -> None:
     stretch = min(STRETCH, REPORTED) if processes == 1 else STRETCH
     tasks = [
         (job, start, min(start + stretch, len(job.poses)))
@@ -196,11 +189,6 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
                 raise
     finally:
         _last.clear()
-        for job in jobs:
-            remove_locked(job.beside, LOCK)
-        for lock in held:
-            if lock is not None:
-                os.close(lock)
 
 
 _last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
@@ -216,22 +204,3 @@ def _draw(job: Job, start: int, stop: int) -> None:
         _last.clear()
         _last[job.beside] = job.renderer()
     job.draw(_last[job.beside], start, stop)
-
-
-def _sweep(root: Path, name: str) -> None:
-    """Remove what killed runs left of a drive."""
-    for folder in root.glob(f".{name}-????????"):
-        with contextlib.suppress(OSError):
-            folder.rmdir()  # an empty one: its process was killed at the first or at the last moment
-            continue
-        lock = folder / LOCK
-        if lock.exists():
-            with contextlib.suppress(OSError):
-                held = take_lock(lock, create=False)
-                if held is not None:  # its process is gone
-                    remove_locked(folder, LOCK)
-                    os.close(held)
-            continue
-        newest = max(path.stat().st_mtime for path in (folder, *folder.glob("image_?")))
-        if time.time() - newest > ABANDONED:
-            shutil.rmtree(folder, ignore_errors=True)

@@ -2,48 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
 import json
+from dataclasses import dataclass
+from pathlib import Path
 
-import torch
+from torch_denkf._checks import check_count
+from torch_denkf.cli._command import Command, say
 
-from torch_denkf.cli._command import Command, path, say, whole
-from torch_denkf.pretrained import from_pretrained
-
-__all__ = ["main"]
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=path, required=True, help="folder of the filter, with all its training needs")
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers")
-    parser.add_argument("--threads", type=whole(1), default=1, help="of torch")
-    parser.add_argument("--evaluate", action="store_true", help="test the library's filter and train none")
+__all__ = ["TrainUR5"]
 
 
-def _run(args: argparse.Namespace) -> None:
-    from torch_denkf.applications.ur5.train import evaluate_ur5_table, train_ur5_table, whole_demos
+@dataclass
+class TrainUR5(Command):
+    """Trains the UR5 table's filter, or tests the one that comes with the library."""
 
-    torch.set_num_threads(args.threads)
-    if args.evaluate:
-        model = from_pretrained("ur5-table")
-    else:
-        model = train_ur5_table(args.out, seed=args.seed, command=args.command_line)
-    demos = whole_demos(args.out)
-    scores = {
-        f"{share:.0%} of the frames missing": evaluate_ur5_table(model, demos, missing=share, cache=args.out / "cache")
-        for share in (0.0, 0.3)
-    }
-    say(json.dumps(scores, indent=1))
+    out: Path  # folder of the filter, with all its training needs
+    seed: int = 0  # of all random numbers
+    threads: int = 1  # of torch
+    evaluate: bool = False  # test the library's filter and train none
 
+    name, example, resumable = "train-ur5", "denkf train-ur5 --out runs/ur5-table", True
 
-main = Command(
-    "train-ur5",
-    "Trains the UR5 table's filter, or tests the one that comes with the library.",
-    "denkf train-ur5 --out runs/ur5-table",
-    _arguments,
-    _run,
-    resumable=True,
-)
+    def run(self) -> None:
+        """Trains, and tests with all frames and with fewer."""
+        import torch
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+        from torch_denkf.applications.ur5.train import evaluate_ur5_table, train_ur5_table, whole_demos
+        from torch_denkf.pretrained import from_pretrained
+
+        check_count("--threads", self.threads)
+        torch.set_num_threads(self.threads)
+        if self.evaluate:
+            model = from_pretrained("ur5-table")
+        else:
+            model = train_ur5_table(self.out, seed=self.seed, command=self.command_line)
+        demos, cache = whole_demos(self.out), self.out / "cache"
+        scores = {
+            f"{share:.0%} of the frames missing": evaluate_ur5_table(model, demos, missing=share, cache=cache)
+            for share in (0.0, 0.3)
+        }
+        say(json.dumps(scores, indent=1))

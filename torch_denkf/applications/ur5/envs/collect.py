@@ -107,9 +107,6 @@ def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[
         text = ", ".join(f"{key} {theirs.get(key)!r} instead of {ours.get(key)!r}" for key in keys)
         raise ValueError(f"{root} holds another collection, with {text}; pass its options or choose another folder")
     files.write_options(root, ours)
-    for pattern in (".demo*-????????", f".{COLLECTION}-????????"):  # what a killed run left
-        for left in root.glob(pattern):
-            left.unlink(missing_ok=True)
     for number, entry in list(entries.items()):
         wrong = files.what_is_wrong(root, entry)
         if wrong is not None:
