@@ -192,7 +192,7 @@ def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None
 
     Args:
         times: see :func:`last_reading`.
-        rows: likewise.
+        rows: times of the rows, in s, ``[n]``, rising.
         tolerance: s; a reading farther away is none. By default half the usual time between two rows.
 
     Returns:
@@ -222,7 +222,7 @@ def interpolate(
     Args:
         times: see :func:`last_reading`.
         values: of the readings, ``[m, C]``.
-        rows: likewise.
+        rows: times of the rows, in s, ``[n]``, rising.
         tolerance: s; between readings that are farther apart there is no value.
 
     Returns:

@@ -21,7 +21,7 @@ def joint_forecast(
         cov: of the forecast, ``[*B, S, S]``.
         cross: covariance of the last state, in rows, and the forecast, ``[*B, S, S]``.
         joint_mean: of the L + 1 states before, the latest first, ``[*B, (L + 1) S]``.
-        joint_cov: likewise, ``[*B, (L + 1) S, (L + 1) S]``.
+        joint_cov: their covariance, ``[*B, (L + 1) S, (L + 1) S]``.
         unmoved: boolean, ``[*B, 1]``: where the forecast is the last state itself. ``None``: nowhere.
 
     Returns:

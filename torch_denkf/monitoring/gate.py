@@ -82,7 +82,7 @@ class GatedAnalysis(AnalysisAround):
     (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
     (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
     (key, ``nis``)            ``[1]``      of the reading as it came, for an :class:`InnovationMonitor`
-    (key, ``innovation``)     ``[O]``      likewise
+    (key, ``innovation``)     ``[O]``      its innovation
     (key, ``part_nis``)       ``[K]``      of each component by itself
     ========================= ============ ============================================================================
 
@@ -96,15 +96,7 @@ class GatedAnalysis(AnalysisAround):
             :class:`EKFAnalysis` or :class:`UKFAnalysis`; or a :class:`LaggedAnalysis`, whose past a reading then
             corrects as far as it is believed. Its keys and its noise are kept.
         observation_dim: O, components of the reading.
-        response: see :class:`GateOptions`, like all that follows.
-        window: likewise.
-        rate: likewise.
-        freedom: likewise.
-        patience: likewise.
-        by_component: likewise.
-        adapt_noise: likewise.
-        adapt_inflation: likewise.
-        gate_prefix: likewise.
+        **options: see :class:`GateOptions`.
 
     Raises:
         TypeError: for another analysis, whose variances and forecast are not known.

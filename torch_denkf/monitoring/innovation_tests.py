@@ -43,7 +43,7 @@ def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
     Args:
         value: any shape ``[*]``.
         knots: rising, ``[N]`` with N >= 2; or ``[K, N]``, those of each component of ``value`` ``[*, K]``.
-        heights: at the knots, likewise.
+        heights: of the function at the knots, of the same shape.
 
     Example:
         >>> interpolate(torch.tensor([1.0, 8.0, 16.0]), torch.tensor([0.0, 2.0, 8.0]), torch.tensor([0.0, 1.0, 4.0]))

@@ -83,7 +83,7 @@ class Processes:
 
         Args:
             parameters: the trained ones, in the same order everywhere.
-            values: ``[K]``, averaged likewise.
+            values: ``[K]``, averaged over the processes, too.
 
         Returns:
             the averaged values, ``[K]``.

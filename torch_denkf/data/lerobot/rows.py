@@ -56,7 +56,8 @@ def recording_from_rows(
         pixels_key: images, ``[N, 3, H, W]`` or ``[N, H, W, 3]``, uint8, or floating in [0, 1]; or a tensordict with one
             camera.
         state_key: numbers of the state, ``[N, S]`` or ``[N]``; a list of keys puts them one behind the other.
-        action_key: likewise; None for none, as are rows without an ``"action"``.
+        action_key: numbers of the action, ``[N, A]`` or ``[N]``, or a list of keys. None for none, as are rows without
+            an ``"action"``.
         episode_key: a number for each row, the same in all rows of an episode and in no others.
         size: (H, W) to scale the images to. None keeps their size: uint8 images of a tensordict are then not copied,
             and stay memory-mapped if they are.

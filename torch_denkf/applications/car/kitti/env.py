@@ -30,7 +30,7 @@ class KITTIReplayEnv(RowsEnv):
     ``pixels``   ``[*B,2C,H,W]``  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour;
                                   where the drive has images
     ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.applications.car.with_motion`
-    ``road``     ``[*B,p,s]``     float32, likewise
+    ``road``     ``[*B,p,s]``     float32, where the drive has it
     ``observed`` ``[*B,1]``       bool: frames t and t-1 are both there; what is missing is zero in the pixels
     ``steps``    ``[*B,1]``       int64, where the drive has it: see :func:`torch_denkf.applications.car.bridge_gaps`
     ``state``    ``[*B,5]``       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)

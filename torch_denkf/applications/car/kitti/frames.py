@@ -25,8 +25,8 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     ``pixels``   ``[*B,2C,H,W]``  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1];
                                   where the drive has ``image``
     ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.applications.car.with_motion`
-    ``road``     ``[*B,p,s]``     float32, likewise
-    ``two_view`` ``[*B,8]``       float32, likewise
+    ``road``     ``[*B,p,s]``     float32, where the drive has it
+    ``two_view`` ``[*B,8]``       float32, where the drive has it
     ``state``    ``[*B,5]``       float32, see :func:`torch_denkf.applications.car.read_kitti_drive`
     ``observed`` ``[*B,1]``       bool: both frames are there, so that the difference means something
     ``steps``    ``[*B,1]``       int64, where the drive has it: steps between the two frames, which then need not be

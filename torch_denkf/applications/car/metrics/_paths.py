@@ -27,7 +27,7 @@ def relative_pose_error(start: Tensor, end: Tensor, true_start: Tensor, true_end
 
     Args:
         start: estimated poses (x m, y m, θ rad) where the motions begin, ``[*B, 3]``.
-        end: estimated poses where they end; likewise the true ones.
+        end: estimated poses where they end, ``[*B, 3]``.
         true_start: see ``start``.
         true_end: see ``end``.
 

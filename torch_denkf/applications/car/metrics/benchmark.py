@@ -18,7 +18,7 @@ class WindowErrors(NamedTuple):
 
     Attributes:
         translation: mean over the windows' lengths, in m/m, ``[*B]``.
-        rotation: likewise, in deg/m, ``[*B]``.
+        rotation: mean over the windows' lengths, in deg/m, ``[*B]``.
         window_translation: that of each length, in m/m, ``[*B, W]``.
         window_rotation: that of each length, in deg/m, ``[*B, W]``.
         windows: the lengths, in steps.

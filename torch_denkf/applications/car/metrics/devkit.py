@@ -18,9 +18,9 @@ class DevkitError(NamedTuple):
 
     Attributes:
         translation: t_rel, mean over all segments of all lengths, in %, ``[*B]``.
-        rotation: r_rel, likewise, in deg/m, ``[*B]``.
+        rotation: r_rel, mean over the same segments, in deg/m, ``[*B]``.
         length_translation: mean over the segments of each length, in %, ``[*B, L]``; NaN where none fits.
-        length_rotation: likewise, in deg/m, ``[*B, L]``.
+        length_rotation: mean over the segments of each length, in deg/m, ``[*B, L]``.
         segments: how many segments of each length there are, ``[*B, L]``, int64.
     """
 

@@ -69,12 +69,13 @@ def evaluate_car_filter(
                                  ``"floor"`` (the true velocities, integrated)
     ``frames``, ``window``       of the drive; steps of the end point errors
     ``translation_m_per_m``      end point error, see :func:`torch_denkf.applications.car.kitti_endpoint_error`
-    ``rotation_deg_per_m``       likewise
-    ``devkit_t_rel_percent``     of the planar path, see :func:`torch_denkf.applications.car.kitti_devkit_error`; left
-    out below ``devkit_r_rel_deg_per_m``   100 m ``coverage90_v``             share of the true speeds in the filter's
-    90 % intervals ``coverage90_theta_dot``     likewise, turn rates ``blind``                    share of the frames
-    that the sensor could not compare with one before ============================
-    ======================================================================================
+    ``rotation_deg_per_m``       its rotation
+    ``devkit_t_rel_percent``,    of the planar path, see :func:`torch_denkf.applications.car.kitti_devkit_error`; left
+    ``devkit_r_rel_deg_per_m``   out below 100 m
+    ``coverage90_v``,            share of the true speeds, and of the true turn rates, in the filter's 90 % intervals
+    ``coverage90_theta_dot``
+    ``blind``                    share of the frames that the sensor could not compare with one before
+    ============================ ======================================================================================
 
     Args:
         car: the filter.

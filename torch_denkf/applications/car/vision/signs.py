@@ -36,7 +36,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 
     Args:
         previous: grey picture ``[H, W]``, uint8.
-        current: the next one, likewise.
+        current: the next picture ``[H, W]``, uint8.
         noise: grey levels by which a pixel changes though nothing moves. A median over 3 x 3 pixels is taken before.
         cells: across the picture.
 
@@ -87,7 +87,7 @@ def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) 
 
     Args:
         previous: grey picture ``[H, W]``, uint8.
-        current: the next one, likewise.
+        current: the next picture ``[H, W]``, uint8.
         noise: see :func:`static_region`.
 
     Returns:
