@@ -197,7 +197,7 @@ def test_mistakes_are_one_line(kitti, checkpoint, tmp_path, capsys):
         (["--calibration", tmp_path / "none.txt", *times], r"no such file or folder: calibration .*none\.txt"),
         (["--calibration", tmp_path / "notes.txt", *times], "does not say fy, cx, cy"),
         (["--calibration", large, *times], "does not belong to images of 75 x 25 pixels"),
-        (["--height", "165", *times], "height is that of the camera over the road in m"),
+        (["--height", "165", *times], "height must be .* It is that of the camera over the road, in m"),
         (["--fps", "2"], r"frames are 0\.5 s apart, but the filter moves in steps of 0\.103 s"),
         (["--fps", "10", *times], "--fps or --times, not both"),
         (["--times", large], r"large\.txt:1: expected a time in s"),

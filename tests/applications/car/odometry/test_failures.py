@@ -28,7 +28,7 @@ def test_black_frames_are_missing_frames(checkpoint, drive):
         assert torch.equal(one.ensemble, other.ensemble)
     unknown = list(track(car, black, calibration))
     assert all(belief.observed for belief in unknown[1:])
-    with pytest.raises(ValueError, match="grey value from 0 to 255; got 300"):
+    with pytest.raises(ValueError, match="black_level must be finite, at least 0 and at most 255; got 300"):
         track(car, black, calibration, black_level=300)
 
 

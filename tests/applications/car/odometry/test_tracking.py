@@ -137,13 +137,15 @@ def test_bad_input_says_what_to_do(checkpoint, drive):
     for calibration in (good[:3], [0.0, *good[1:]], [float("nan"), *good[1:]]):
         with pytest.raises(ValueError, match=r"calibration is \(fx, fy, cx, cy\)"):
             track(car, images, calibration)
-    with pytest.raises(ValueError, match=r"height is that of the camera over the road in m, 0\.3 to 5; got 165"):
+    with pytest.raises(
+        ValueError, match=r"height must be finite, at least 0\.3 and at most 5; got 165\. It is that of the camera over"
+    ):
         track(car, images, good, height=165)
     with pytest.raises(ValueError, match="pitch"):
         track(car, images, good, pitch=2.0)
     with pytest.raises(ValueError, match="times or fps, not both"):
         track(car, images, good, times=[0.0], fps=10)
-    with pytest.raises(ValueError, match="fps is the number"):
+    with pytest.raises(ValueError, match="fps must be finite and above 0; got 0"):
         track(car, images, good, fps=0)
     with pytest.raises(ValueError, match=r"times must increase; that of frame 2 is 0\.1 s, after 0\.2 s"):
         list(track(car, images, good, times=[0.0, 0.2, 0.1]))
