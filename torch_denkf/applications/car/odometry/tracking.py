@@ -72,7 +72,7 @@ def track(
     that is not one, speeds beyond the sensor's range.
 
     Args:
-        car: the filter, see :func:`torch_denkf.applications.car.odometry.checkpoint.load_car_filter`.
+        car: the filter, see :func:`torch_denkf.pretrained.from_pretrained`.
         frames: rectified images: grey ``[H, W]``, or in colour ``[H, W, 3]`` in OpenCV's order, uint8, all of one size;
             ``None`` for a frame that is missing.
         calibration: focal lengths and principal point (fx, fy, cx, cy) in pixels of the images.
