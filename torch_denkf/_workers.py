@@ -11,19 +11,16 @@ from multiprocessing.connection import wait
 __all__ = ["follow_parent"]
 
 
-def follow_parent(leave_interrupts: bool = True) -> None:
+def follow_parent() -> None:
     """Makes a worker, which was spawned, end when its parent ends, however that ends.
 
-    Workers of a parent that was killed would wait for work for ever. Call it in a pool's initializer.
-
-    Args:
-        leave_interrupts: whether Ctrl-C is the parent's alone, which must then see to it that its workers end.
+    Workers of a parent that was killed would wait for work for ever. Call it in a pool's initializer. Ctrl-C is then
+    the parent's alone, which must see to it that its workers end.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
         return
-    if leave_interrupts:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 

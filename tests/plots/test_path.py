@@ -35,9 +35,9 @@ def test_lines_are_the_paths():
 
 def test_a_cars_path_drives_up():
     run = ensemble_run()
-    drawn = lines(plot_path(run, forward_up=True, factor=100, unit="cm"))
-    np.testing.assert_allclose(drawn["truth"][:, 0], -100 * run["state"][:, 1], rtol=1e-6)
-    np.testing.assert_allclose(drawn["truth"][:, 1], 100 * run["state"][:, 0], rtol=1e-6)
+    drawn = lines(plot_path(run, forward_up=True))
+    np.testing.assert_allclose(drawn["truth"][:, 0], -run["state"][:, 1], rtol=1e-6)
+    np.testing.assert_allclose(drawn["truth"][:, 1], run["state"][:, 0], rtol=1e-6)
     axes = plot_path(run, forward_up=True, unit="cm")
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("right, cm", "forward, cm")
 
@@ -47,8 +47,8 @@ def test_ellipses_hold_their_share_of_the_belief(forward_up):
     cov = torch.tensor([[4.0, 1.5], [1.5, 1.0]], dtype=torch.float64).expand(3, 2, 2)
     mean = torch.tensor([[5.0, -2.0]], dtype=torch.float64).expand(3, 2)
     belief = TensorDict({"mean": mean, "cov": cov}, [3])
-    axes = plot_path(belief, forward_up=forward_up, ellipses=2, level=0.8)
-    assert [patch.get_gid() for patch in axes.patches] == ["step 0", "step 2"]
+    axes = plot_path(belief, forward_up=forward_up, level=0.8)
+    assert [patch.get_gid() for patch in axes.patches] == ["step 0", "step 1", "step 2"]
     rng = torch.Generator().manual_seed(0)
     draws = mean[0] + torch.randn(50_000, 2, generator=rng, dtype=torch.float64) @ torch.linalg.cholesky(cov[0]).T
     if forward_up:
@@ -63,10 +63,11 @@ def test_ellipses_hold_their_share_of_the_belief(forward_up):
 
 def test_ellipses_of_a_kalman_filter_and_of_a_variance():
     run = kalman_runs()[0]
-    axes = plot_path(run, ellipses=5)
-    assert [patch.get_gid() for patch in axes.patches] == ["step 0", "step 20", "step 40", "step 59", "step 79"]
+    axes = plot_path(run)
+    steps = [0, 7, 14, 22, 29, 36, 43, 50, 57, 65, 72, 79]
+    assert [patch.get_gid() for patch in axes.patches] == [f"step {step}" for step in steps]
     reach = math.sqrt(-2 * math.log(0.1))
-    for patch, step in zip(axes.patches, (0, 20, 40, 59, 79), strict=True):
+    for patch, step in zip(axes.patches, steps, strict=True):
         np.testing.assert_allclose(patch.center, run["belief", "mean"][step, :2], rtol=1e-6)
         squares = np.linalg.eigvalsh(run["belief", "cov"][step, :2, :2].double())
         np.testing.assert_allclose([patch.height, patch.width], 2 * reach * np.sqrt(squares), rtol=1e-5)
@@ -86,7 +87,7 @@ def test_particles_are_summed_up_with_their_weights():
 
 def test_ellipses_of_an_ensemble_are_those_of_its_covariance():
     run = ensemble_run()
-    for patch in plot_path(run, spread="ellipses", ellipses=3).patches:
+    for patch in plot_path(run, spread="ellipses").patches:
         step = int(patch.get_gid().removeprefix("step "))
         squares = np.linalg.eigvalsh(np.cov(run["belief", "ensemble"][step, :, :2].double().numpy().T))
         wanted = 2 * math.sqrt(-2 * math.log(0.1)) * np.sqrt(squares)

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_count
 from torch_denkf.data.episodes import Split
 from torch_denkf.data.slices import choose_sampler
 
-__all__ = ["ReplayOptions", "check_options", "sampler_of"]
+__all__ = ["ReplayOptions", "check_options"]
 
 
 class ReplayOptions(TypedDict, total=False):
@@ -61,15 +61,4 @@ def check_options(options: Mapping[str, Any]) -> None:
             "split='validation' is empty without a validation_share; pass validation_share=0.1, and the same to the "
             "data set with split='train', which then leaves these episodes out"
         )
-    sampler_of(options)
-
-
-def sampler_of(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    """The sampler and the batch size that the options ask for, see :func:`torch_denkf.data.slices.choose_sampler`."""
-    return choose_sampler(
-        options.get("sampler"),
-        options.get("num_slices"),
-        options.get("slice_len"),
-        options.get("batch_size"),
-        options.get("strict_length", True),
-    )
+    choose_sampler(options)

@@ -51,21 +51,24 @@ def text_of_size(size: Sequence[int]) -> str:
 
 
 def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """``[H, W, 3]`` to ``[3, *size]``: averaged over areas where it shrinks."""
+    """``[H, W, 3]`` or grey ``[H, W]`` to ``[C, *size]``: averaged over areas where it shrinks."""
     if image.shape[:2] != size:
         shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
         image = np.ascontiguousarray(image)
         image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return image.transpose(2, 0, 1)
+    return np.atleast_3d(image).transpose(2, 0, 1)
 
 
-def decode_picture(data: bytes) -> np.ndarray | None:
-    """The bytes of a PNG, a JPEG or another file that OpenCV knows, as RGB ``[H, W, 3]``; None if they are damaged."""
+def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
+    """The bytes of a PNG, a JPEG or another file that OpenCV knows, as RGB ``[H, W, 3]``; None if they are damaged.
+
+    By OpenCV's ``flags`` it may be grey, ``[H, W]``.
+    """
     # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
     ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
     complete = next((end in data[-64:] for begin, end in ends.items() if data.startswith(begin)), bool(data))
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if complete and not is_bomb(data) else None
-    return None if pixels is None else pixels[..., ::-1]
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete and not is_bomb(data) else None
+    return pixels if pixels is None or pixels.ndim == 2 else pixels[..., ::-1]
 
 
 def is_bomb(data: bytes) -> bool:

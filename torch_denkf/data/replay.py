@@ -17,8 +17,8 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.envs.transforms import Transform
 
 from torch_denkf.data.episodes import ROW, Episode, check_rows, roles_of, rows_of, select_episodes
-from torch_denkf.data.options import ReplayOptions, check_options, sampler_of
-from torch_denkf.data.slices import refuse_short_episodes, slices_of
+from torch_denkf.data.options import ReplayOptions, check_options
+from torch_denkf.data.slices import choose_sampler, refuse_short_episodes, slices_of
 from torch_denkf.data.statistics import mean_and_std
 
 __all__ = ["EpisodeReplay"]
@@ -126,7 +126,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         **options: Unpack[ReplayOptions],
     ):
         check_options(options)
-        sampler, batch_size = sampler_of(options)
+        sampler, batch_size = choose_sampler(options)
         self.sequential = single is None
         if not self.sequential and isinstance(sampler, SliceSampler):
             raise ValueError("slices are cut out of whole sequences, but this data set offers single rows alone")

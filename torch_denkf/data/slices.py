@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,19 +15,19 @@ from torch_denkf.data.episodes import Episode
 __all__ = ["Slices", "choose_sampler", "refuse_short_episodes", "slices_of"]
 
 
-def choose_sampler(
-    sampler: Sampler | None, num_slices: int | None, slice_len: int | None, batch_size: int | None, strict_length: bool
-) -> tuple[Sampler | None, int | None]:
-    """A sampler of slices of episodes, if they are asked for, or else the one that was passed; and the batch size.
+def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
+    """A sampler of slices of episodes, if a data set's options ask for them, or else theirs; and the batch size.
 
     Raises:
         ValueError: if ``sampler`` comes with ``num_slices`` or ``slice_len``, or these two contradict ``batch_size``.
 
     Examples:
-        >>> sampler, batch_size = choose_sampler(None, 4, 16, None, True)
+        >>> sampler, batch_size = choose_sampler({"num_slices": 4, "slice_len": 16})
         >>> sampler.slice_len, batch_size
         (16, 64)
     """
+    names = ("sampler", "num_slices", "slice_len", "batch_size")
+    sampler, num_slices, slice_len, batch_size = map(options.get, names)
     if num_slices is None and slice_len is None:
         return sampler, batch_size
     if sampler is not None:
@@ -40,10 +40,9 @@ def choose_sampler(
                 "leave one of the three out"
             )
         num_slices, batch_size = None, rows
-    sampler = SliceSampler(
-        num_slices=num_slices, slice_len=slice_len, traj_key="episode", cache_values=True, strict_length=strict_length
-    )
-    return sampler, batch_size
+    strict = options.get("strict_length", True)
+    kept = {"traj_key": "episode", "cache_values": True, "strict_length": strict}
+    return SliceSampler(num_slices=num_slices, slice_len=slice_len, **kept), batch_size
 
 
 def slices_of(sampler: Sampler | None) -> Slices | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -17,6 +17,9 @@ BELIEF, FILL, READING, TRUTH, UNSEEN = "#0072B2", "#9CCBEA", "#D55E00", "black",
 OTHERS = ("#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#0072B2")
 DASHES = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+T = TypeVar("T")
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
@@ -92,30 +95,20 @@ def legend_above(axes: Axes, *others: Axes) -> None:
         handle.set_alpha(max(handle.get_alpha() or 1.0, 0.6))
 
 
+def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
+    """One value a drawn component.
+
+    Raises:
+        ValueError: if there are more or fewer.
+    """
+    if given is not None and len(given) != len(default):
+        raise ValueError(f"{what} needs one entry a drawn component, {len(default)}; got {len(given)}")
+    return default if given is None else list(given)
+
+
 def labels_for(names: Sequence[str] | None, dims: Sequence[int]) -> list[str]:
-    """One label a component: the names, or ``state 3`` for dimension 3.
-
-    Raises:
-        ValueError: if there are not as many names as components.
-    """
-    if names is None:
-        return [f"state {dim}" for dim in dims]
-    if len(names) != len(dims):
-        raise ValueError(f"names needs one entry a drawn component, {len(dims)}; got {len(names)}")
-    return list(names)
-
-
-def factors_for(factors: Sequence[float] | None, dims: Sequence[int]) -> list[float]:
-    """One factor a component, 1 by default.
-
-    Raises:
-        ValueError: if there are not as many factors as components.
-    """
-    if factors is None:
-        return [1.0] * len(dims)
-    if len(factors) != len(dims):
-        raise ValueError(f"factors needs one entry a drawn component, {len(dims)}; got {len(factors)}")
-    return [float(factor) for factor in factors]
+    """One label a component: the names, or ``state 3`` for dimension 3."""
+    return one_each("names", names, [f"state {dim}" for dim in dims])
 
 
 def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:

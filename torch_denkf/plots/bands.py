@@ -18,13 +18,13 @@ from torch_denkf.plots._axes import (
     TRUTH,
     UNSEEN,
     axes_for,
-    factors_for,
     labels_for,
     legend_above,
+    one_each,
     step_bounds,
     times_of,
 )
-from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, with_truth
+from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, turns_of, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,10 +90,11 @@ def plot_bands(
     chosen = dims_of(read, dims)
     masks = _masks(belief, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
-    labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
+    labels, scales = labels_for(names, chosen), one_each("factors", factors, [1.0] * len(chosen))
     seconds = times_of(time, len(read.mean))
     bounds = step_bounds(seconds)
-    angular = [dim in {int(angle) % read.mean.shape[-1] for angle in angles} for dim in chosen]
+    turns = turns_of(read, chosen, angles)
+    angular = [column in turns for column in range(len(chosen))]
     mean, lower, upper = _edges(read, chosen, angular, level, band)
     true = None if read.truth is None else _beside(with_truth(read, chosen), mean, angular)
     for what, given in (("readings", readings or {}), ("observed", masks)):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_denkf.metrics import pit
 from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots._axes import FILL, TRUTH, axes_for, labels_for, legend_above
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,7 +83,7 @@ def plot_calibration(
     if ranks and read.ensemble_size is None:
         raise ValueError('kind="rank" needs ("belief", "ensemble") of equal weights; pass kind="pit"')
     true = with_truth(read, chosen)
-    turns = [column for column, dim in enumerate(chosen) if dim in {int(a) % read.mean.shape[-1] for a in angles}]
+    turns = turns_of(read, chosen, angles)
     time = slice(None, None, every)
     true = true[..., time, :]
     if ranks:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_path"]
 
+MEMBERS, ELLIPSES = 32, 12  # that are drawn: the first ones; evenly over time
+
 
 def plot_path(
     belief: TensorDictBase | Tensor,
@@ -28,10 +30,7 @@ def plot_path(
     dims: Sequence[int] = (0, 1),
     forward_up: bool = False,
     spread: Literal["auto", "ensemble", "ellipses", "none"] = "auto",
-    members: int = 32,
-    ellipses: int = 12,
     level: float = 0.9,
-    factor: float = 1.0,
     unit: str = "m",
     legend: bool = True,
     ax: Axes | None = None,
@@ -48,11 +47,8 @@ def plot_path(
         spread: ``"ensemble"`` draws the members' paths, ``"ellipses"`` draws ``level`` of a Gaussian at some steps;
             ``"auto"`` takes members where they have equal weights, else ellipses where there is a covariance or a
             variance. Particles have no paths of their own: resampling moves them to other rows.
-        members: to draw, the first ones.
-        ellipses: to draw, evenly over time.
         level: probability of an ellipse.
-        factor: multiplies all coordinates.
-        unit: of the coordinates after that.
+        unit: of the coordinates.
         legend: whether to add one above the Axes.
         ax: to draw into; 3-D for three dims. ``None`` makes a figure.
 
@@ -81,12 +77,12 @@ def plot_path(
 
     def place(states: Tensor) -> list[np.ndarray]:
         """Coordinates on the picture's axes, each ``[T, ...]``."""
-        parts = [factor * states[..., dim].numpy() for dim in chosen]
+        parts = [states[..., dim].numpy() for dim in chosen]
         return [-parts[1], parts[0]] if forward_up else parts
 
     if kind == "ensemble":
         assert read.ensemble is not None
-        for index, member in enumerate(read.ensemble[:, :members].unbind(1)):
+        for index, member in enumerate(read.ensemble[:, :MEMBERS].unbind(1)):
             label = "members" if index == 0 else None
             axes.plot(*place(member), color=BELIEF, alpha=0.15, linewidth=0.8, label=label, zorder=1.5)
     if read.truth is not None:
@@ -97,7 +93,7 @@ def plot_path(
         axes.plot(*place(number(path)), linewidth=1.4, label=name, zorder=2.2, **style)
     axes.plot(*place(read.mean), color=BELIEF, linewidth=1.4, label="belief", zorder=2.3)
     if kind == "ellipses":
-        _draw_ellipses(axes, read, chosen, forward_up, ellipses, level, factor)
+        _draw_ellipses(axes, read, chosen, forward_up, level)
     names = ["right", "forward"] if forward_up else [_name(dim) for dim in chosen]
     axes.set(xlabel=f"{names[0]}, {unit}", ylabel=f"{names[1]}, {unit}")
     if len(chosen) == 3:
@@ -138,9 +134,7 @@ def _name(dim: int) -> str:
     return "xyz"[dim] if dim < 3 else f"state {dim}"
 
 
-def _draw_ellipses(
-    axes: Axes, read: Belief, dims: list[int], forward_up: bool, count: int, level: float, factor: float
-) -> None:
+def _draw_ellipses(axes: Axes, read: Belief, dims: list[int], forward_up: bool, level: float) -> None:
     """Draws where a Gaussian lies with probability ``level``: half axes sqrt(-2 ln(1 - level)) standard deviations."""
     from matplotlib.patches import Ellipse
 
@@ -149,13 +143,13 @@ def _draw_ellipses(
     # (x, y) to (-y, x)
     turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]] if forward_up else [[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
     mean = read.mean[:, dims] @ turn.T
-    reach = factor * math.sqrt(-2 * math.log1p(-level))
-    for first, step in enumerate(np.unique(np.linspace(0, len(mean) - 1, count).round().astype(int)).tolist()):
+    reach = math.sqrt(-2 * math.log1p(-level))
+    for first, step in enumerate(np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).round().astype(int)).tolist()):
         squares, directions = np.linalg.eigh((turn @ covariance_at(read, step, dims) @ turn.T).numpy())
         small, large = 2 * reach * np.sqrt(squares.clip(0))
         angle = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
         style: dict[str, Any] = {"facecolor": BELIEF, "edgecolor": BELIEF, "alpha": 0.3, "zorder": 1.5}
-        centre = (factor * float(mean[step, 0]), factor * float(mean[step, 1]))
+        centre = (float(mean[step, 0]), float(mean[step, 1]))
         patch = Ellipse(centre, large, small, angle=angle, gid=f"step {step}", **style)
         patch.set_label(None if first else f"{100 * level:g} % of the belief")
         axes.add_patch(patch)

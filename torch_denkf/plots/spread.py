@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDictBase
 
 from torch_denkf.metrics.calibration import spread_error
-from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, factors_for, labels_for, legend_above
-from torch_denkf.plots._belief import Truth, dims_of, read_belief, with_truth
+from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
+from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +26,6 @@ def plot_spread_error(
     factors: Sequence[float] | None = None,
     bins: int = 8,
     angles: Sequence[int] = (),
-    log: bool = False,
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
@@ -38,12 +37,11 @@ def plot_spread_error(
         belief: roll-outs or sequences ``[*B]`` with ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "var")`` or
             ``("belief", "ensemble")`` ``[*B, E, S]``. The spread of E members is scaled with sqrt((E+1)/E).
         truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
-        dims: components to draw, a line each; all by default. They should have a similar size, or pass ``log``.
+        dims: components to draw, a line each; all by default. They should have a similar size.
         names: a label with its unit for each of them, such as ``"v, m/s"``.
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
         bins: points of a line, each for as many states.
         angles: dimensions of the state that are angles in rad, whose errors are wrapped.
-        log: whether both axes are logarithmic.
         legend: whether to add one above the Axes.
         ax: to draw into; ``None`` makes a figure.
 
@@ -69,7 +67,7 @@ def plot_spread_error(
     chosen = dims_of(read, dims)
     if read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
-    turns = [column for column, dim in enumerate(chosen) if dim in {int(a) % read.mean.shape[-1] for a in angles}]
+    turns = turns_of(read, chosen, angles)
     points = spread_error(
         read.mean[..., chosen],
         read.var[..., chosen],
@@ -79,22 +77,18 @@ def plot_spread_error(
         angles=turns,
     )
     (axes,) = axes_for(ax, 1, (6.4, 6.8))
-    labels, scales = labels_for(names, chosen), factors_for(factors, chosen)
-    lowest, highest = float("inf"), 0.0
+    labels, scales = labels_for(names, chosen), one_each("factors", factors, [1.0] * len(chosen))
+    highest = 0.0
     for column, (label, scale) in enumerate(zip(labels, scales, strict=True)):
         spread, error = scale * points.spread[column].numpy(), scale * points.error[column].numpy()
         colour = (BELIEF, *OTHERS)[column % 6]
         axes.plot(spread, error, "-", marker=MARKERS[column % len(MARKERS)], color=colour, label=label)
-        lowest = min(lowest, spread.min(), error.min())
         highest = max(highest, spread.max(), error.max())
-    low, high = (lowest / 1.2, highest * 1.2) if log else (0.0, highest * 1.05)
-    axes.plot([low, high], [low, high], ":", color=TRUTH, label="spread = error")
-    if log:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+    limits = (0.0, highest * 1.05)
+    axes.plot(limits, limits, ":", color=TRUTH, label="spread = error")
     units = {label.rpartition(", ")[2] for label in labels if ", " in label}
     unit = f", {units.pop()}" if len(units) == 1 else ""
-    axes.set(xlabel=f"predicted spread{unit}", ylabel=f"RMS error{unit}", xlim=(low, high), ylim=(low, high))
+    axes.set(xlabel=f"predicted spread{unit}", ylabel=f"RMS error{unit}", xlim=limits, ylim=limits)
     axes.set_aspect("equal", adjustable="box")
     if legend:
         legend_above(axes)

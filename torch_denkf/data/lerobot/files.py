@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from torch_denkf._checks import check_count, check_number, read_lines
-from torch_denkf.data.lerobot.paths import stay_inside
 from torch_denkf.data.parquet import read_parquet
 from torch_denkf.data.pictures import decode_picture
 
@@ -333,3 +332,23 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
         files = [stay_inside(root, name, source) for name in names if name]
         data = next((file.read_bytes() for file in files if file.is_file()), b"")
     return decode_picture(data)
+
+
+def stay_inside(root: Path, path: str, source: str) -> Path:
+    """A path below a folder, as metadata name it.
+
+    Args:
+        root: the folder.
+        path: relative to it.
+        source: what names the path, for the message.
+
+    Raises:
+        ValueError: if it is absolute and elsewhere, or leads out of the folder.
+    """
+    file = root / path
+    if ".." in Path(path).parts or not file.is_relative_to(root) or "\0" in path:
+        raise ValueError(
+            f"{source} names a file outside of the data set, {path!r}; such a data set may read anything of yours: "
+            "download it from where you trust it, or correct the path"
+        )
+    return file

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from torch_denkf.applications.car import write_drives
-from torch_denkf.applications.car.odometry.checkpoint import save_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
+from torch_denkf.pretrained import save_pretrained
 
 
 @pytest.fixture(scope="session")
@@ -19,4 +19,4 @@ def kitti(tmp_path_factory):
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory):
     torch.manual_seed(0)
-    return save_car_filter(car_filter(ensemble_size=8, size=(25, 75)), tmp_path_factory.mktemp("car"))
+    return save_pretrained(car_filter(ensemble_size=8, size=(25, 75)), tmp_path_factory.mktemp("car"))

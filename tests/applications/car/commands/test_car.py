@@ -15,11 +15,11 @@ from evo.core import sync
 from evo.tools import file_interface
 
 from torch_denkf.applications.car import read_camera, read_frames, read_kitti_drive, track
-from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.images import read_times
 from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.cli.main import main
+from torch_denkf.pretrained import from_pretrained
 
 SIZE = (25, 75)
 
@@ -49,7 +49,7 @@ def test_train_leaves_a_filter_that_evaluate_reads(kitti, tmp_path, capsys):
         rows = list(csv.DictReader(stream))
     cache = tmp_path / "e/cache"
     expected, _ = evaluate_car_filter(
-        load_car_filter(out), kitti, ["a"], cache=cache, draws=2, window=6, progress=False
+        from_pretrained(out), kitti, ["a"], cache=cache, draws=2, window=6, progress=False
     )
     for row, wanted in zip(rows, expected, strict=True):
         assert row["method"] == wanted["method"]
@@ -73,7 +73,7 @@ def test_odometry_leaves_the_belief_in_all_files(kitti, checkpoint, tmp_path, ca
     source = list(read_frames(drive / "image_2"))  # in colour, as the files are
     assert len(source) == len(frames) == 12
     calibration, times = read_camera(drive / "calib.txt"), read_times(drive / "times.txt")
-    beliefs = list(track(load_car_filter(checkpoint), source, calibration, times=times, seed=4))
+    beliefs = list(track(from_pretrained(checkpoint), source, calibration, times=times, seed=4))
     path = read_path(tmp_path / "path.csv")
     mean, var = (torch.stack([getattr(belief, name) for belief in beliefs]).double() for name in ("mean", "var"))
     torch.testing.assert_close(path["belief", "mean"], mean, rtol=1e-8, atol=1e-12)
@@ -197,7 +197,7 @@ def test_mistakes_are_one_line(kitti, checkpoint, tmp_path, capsys):
         (["--calibration", tmp_path / "none.txt", *times], r"no such file or folder: calibration .*none\.txt"),
         (["--calibration", tmp_path / "notes.txt", *times], "does not say fy, cx, cy"),
         (["--calibration", large, *times], "does not belong to images of 75 x 25 pixels"),
-        (["--height", "165", *times], "height is that of the camera over the road in m"),
+        (["--height", "165", *times], "height must be .* It is that of the camera over the road, in m"),
         (["--fps", "2"], r"frames are 0\.5 s apart, but the filter moves in steps of 0\.103 s"),
         (["--fps", "10", *times], "--fps or --times, not both"),
         (["--times", large], r"large\.txt:1: expected a time in s"),

@@ -201,7 +201,6 @@ def test_a_bar_counts_what_is_decoded(root, tmp_path, monkeypatch):
     bars = shared.counting_bars(monkeypatch)
     open_dataset(root, "hill", cache=tmp_path)
     assert [(bar.n, bar.total, bar.closed) for bar in bars] == [(14, 14, True)]
-    open_dataset(root, "hill", cache=tmp_path)  # from the cache: no bar
     open_dataset(root, progress=False)
     assert len(bars) == 1
     open_dataset(root, ["hill", "lane", "town"], cache=tmp_path)  # what is there counts as done

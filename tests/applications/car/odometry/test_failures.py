@@ -9,16 +9,16 @@ from tensordict import TensorDict
 
 from tests.applications.car.odometry.test_tracking import calibration_of, frames_of
 from torch_denkf.applications.car import track
-from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
 from torch_denkf.applications.car.odometry.failures import CameraFailure, fail_frames
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.envs import OccludingBox
+from torch_denkf.pretrained import from_pretrained
 
 
 def test_black_frames_are_missing_frames(checkpoint, drive):
-    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     lost = list(track(car, fail_frames(images, [CameraFailure("missing", 5, 6)]), calibration))
     black = [*fail_frames(images, [CameraFailure("black", 5, 6)])]
     black[5][0, 0] = 255  # a hot pixel
@@ -28,13 +28,13 @@ def test_black_frames_are_missing_frames(checkpoint, drive):
         assert torch.equal(one.ensemble, other.ensemble)
     unknown = list(track(car, black, calibration))
     assert all(belief.observed for belief in unknown[1:])
-    with pytest.raises(ValueError, match="grey value from 0 to 255; got 300"):
+    with pytest.raises(ValueError, match="black_level must be finite, at least 0 and at most 255; got 300"):
         track(car, black, calibration, black_level=300)
 
 
 def test_readings_are_velocities(checkpoint, drive):
     """Of a pair over a gap the mean over its steps, and in real time where frames are not as far apart as trained."""
-    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     plain, slow = (list(track(car, images, calibration, fps=fps)) for fps in (1 / 0.103, 1 / 0.12))
     assert plain[0].reading is None
     for one, other in zip(plain[1:], slow[1:], strict=True):
@@ -68,7 +68,7 @@ def test_kinds_of_failures():
 
 
 def test_dead_reckoning_integrates_what_was_read(checkpoint, drive):
-    car = load_car_filter(checkpoint)
+    car = from_pretrained(checkpoint)
     failures = [CameraFailure("black", 6, 7)]
     tracked = track_failing_drive(car, drive, failures, seed=3)
     beliefs = list(track(car, fail_frames(frames_of(drive), failures), calibration_of(drive), black_level=8, seed=3))

@@ -12,11 +12,11 @@ from tensordict import TensorDict
 
 from torch_denkf.applications.car import bridge_gaps, read_frames, read_kitti_drive, track, with_motion
 from torch_denkf.applications.car.kitti.render import render_drives
-from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.odometry.tracking import _Clock
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import ROAD_SHIFTS
+from torch_denkf.pretrained import from_pretrained
 
 
 def frames_of(drive):
@@ -44,7 +44,7 @@ def recorded(car):
 
 @pytest.mark.parametrize("lost", [[], [5, 6, 11]])
 def test_tracking_equals_filtering_the_whole_drive(lost, checkpoint, drive):
-    car = load_car_filter(checkpoint)
+    car = from_pretrained(checkpoint)
     drive["frame_valid"][lost] = False
     noises, state = recorded(car), torch.get_rng_state()
     beliefs = list(track(car, frames_of(drive), calibration_of(drive), seed=7))
@@ -70,7 +70,7 @@ def test_tracking_equals_filtering_the_whole_drive(lost, checkpoint, drive):
 
 
 def test_a_faster_camera_is_read_every_third_frame(checkpoint, drive):
-    car, calibration = load_car_filter(checkpoint), calibration_of(drive)
+    car, calibration = from_pretrained(checkpoint), calibration_of(drive)
     images = frames_of(drive)
     slow = list(track(car, images[:8], calibration, fps=10))
     fast = list(track(car, (images[n // 3] for n in range(22)), calibration, fps=30))
@@ -86,7 +86,7 @@ def test_a_faster_camera_is_read_every_third_frame(checkpoint, drive):
 
 
 def test_times_with_a_gap_count_as_missing_frames(checkpoint, drive):
-    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     kept = [n for n in range(16) if n not in (5, 6)]
     given = list(track(car, [images[n] for n in kept], calibration, times=[5.0 + 0.103 * n for n in kept]))
     marked = list(track(car, [image if n in kept else None for n, image in enumerate(images)], calibration))
@@ -107,7 +107,7 @@ def test_clock():
 
 
 def test_colour_and_large_images_are_read_as_grey_and_small_ones(checkpoint, drive):
-    car, images, calibration = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    car, images, calibration = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     grey = list(track(car, images[:5], calibration))
     colour = list(track(car, (np.dstack([image] * 3) for image in images[:5]), calibration))
     assert torch.equal(grey[-1].mean, colour[-1].mean)
@@ -118,7 +118,7 @@ def test_colour_and_large_images_are_read_as_grey_and_small_ones(checkpoint, dri
 
 
 def test_memory_does_not_grow(checkpoint, drive):
-    car, images, alive, most = load_car_filter(checkpoint), frames_of(drive), [], 0
+    car, images, alive, most = from_pretrained(checkpoint), frames_of(drive), [], 0
 
     def camera():
         for image in images:
@@ -133,17 +133,19 @@ def test_memory_does_not_grow(checkpoint, drive):
 
 
 def test_bad_input_says_what_to_do(checkpoint, drive):
-    car, images, good = load_car_filter(checkpoint), frames_of(drive), calibration_of(drive)
+    car, images, good = from_pretrained(checkpoint), frames_of(drive), calibration_of(drive)
     for calibration in (good[:3], [0.0, *good[1:]], [float("nan"), *good[1:]]):
         with pytest.raises(ValueError, match=r"calibration is \(fx, fy, cx, cy\)"):
             track(car, images, calibration)
-    with pytest.raises(ValueError, match=r"height is that of the camera over the road in m, 0\.3 to 5; got 165"):
+    with pytest.raises(
+        ValueError, match=r"height must be finite, at least 0\.3 and at most 5; got 165\. It is that of the camera over"
+    ):
         track(car, images, good, height=165)
     with pytest.raises(ValueError, match="pitch"):
         track(car, images, good, pitch=2.0)
     with pytest.raises(ValueError, match="times or fps, not both"):
         track(car, images, good, times=[0.0], fps=10)
-    with pytest.raises(ValueError, match="fps is the number"):
+    with pytest.raises(ValueError, match="fps must be finite and above 0; got 0"):
         track(car, images, good, fps=0)
     with pytest.raises(ValueError, match=r"times must increase; that of frame 2 is 0\.1 s, after 0\.2 s"):
         list(track(car, images, good, times=[0.0, 0.2, 0.1]))

@@ -17,6 +17,7 @@ from torch_denkf.applications.car.odometry.roles import assign_roles
 from torch_denkf.applications.car.odometry.scores import calibrate
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, lose_frames, read_spans, take_spans
 from torch_denkf.applications.car.odometry.training import train_car_filter
+from torch_denkf.pretrained import from_pretrained
 from torch_denkf.training import FilterTrainer
 
 
@@ -162,8 +163,8 @@ def test_readings_over_gaps_are_those_of_pairs(trained, root):
 
 
 def test_saved_and_loaded_filters_believe_the_same(trained, checkpoint, root):
-    loaded = load_car_filter(checkpoint)
-    assert loaded.settings == load_car_filter(trained[0]).settings
+    loaded = from_pretrained(checkpoint)
+    assert loaded.settings == from_pretrained(trained[0]).settings
     assert loaded.inflation == trained[1].inflation
     options = {"cache": trained[0] / "cache", "draws": 1, "window": 10, "progress": False}
     mine, theirs = (evaluate_car_filter(car, root, ["c"], **options)[1]["c"] for car in (trained[1], loaded))

@@ -10,6 +10,7 @@ See :func:`torch_denkf.applications.car.odometry.training.train_car_filter`, whi
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +51,6 @@ class Train(Command):
         import torch
 
         from torch_denkf.applications.car.commands._car import set_threads
-        from torch_denkf.applications.car.odometry.checkpoint import read_config
         from torch_denkf.applications.car.odometry.training import Updates, train_car_filter
 
         try:
@@ -74,7 +74,7 @@ class Train(Command):
                 processes=self.processes,
                 command=self.command_line,
             )
-        config = read_config(self.out)
+        config = json.loads((self.out / "config.json").read_text())
         training = config["training"]
         say(f"{self.out}: trained; roles: " + "; ".join(f"{k}: {' '.join(v)}" for k, v in training["roles"].items()))
         say(

@@ -30,13 +30,12 @@ from torch_denkf.applications.car.kitti.clock import read_times
 from torch_denkf.applications.car.kitti.files import check_speeds, read_calibration, read_poses, scale_calibration
 from torch_denkf.applications.car.vision.poses import poses_to_state
 from torch_denkf.data.cache import cache_folder, cached, stamp
-from torch_denkf.data.pictures import check_size, is_bomb, text_of_size
+from torch_denkf.data.pictures import check_size, decode_picture, scaled, text_of_size
 
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
 _FORMAT = 3  # part of the cache's key: raise it when what is stored changes
-_END_OF_PNG = b"IEND\xaeB`\x82"
 
 
 def list_kitti_drives(root: str | Path) -> list[str]:
@@ -267,30 +266,15 @@ def _read(
 
 
 def _decode(file: Path, flags: int) -> np.ndarray | None:
-    data = file.read_bytes()
-    # OpenCV would fill the rest of a truncated file or complain on stderr: look for the end first.
-    if _END_OF_PNG not in data[-64:] or is_bomb(data):
-        return None
-    return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    return decode_picture(file.read_bytes(), flags) if file.is_file() else None  # or a folder, or a link to nowhere
 
 
 def _is_colour(files) -> bool:
-    for file in files:
-        pixels = _decode(file, cv2.IMREAD_ANYCOLOR)
-        if pixels is not None:
-            return pixels.ndim == 3
-    return False
+    pixels = next((image for file in files if (image := _decode(file, cv2.IMREAD_ANYCOLOR)) is not None), None)
+    return pixels is not None and pixels.ndim == 3
 
 
 def _read_image(file: Path, size: tuple[int, int], colour: bool) -> tuple[np.ndarray | None, tuple[int, int]]:
     """Pixels ``[C, H, W]``, RGB or grey, and the file's own (H, W)."""
-    if not file.is_file():  # a folder, or a link to nowhere
-        return None, (0, 0)
     pixels = _decode(file, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
-    if pixels is None:
-        return None, (0, 0)
-    native = pixels.shape[:2]
-    if native != size:
-        shrinks = native[0] >= size[0] and native[1] >= size[1]
-        pixels = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return (pixels[..., ::-1].transpose(2, 0, 1) if colour else pixels[None]), native
+    return (None, (0, 0)) if pixels is None else (scaled(pixels, size), pixels.shape[:2])

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 
@@ -95,35 +94,6 @@ def find_cameras(root: Path, drive: str, cameras: str | Sequence[str]) -> list[s
     return list(cameras)
 
 
-class Bar:
-    """A progress bar over images, which appears when the first one is worked on."""
-
-    def __init__(self, total: int, shown: bool):
-        self.total, self.done, self._shown = total, 0, shown
-        self._bar: Any = None
-
-    def __enter__(self) -> Bar:
-        return self
-
-    def __exit__(self, *_) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, images: int) -> None:
-        """Count images that were worked on."""
-        if self._bar is None and self._shown:
-            self._bar = progress_bar("reading drives", self.total, self.done, unit=" images")
-        self.done += images
-        if self._bar is not None:
-            self._bar.update(images)
-
-    def skip_to(self, done: int) -> None:
-        """Count what needed no work."""
-        if self._bar is not None:
-            self._bar.update(done - self.done)
-        self.done = done
-
-
 def read_drives(
     root: Path,
     sources: Sequence[tuple[str, str]],
@@ -146,10 +116,12 @@ def read_drives(
     add_flow = partial(with_motion, cache=cache) if flow is True else flow
     steps = 2 if add_flow else 1
     drives, ends = [], 0
-    with Bar(steps * sum(counts), progress) as bar:
+    with progress_bar("reading drives", steps * sum(counts), unit=" images", shown=progress) as bar:
         for (name, camera), count in zip(sources, counts, strict=True):
-            drive = read_kitti_drive(root, name, camera=camera, size=size, colour=colour, cache=cache, progress=bar)
-            bar.skip_to(ends + count)
+            drive = read_kitti_drive(
+                root, name, camera=camera, size=size, colour=colour, cache=cache, progress=bar.update
+            )
+            bar.update(ends + count - bar.n)  # what came from the cache
             if add_flow:
                 rows = drive.batch_size
                 drive = add_flow(drive)
@@ -158,7 +130,7 @@ def read_drives(
                         f"flow must return the drive with 'flow', {rows[0]} rows of it; for {name}/{camera} it "
                         f"returned {sorted(drive.keys())} of batch size {tuple(drive.batch_size)}"
                     )
-                bar(count)
+                bar.update(count)
             ends += steps * count
             drives.append(drive)
     shapes = [_shapes(drive) for drive in drives]

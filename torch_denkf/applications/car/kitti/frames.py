@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_denkf.applications.car.kitti.gaps import steps_at
 
-__all__ = ["drive_frames", "frames_at"]
+__all__ = ["drive_frames", "frames_at", "mark_start"]
 
 MOTION_KEYS = ("flow", "road", "two_view")  # what with_motion adds
 
@@ -87,10 +87,11 @@ def drive_frames(drive: TensorDictBase) -> TensorDict:
     """
     rows = drive.batch_size[0]
     frames = frames_at(drive, torch.arange(rows, device=drive["state"].device))
-    return _mark_start(frames)
+    return mark_start(frames)
 
 
-def _mark_start(frames: TensorDict) -> TensorDict:
+def mark_start(frames: TensorDict) -> TensorDict:
+    """Frames ``[*B, T]`` with ``"is_init"``, true in the first of each row."""
     is_init = torch.zeros(*frames.batch_size, 1, dtype=torch.bool, device=frames.device)
     is_init[..., 0, :] = True
     return frames.set("is_init", is_init)

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_denkf.applications.car.kitti.frames import mark_start
 from torch_denkf.applications.car.kitti.gaps import steps_between
 from torch_denkf.applications.car.odometry.filter import VELOCITIES
 from torch_denkf.applications.car.odometry.streams import Drive, mirror, rows, take_spans
@@ -107,10 +108,3 @@ def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generato
     """Windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
     windows["start"] = windows["state"] + start_std * torch.randn(len(windows), 1, 5, generator=generator)
     return mark_start(windows)
-
-
-def mark_start(windows: TensorDict) -> TensorDict:
-    """Windows ``[*B, T]`` with ``"is_init"``, true in the first row of each."""
-    is_init = torch.zeros(*windows.batch_size, 1, dtype=torch.bool)
-    is_init[..., 0, :] = True
-    return windows.set("is_init", is_init)

@@ -74,8 +74,6 @@ class CarSettings:
             raise ValueError(f"size is (height, width) in pixels, positive; got {self.size!r}.")
         if self.focal is not None:
             check_number("focal", self.focal, above=0, cure="It is in pixels")
-        if min(self.dt, *self.velocity_std, self.reach, self.inflation) <= 0:
-            raise ValueError(f"dt, velocity_std, reach and inflation must be positive; got {self}.")
         if not 1 <= self.longest <= self.lags + 1:
             raise ValueError(f"longest is 1 to lags + 1 = {self.lags + 1} steps; got {self.longest}.")
 

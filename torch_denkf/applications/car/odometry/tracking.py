@@ -72,7 +72,7 @@ def track(
     that is not one, speeds beyond the sensor's range.
 
     Args:
-        car: the filter, see :func:`torch_denkf.applications.car.odometry.checkpoint.load_car_filter`.
+        car: the filter, see :func:`torch_denkf.pretrained.from_pretrained`.
         frames: rectified images: grey ``[H, W]``, or in colour ``[H, W, 3]`` in OpenCV's order, uint8, all of one size;
             ``None`` for a frame that is missing.
         calibration: focal lengths and principal point (fx, fy, cx, cy) in pixels of the images.
@@ -101,21 +101,16 @@ def track(
         calibration = [float(value) for value in calibration]
     except (TypeError, ValueError) as error:
         raise ValueError(f"calibration is (fx, fy, cx, cy) in pixels, four numbers; got {calibration!r}") from error
-    for name, value in {"height": height, "pitch": pitch, "fps": fps, "black_level": black_level}.items():
-        if value is not None:
-            check_number(name, value)
     if len(calibration) != 4 or not all(np.isfinite(calibration)) or min(calibration[:2]) <= 0:
         raise ValueError(f"calibration is (fx, fy, cx, cy) in pixels, fx and fy positive; got {calibration}")
-    if not 0.3 <= height <= 5:
-        raise ValueError(f"height is that of the camera over the road in m, 0.3 to 5; got {height}")
-    if not -0.5 <= pitch <= 0.5:
-        raise ValueError(f"pitch is how far the camera looks up in rad, -0.5 to 0.5; got {pitch}")
+    check_number("height", height, least=0.3, most=5, cure="It is that of the camera over the road, in m")
+    check_number("pitch", pitch, least=-0.5, most=0.5, cure="It is how far the camera looks up, in rad")
     if times is not None and fps is not None:
         raise ValueError("pass times or fps, not both")
-    if fps is not None and not 0 < fps < np.inf:
-        raise ValueError(f"fps is the number of frames in a second; got {fps}")
-    if black_level is not None and not 0 <= black_level <= 255:
-        raise ValueError(f"black_level is a grey value from 0 to 255; got {black_level}")
+    if fps is not None:
+        check_number("fps", fps, above=0, cure="It is the number of frames in a second")
+    if black_level is not None:
+        check_number("black_level", black_level, least=0, most=255, cure="It is a grey value")
     return _track(car, _seen(frames, black_level), calibration, times, fps, height, pitch, seed)
 
 

@@ -15,7 +15,6 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf._progress import progress_bar
 from torch_denkf.applications.car.odometry.batches import PairSampler, ReadingSampler
-from torch_denkf.applications.car.odometry.checkpoint import save_car_filter
 from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter, CarSettings
 from torch_denkf.applications.car.odometry.roles import drives_by_role, recorded_drives, rendered_drives
 from torch_denkf.applications.car.odometry.scores import (
@@ -29,6 +28,7 @@ from torch_denkf.applications.car.odometry.scores import (
 )
 from torch_denkf.applications.car.odometry.streams import Drive, read_spans
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
+from torch_denkf.pretrained.folders import save_pretrained
 from torch_denkf.training import FilterTrainer, Stage
 
 __all__ = ["Updates", "train_car_filter"]
@@ -89,8 +89,8 @@ def train_car_filter(
     A call that is repeated goes on where the last one ended, also after a kill, and leaves the same weights.
 
     Args:
-        out: folder; gets the filter (see :func:`save_car_filter`), checkpoints and logs below ``training``, rendered
-            drives below ``rendered`` and the optical flow of all drives below ``cache``.
+        out: folder; gets the filter (see :func:`torch_denkf.pretrained.save_pretrained`), checkpoints and logs below
+            ``training``, rendered drives below ``rendered``, and optical flow of all drives below ``cache``.
         root: folder of recorded drives in KITTI's layout, with ``sequences`` and ``poses``.
         drives: names of the drives below ``root``; all by default.
         leave_out: names of drives below ``root`` that must not be seen.
@@ -151,7 +151,7 @@ def train_car_filter(
         "validation_crps": value,
         "sensor_gain_error": gain,
     }
-    save_car_filter(car, out, training=record)
+    save_pretrained(car, out, training=record)
     return car.eval()
 
 
