@@ -13,12 +13,11 @@ from pathlib import Path
 from tensordict import TensorDict
 
 from torch_denkf._files import clear_errors, place_beside, sweep, sync
-from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, reserve_entry, seal_entry, write_entry
+from torch_denkf.data.cache_entry import DamagedEntry, is_entry, open_entry, write_entry
 
-__all__ = ["cache_folder", "cached", "cached_in_place", "entries_of", "forget", "stamp", "usual_folder"]
+__all__ = ["cache_folder", "cached", "entries_of", "forget", "stamp", "usual_folder"]
 
 _LOG = logging.getLogger("torch_denkf")
-_TRIES = 3  # to open what was just written: another process may clear the cache at that moment
 
 
 def usual_folder() -> Path:
@@ -62,37 +61,6 @@ def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
     with _writing(entry) as folder:
         write_entry(folder, content)
     return content if (stored := _load(entry)) is None else stored  # it may be gone again
-
-
-def cached_in_place(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> TensorDict:
-    """As :func:`cached`, for what is too large for memory.
-
-    Args:
-        entry: folder of the entry.
-        fill: is called with a function that turns a TensorDict of the right shapes and dtypes into zeros on the disk,
-            and fills those.
-
-    Raises:
-        OSError: if the cache cannot be written; names the entry and the free space.
-    """
-    for _ in range(_TRIES):
-        stored = _load(entry)
-        if stored is not None:
-            return stored
-        _fill(entry, fill)
-    return open_entry(entry)
-
-
-def _fill(entry: Path, fill: Callable[[Callable[[TensorDict], TensorDict]], object]) -> None:
-    with _writing(entry) as folder:
-        made: list[TensorDict] = []
-
-        def allocate(like: TensorDict) -> TensorDict:
-            made.append(reserve_entry(folder, like))
-            return made[0]
-
-        fill(allocate)
-        seal_entry(folder, made[0])
 
 
 def entries_of(folder: Path) -> list[Path]:

@@ -34,7 +34,6 @@ __all__ = [
     "check_entry",
     "is_entry",
     "open_entry",
-    "reserve_entry",
     "seal_entry",
     "write_entry",
 ]
@@ -73,7 +72,7 @@ class CachedTensor(Tensor):
         Raises:
             OSError: if the file has another size; it does not grow.
         """
-        whole = _map(file, dtype, torch.Size(shape), _MAP)
+        whole = _map(file, dtype, torch.Size(shape))
         out = (whole.as_strided(*view) if view else whole).as_subclass(cls)
         out.file = file
         return out
@@ -91,32 +90,6 @@ class CachedTensor(Tensor):
             return self.clone().__reduce_ex__(protocol)
         whole = (self.untyped_storage().nbytes() // self.itemsize,)
         return self.open, (self.file, self.dtype, whole, self.shape, self.stride(), self.storage_offset())
-
-
-def reserve_entry(folder: Path, like: TensorDict) -> TensorDict:
-    """Makes an entry whose tensors are still to be filled, where they lie, and reserves their space on the disk.
-
-    Args:
-        folder: of the entry; made.
-        like: shapes and dtypes.
-
-    Returns:
-        Zeros, mapped to the files; :func:`seal_entry` finishes the entry.
-
-    Raises:
-        OSError: if there is not enough space.
-    """
-    folder.mkdir()
-    out = TensorDict({}, like.batch_size)
-    for name, tensor in _tensors(like):
-        file = folder / f"{'.'.join(name)}.bin"
-        with file.open("wb") as stream:
-            reserve(stream, tensor.numel() * tensor.element_size())
-        out.set(name, _map(file, tensor.dtype, tensor.shape, mmap.MAP_SHARED))
-    for name, size in _batch_sizes(like):
-        if name:
-            out.get(name).batch_size = size
-    return out
 
 
 def write_entry(folder: Path, content: TensorDict) -> None:
@@ -274,15 +247,15 @@ def _ends(stream: BinaryIO) -> int:
     return total
 
 
-def _map(file: Path, dtype: torch.dtype, shape: torch.Size, flags: int) -> Tensor:
+def _map(file: Path, dtype: torch.dtype, shape: torch.Size) -> Tensor:
     size = shape.numel() * dtype.itemsize
-    with file.open("r+b" if flags & mmap.MAP_SHARED else "rb") as stream:
+    with file.open("rb") as stream:
         there = os.fstat(stream.fileno()).st_size
         if there != size:
             raise OSError(f"{file} has {there} bytes instead of {size}; delete its folder, and it is made anew")
         if not size:
             return torch.empty(shape, dtype=dtype)
-        mapped = mmap.mmap(stream.fileno(), size, flags, mmap.PROT_READ | mmap.PROT_WRITE)
+        mapped = mmap.mmap(stream.fileno(), size, _MAP, mmap.PROT_READ | mmap.PROT_WRITE)
     return torch.frombuffer(mapped, dtype=dtype).reshape(shape)
 
 

@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Transform
 from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_number
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
-from torch_denkf.applications.car.vision.motion import image_motion
+from torch_denkf.applications.car.vision.motion import grey_picture, image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE
 from torch_denkf.modules._tensors import as_floating
 
@@ -103,7 +103,4 @@ class OpticalFlow(Checked, Transform):
 
 
 def _grey(image: torch.Tensor):
-    import cv2
-
-    pixels = (image * 255).round_().clamp_(0, 255).to(torch.uint8).numpy()
-    return pixels[0] if len(pixels) == 1 else cv2.cvtColor(pixels.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)
+    return grey_picture((image * 255).round_().clamp_(0, 255).to(torch.uint8).numpy())

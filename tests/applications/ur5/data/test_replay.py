@@ -152,7 +152,7 @@ def test_the_cache_is_read_and_follows_the_files(root, tmp_path, monkeypatch):
         (entry / "meta.json").write_text("{")
     assert (UR5ExperienceReplay(folder, split="all", cache=place)[:32] == fresh[:]).all()
 
-    monkeypatch.setattr(cache, "_fill", lambda *args: 1 / 0)
+    monkeypatch.setattr(cache, "_rows", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         UR5ExperienceReplay(folder, size=(3, 4), cache=place)
     assert len(list(place.iterdir())) == 2  # nothing half-made stays

@@ -45,19 +45,13 @@ class Evaluate(Command):
     def run(self) -> None:
         """Evaluates, and writes what was found."""
         from torch_denkf.applications.car.commands._car import load_car, set_threads
-        from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+        from torch_denkf.applications.car.kitti.episodes import find_drives
         from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows
 
         set_threads(self.threads)
         check_count("--seed", self.seed, least=0)
         car = load_car(self.checkpoint)
-        drives = self.drives or list_kitti_drives(self.root)
-        if not drives:
-            lacking = ", ".join(sorted(f"poses/{folder.name}.txt" for folder in (self.root / "sequences").glob("*/")))
-            raise FileNotFoundError(
-                f"no drive below --root {self.root} has both images and poses; expected images in "
-                f"sequences/NAME/image_2 and {lacking or 'poses/NAME.txt'}"
-            )
+        drives = find_drives(self.root, self.drives or None)
         with nullcontext() if self.out is None else alone_in(self.out):
             rows, _ = evaluate_car_filter(
                 car,

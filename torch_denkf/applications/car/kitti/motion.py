@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import cv2
 import torch
 from tensordict import TensorDict, TensorDictBase
 
@@ -13,7 +12,7 @@ from torch_denkf._checks import check_number
 from torch_denkf.applications.car.kitti.gaps import after_gap, steps_at
 from torch_denkf.applications.car.vision.camera import KITTI_HEIGHT
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
-from torch_denkf.applications.car.vision.motion import image_motion
+from torch_denkf.applications.car.vision.motion import grey_picture, image_motion
 from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, ROAD_SHAPE, TWO_VIEW_SHAPE
 from torch_denkf.applications.car.vision.signs import PICTURE_SIGNS, picture_signs, static_region
 from torch_denkf.data.cache import cache_folder, cached
@@ -117,7 +116,7 @@ def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool, tw
     steps, calibration = steps_at(drive, torch.arange(rows)).squeeze(-1).tolist(), drive["calibration"].tolist()
     for row in range(rows):
         if steps[row]:
-            previous, current = (_grey(drive["image"][at]) for at in (row - steps[row], row))
+            previous, current = (grey_picture(drive["image"][at].numpy()) for at in (row - steps[row], row))
             static = static_region(previous, current) if repair else None
             hidden = {} if static is None or not static.any() else {"hidden": static}
             arrays = image_motion(previous, current, calibration[row], height=height, **hidden)
@@ -129,8 +128,3 @@ def _compute(drive: TensorDictBase, height: float, signs: bool, repair: bool, tw
                     two_view_motion(previous, current, calibration[row], **hidden)
                 )
     return TensorDict(motion, batch_size=[rows])
-
-
-def _grey(image: torch.Tensor):
-    pixels = image.numpy()
-    return pixels[0] if len(pixels) == 1 else cv2.cvtColor(pixels.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -51,10 +50,8 @@ class Updates:
     length: int = 24
 
     def __post_init__(self):
-        for name in ("sensor", "filter", "end_to_end", "length"):
-            check_count(f"{name} of Updates", getattr(self, name), least=-sys.maxsize)
-        if min(self.sensor, self.filter, self.end_to_end) < 1 or self.length < 2:
-            raise ValueError(f"each stage needs at least one update, and windows two steps; got {self}.")
+        for name, least in (("sensor", 1), ("filter", 1), ("end_to_end", 1), ("length", 2)):
+            check_count(f"{name} of Updates", getattr(self, name), least=least)
 
 
 def train_car_filter(

@@ -11,7 +11,7 @@ from torch_denkf.applications.car.vision.flow import coarse_flow, dense_flow, me
 from torch_denkf.applications.car.vision.hidden import continue_flow, continue_picture
 from torch_denkf.applications.car.vision.road import road_correlation
 
-__all__ = ["image_motion"]
+__all__ = ["grey_picture", "image_motion"]
 
 
 def image_motion(
@@ -63,3 +63,8 @@ def image_motion(
     if hole is not None:
         coarse[2] = mismatch
     return coarse, road
+
+
+def grey_picture(image: np.ndarray) -> np.ndarray:
+    """A picture ``[C, H, W]``, uint8, RGB or grey, as ``[H, W]``."""
+    return image[0] if len(image) == 1 else cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY)

@@ -8,18 +8,16 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple
-from itertools import accumulate
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from tensordict import TensorDict
 
 from torch_denkf.applications.ur5.data.files import COMMAND, MANIFEST, Demo, Entry, read_demo, read_manifest
 from torch_denkf.applications.ur5.simulation.names import TASKS
-from torch_denkf.data.cache import cache_folder, cached_in_place
-from torch_denkf.data.pictures import check_size
+from torch_denkf.data.cache import cache_folder, cached
+from torch_denkf.data.pictures import check_size, image_store, scaled
 
 _FORMAT = 1  # part of the cache's key: raise it when what is stored changes
 _CHUNK = 8  # demos that are decoded ahead of what is written
@@ -80,91 +78,68 @@ def read_demos(
     size = None if size is None else check_size(size)
     directory = cache_folder(cache)
     if directory is None:
-        return _read(root, entries, size, TensorDict.clone, progress)
+        return _read(root, entries, size, None, progress)
     key = json.dumps([_FORMAT, size, [astuple(entry) for entry in entries]])  # by content, wherever the folder lies
     name = "x".join(map(str, size)) if size else "stored"
     entry = directory / f"ur5-{len(entries)}-{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    # Filled where it lies: whole sequences of 2,000 demos at 112 px are 26 GB.
-    return cached_in_place(entry, lambda allocate: _read(root, entries, size, allocate, progress))
+    return cached(entry, lambda: _read(root, entries, size, directory, progress))
 
 
 def _read(
     root: Path,
     entries: Sequence[Entry],
     size: tuple[int, int] | None,
-    allocate: Callable[[TensorDict], TensorDict],
+    folder: Path | None,
     progress: Callable[[int], object],
 ) -> TensorDict:
-    first = read_demo(root, entries[0])
-    native = first.pixels.shape[2:]
+    native = read_demo(root, entries[0]).pixels.shape[2:]
     height, width = native if size is None else size
-    size = (height, width)
     frames = sum(entry.frames for entry in entries)
-    if frames and (size[0] > native[0] or size[1] > native[1]):
+    if frames and (height > native[0] or width > native[1]):
         raise ValueError(f"size {size} is larger than the demos' {native} in {root}; collect larger ones or pass less")
-    store = allocate(_like(sum(entry.rows for entry in entries), frames, size))
-    starts = list(accumulate((entry.rows for entry in entries), initial=0))
-    shots = list(accumulate((entry.frames for entry in entries), initial=0))
+    # Pictures go to the disk: those of whole sequences of 2,000 demos at 112 px are 26 GB.
+    pixels = image_store(frames, (height, width), folder if frames else None)
+    sums, parts, shot = np.zeros((2, frames, 3), np.int64), [], 0
 
-    def read(entry: Entry) -> tuple[Demo, np.ndarray]:
+    def read(entry: Entry) -> tuple[Demo, list[np.ndarray]]:
         demo = read_demo(root, entry)
         if demo.pixels.shape[2:] != native:
             raise ValueError(
                 f"{root / entry.file} has pictures of (H, W) = {demo.pixels.shape[2:]}, but "
                 f"{root / entries[0].file} of {native}; the demos of a folder have one size: collect into another"
             )
-        return demo, _scale(demo.pixels, size)
+        return demo, [scaled(picture.transpose(1, 2, 0), (height, width)) for picture in demo.pixels]
 
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # zlib, SHA-256 and OpenCV work without the GIL
         for begin in range(0, len(entries), _CHUNK):
-            for k, (demo, pixels) in enumerate(pool.map(read, entries[begin : begin + _CHUNK]), begin):
-                _fill(store, demo, pixels, starts[k], shots[k])
+            for demo, pictures in pool.map(read, entries[begin : begin + _CHUNK]):
+                parts.append(_rows(demo, shot))
+                for picture in pictures:
+                    pixels[shot] = picture
+                    sums[:, shot] = (
+                        picture.sum((1, 2), np.int64),
+                        np.square(picture, dtype=np.uint16).sum((1, 2), np.int64),
+                    )
+                    shot += 1
                 progress(1)
-    return store
-
-
-def _like(rows: int, frames: int, size: tuple[int, int]) -> TensorDict:
-    """Shapes and dtypes; takes no memory."""
-
-    def of(count: int, dtype: torch.dtype, *shape: int) -> torch.Tensor:
-        return torch.zeros((), dtype=dtype).expand(count, *shape)
-
-    entries = {
-        "state": of(rows, torch.float32, 10),
-        "action": of(rows, torch.float32, 7),
-        "success": of(rows, torch.bool, 1),
-        **{key: of(rows, torch.int64, 1) for key in ("task", "step", "frame")},
-    }
-    like = TensorDict({"rows": TensorDict(entries, [rows])})
+    rows = {key: torch.from_numpy(np.concatenate([part[key] for part in parts])) for key in parts[0]}
+    store = {"rows": TensorDict(rows, [len(rows["step"])])}
     if frames:
-        pictures = {"pixels": of(frames, torch.uint8, 3, *size)}
-        pictures |= {key: of(frames, torch.int64, 3) for key in ("sum", "square")}
-        like["frames"] = TensorDict(pictures, [frames])
-    return like
+        taken = {"pixels": pixels, "sum": sums[0], "square": sums[1]}
+        store["frames"] = TensorDict({key: torch.from_numpy(value) for key, value in taken.items()}, [frames])
+    return TensorDict(store)
 
 
-def _fill(store: TensorDict, demo: Demo, pixels: np.ndarray, start: int, shot: int) -> None:
+def _rows(demo: Demo, shot: int) -> dict[str, np.ndarray]:
+    """The rows of a demo whose first picture has the number ``shot``."""
     count = len(demo.state)
-    rows = store["rows"]
     frame = np.full(count, -1)
     frame[demo.steps] = np.arange(shot, shot + len(demo.steps))
-    values = {"state": demo.state, "action": demo.action, "success": demo.success[:, None]}
-    values |= {"task": np.full((count, 1), TASKS.index(demo.task)), "step": np.arange(count)[:, None]}
-    for key, value in {**values, "frame": frame[:, None]}.items():
-        rows[key][start : start + count] = torch.from_numpy(value)
-    if len(pixels):
-        frames = store["frames"]
-        at = slice(shot, shot + len(pixels))
-        frames["pixels"][at] = torch.from_numpy(pixels)
-        frames["sum"][at] = torch.from_numpy(pixels.sum((2, 3), dtype=np.int64))
-        frames["square"][at] = torch.from_numpy(np.square(pixels, dtype=np.uint16).sum((2, 3), dtype=np.int64))
-
-
-def _scale(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    if pixels.shape[2:] == size or not len(pixels):
-        return pixels
-    scaled = [
-        cv2.resize(np.ascontiguousarray(picture.transpose(1, 2, 0)), size[::-1], interpolation=cv2.INTER_AREA)
-        for picture in pixels
-    ]
-    return np.stack(scaled).transpose(0, 3, 1, 2)
+    return {
+        "state": demo.state.astype(np.float32),
+        "action": demo.action.astype(np.float32),
+        "success": demo.success[:, None],
+        "task": np.full((count, 1), TASKS.index(demo.task)),
+        "step": np.arange(count)[:, None],
+        "frame": frame[:, None],
+    }
