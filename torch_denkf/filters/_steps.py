@@ -276,7 +276,9 @@ def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
     """What a module writes where its reading is missing; nothing if it does not know."""
     if not isinstance(module, SubModel) or not module.reading_keys:
         return {}
+    if type(module).without_reading is SubModel.without_reading:
+        return {}
     readings = set(module.reading_keys)
     values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
     told = module.without_reading(*values, *(entries.get(key) for key in module.optional_keys))
-    return {} if told is None else module.by_key(told, "without_reading")
+    return module.by_key(told, "without_reading")

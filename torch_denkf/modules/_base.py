@@ -183,7 +183,7 @@ class SubModel(Checked, TensorDictModule):
             extra["noise"] = self._noise(entries, values, call)
         return self.by_key(self.compute(*values, **extra))
 
-    def by_key(self, out: Tensor | Sequence[Tensor], method: str = "compute") -> Entries:
+    def by_key(self, out: Tensor | Sequence[Tensor] | None, method: str = "compute") -> Entries:
         """What ``method`` returned, under :attr:`out_keys`.
 
         Raises:

@@ -16,7 +16,7 @@ from benchmarks.reliability.borders import kitti, pretrained
 from benchmarks.reliability.target import Subject, Target, targets_of
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.particle_for_tests import bootstrap
-from torch_denkf import envs, objectives, transforms
+from torch_denkf import envs, objectives
 from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, Updates, bridge_gaps, track
 from torch_denkf.applications.car.odometry.filter import car_filter
 from torch_denkf.applications.car.vision.camera import CanonicalCamera
@@ -40,7 +40,6 @@ def _flow(transform: Any) -> Any:
 
 
 def _transforms() -> Iterator[Subject]:
-    t = transforms
     bounds = d.Wrong(
         {"upside down": (2.0, 1.0), "nan": (NAN, 1.0), "inf": (0.0, INF), "one number": (1.0,), "text": "ab"}
     )
@@ -51,12 +50,12 @@ def _transforms() -> Iterator[Subject]:
     fraction = d.Wrong({"negative": -0.1, "beyond a half": 0.7, "nan": NAN, "text": "x"})
     camera = lambda: {"calibration": (40.0, 40.0, 35.0, 11.0)}  # noqa: E731
     calibration = CALIBRATION | {"negative": (-4.0, 40.0, 35.0, 11.0)}
-    yield Subject(t.MissingFrames, use=_pictures)
-    yield Subject(t.BlackFrames, use=_pictures)
-    yield Subject(t.Blur, use=_pictures, wrong={"kernel": kernel})
-    yield Subject(t.Brightness, use=_pictures, wrong={"gain": bounds | {"negative": (-1.0, 1.0)}, "offset": bounds})
-    yield Subject(t.OccludingBox, use=_pictures, wrong={"size": shares, "position": shares})
-    yield Subject(t.SaltAndPepper, use=_pictures, wrong={"fraction": fraction})
+    yield Subject(envs.MissingFrames, use=_pictures)
+    yield Subject(envs.BlackFrames, use=_pictures)
+    yield Subject(envs.Blur, use=_pictures, wrong={"kernel": kernel})
+    yield Subject(envs.Brightness, use=_pictures, wrong={"gain": bounds | {"negative": (-1.0, 1.0)}, "offset": bounds})
+    yield Subject(envs.OccludingBox, use=_pictures, wrong={"size": shares, "position": shares})
+    yield Subject(envs.SaltAndPepper, use=_pictures, wrong={"fraction": fraction})
     yield Subject(OpticalFlow, camera, _flow, {"calibration": calibration})
 
 
