@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 STUDY = """
 import os, time
 from functools import partial
@@ -61,7 +63,8 @@ def test_workers_of_a_killed_parent_end(tmp_path):
         time.sleep(0.05)
 
 
-def test_workers_of_a_killed_study_end(tmp_path):
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+def test_workers_of_a_study_end_with_it(tmp_path, how):
     file, folder = tmp_path / "study.py", tmp_path / "begun"
     file.write_text(STUDY)
     folder.mkdir()
@@ -73,7 +76,7 @@ def test_workers_of_a_killed_study_end(tmp_path):
             assert time.monotonic() < until
             time.sleep(0.05)
         assert all(map(running, workers))
-        run.send_signal(signal.SIGKILL)
+        run.send_signal(how)
     until = time.monotonic() + 20
     while any(map(running, workers)):
         assert time.monotonic() < until

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import torch
@@ -46,10 +46,15 @@ def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: s
             call()
         return
     context = get_context("spawn")
-    with ProcessPoolExecutor(processes, context, initializer=follow_parent, initargs=(False,)) as pool:
+    with ProcessPoolExecutor(processes, context, initializer=follow_parent) as pool:
         futures = [pool.submit(call) for call in calls]
-        for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
-            future.result()
+        try:
+            for future in tqdm(as_completed(futures), total=len(futures), desc=title, disable=None):
+                future.result()
+        except KeyboardInterrupt:
+            for worker in active_children():  # they leave Ctrl-C to this process, which would wait for all their calls
+                worker.terminate()
+            raise
 
 
 def compute(jobs: Mapping[Path, Callable[[], list[dict]]], processes: int, title: str) -> list[dict]:

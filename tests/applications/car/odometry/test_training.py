@@ -102,7 +102,7 @@ def test_mistakes_say_what_to_do(root, trained, tmp_path):
         train_car_filter(tmp_path, root=root, drives=["z"], **OPTIONS)
     with pytest.raises(ValueError, match=r"last\.pt is of another training: seed \(3, now 4\)"):
         train_car_filter(trained[0], root=root, **{**OPTIONS, "seed": 4})
-    with pytest.raises(ValueError, match="at least one update"):
+    with pytest.raises(ValueError, match="filter of Updates must be a whole number, at least 1; got 0"):
         Updates(filter=0)
     with pytest.raises(ValueError, match=r"dt must be finite and above 0; got 0.0"):
         car_filter(dt=0.0)
