@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 STUDY = """
-import os, time
+import os, signal, time
 from functools import partial
 from pathlib import Path
 from benchmarks.common.jobs import side_by_side
@@ -20,6 +20,7 @@ def work(folder):
     time.sleep(600)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
     side_by_side([partial(work, os.environ["FOLDER"])] * 2, 2, "study")
 """
 PROGRAM = """
@@ -77,6 +78,10 @@ def test_workers_of_a_study_end_with_it(tmp_path, how):
             time.sleep(0.05)
         assert all(map(running, workers))
         run.send_signal(how)
+        try:
+            run.wait(60)
+        finally:
+            run.kill()
     until = time.monotonic() + 20
     while any(map(running, workers)):
         assert time.monotonic() < until

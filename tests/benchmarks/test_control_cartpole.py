@@ -91,7 +91,8 @@ def still_filter(members=8):
     """One without process noise, that starts at given members: all its steps are determined."""
     filter = cartpole.unlearned_filter(members)
     torch.manual_seed(0)
-    filter.initial = FixedEnsemble(torch.tensor(cartpole.START) + 0.1 * torch.randn(members, 5))
+    start = torch.tensor(cartpole.START) + 0.1 * torch.randn(members, 5)
+    filter.replace("initial", FixedEnsemble(start))
     with torch.no_grad():
         filter["transition"].module["noise"].log_variance.fill_(-60.0)
     return filter

@@ -124,8 +124,8 @@ def test_a_start_without_the_reading_is_the_prior(float64, case):
     modules |= parts_of_reading(0, "forecast", "mid", info_prefix="i0")
     modules |= parts_of_reading(1, "mid", "belief", info_prefix="i1")
     if case == "weights":
-        filter = bootstrap(7, initial=with_weights(start))
-        filter.module.update(torch.nn.ModuleDict({"r0": modules["r0"]}))
+        particles = dict(bootstrap(7).module.items())
+        filter = Filter({**particles, "r0": modules["r0"]}, initial=with_weights(start))
         noise_key = ("noise", "initial.initial")
     else:
         filter = Filter(modules, initial=start, update_at_reset=case == "update at reset")
@@ -164,7 +164,7 @@ def test_an_unstable_system_that_nobody_observes_stays_finite_and_comes_back(kin
         else:
             filter = bootstrap(64, initial=prior)
             filter.module["transition"].module = NoisyLinear(F, one)
-            filter.module["observation"], filter.module["noise"] = parts["observation"], parts["noise"]
+            filter.replace("observation", parts["observation"]).replace("noise", parts["noise"])
     td = filter.initialise(TensorDict({"observation": torch.zeros(1)}))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -107,7 +107,7 @@ def test_a_policy_carries_actions_that_need_not_be_there():
             self.in_keys, self.optional_keys = self.in_keys[:1], ["action"]
 
     filter = linear_denkf()
-    filter.module["transition"] = Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]]))
+    filter.replace("transition", Coasting(linear_system()[0], torch.tensor([[0.5], [-1.0]])))
     assert ("previous", "action") in filter.make_tensordict_primer().actions.values()
     td = filter.initialise(TensorDict({"observation": torch.randn(2)}))
     coasting = filter.predict(td.copy())["belief", "mean"]

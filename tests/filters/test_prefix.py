@@ -23,7 +23,7 @@ def named(name, prefix="imu"):
     """A filter of the contract's table, twice: without and with a prefix, under one noise."""
     plain, other = FILTERS[name](), FILTERS[name]()
     other.prefix = prefix
-    other._sort()
+    other._sort()  # as its constructor would
     frames = plain.draw_noise(readings(3, 6))
     return plain, other, frames
 

@@ -1,5 +1,7 @@
 """Resets that update, policies' data, analyses inside sequences, marks in data: what a stranger composed first."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -87,15 +89,14 @@ def test_a_step_on_entries_sees_a_replaced_module():
     filter = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
     entries = {MEAN: torch.zeros(1), ("belief", "cov"): one, "observation": torch.ones(1)}
     before = filter.take_step(dict(entries), torch.Size([]))[MEAN]
-    filter.module["analysis"] = KalmanAnalysis(one, 2 * one)
+    filter.replace("analysis", KalmanAnalysis(one, 2 * one))
     after = filter.take_step(dict(entries), torch.Size([]))[MEAN]
     torch.testing.assert_close(torch.cat([before, after]), torch.tensor([2 / 3, 1 / 2]))
 
 
 def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
     filter = blocks(named=True)
-    old = filter["second"].module[1]
-    filter["second"].module[1] = EnsembleAnalysis(
+    new = EnsembleAnalysis(
         "etkf",
         forecast_key=("mid", "ensemble"),
         predicted_key="p1",
@@ -103,7 +104,8 @@ def test_a_module_replaced_inside_a_sequence_is_sorted_anew(float64):
         noise_variance_key="r1",
         observed_key="seen",
     )
-    assert old is not filter["second"].module[1]
+    filter.replace("second.1", new)
+    assert filter["second"].module[1] is new
     frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
     hidden = filter.sequence(frames.copy().set("seen", torch.zeros(5, 1, dtype=torch.bool)))
     assert not hidden[MEAN].equal(filter.sequence(frames.copy())[MEAN])
@@ -180,3 +182,25 @@ def test_groups_of_next_and_previous_mark_nothing(float64):
     plain = filter.sequence(data.copy())
     data["next", "agents", "is_init"] = data["previous", "is_init"] = torch.ones(9, 1, dtype=torch.bool)
     close(filter.sequence(data), plain, [ENSEMBLE, MEAN])
+
+
+def test_modules_are_exchanged_by_the_filter_alone():
+    """An exchange behind its back is named; where a new module does not fit, the old one stays."""
+    filter, one = blocks(named=True), torch.ones(1, 1)
+    frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
+    before = filter.structure
+    for place in ("third", "second.7", "second.1.network", "initial.mean"):
+        with pytest.raises(KeyError, match=f"no module at '{place}'"):
+            filter.replace(place, filter["second"])
+    with pytest.raises(ValueError, match="no module writes"):
+        filter.replace("second", Select([0], out_key="elsewhere"))
+    assert filter.structure.modules == before.modules
+    old = filter["second"].module[1]
+    filter["second"].module[1] = KalmanAnalysis(one, one)
+    with pytest.raises(RuntimeError, match=r"filter.replace\("):
+        filter.sequence(frames.copy())
+    filter["second"].module[1] = old
+    filter.sequence(frames.copy())
+    filter.initial = copy.deepcopy(filter.initial)
+    with pytest.raises(RuntimeError, match=r"filter.replace\("):
+        filter.sequence(frames.copy())

@@ -14,7 +14,7 @@ from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, li
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_noise_sizes import SizeAtTheStep
 from torch_denkf.envs import LinearGaussianEnv
-from torch_denkf.filters import DEnKF
+from torch_denkf.filters import DEnKF, Filter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform
@@ -55,7 +55,7 @@ class Perturbed(SubModel):
 
 def with_analysis(analysis, **kwargs):
     filter = linear_denkf("perturbed", noisy=True, **kwargs)
-    filter.module["analysis"] = analysis
+    filter.replace("analysis", analysis)
     return filter
 
 
@@ -88,7 +88,7 @@ def test_a_stochastic_analysis_that_names_no_variances_compiles(float64):
 def test_a_compiled_filter_that_cannot_draw_its_noise_says_so_once():
     F, Q, _, _ = linear_system()
     filter = linear_denkf("perturbed", noisy=True)
-    filter.module["transition"] = SizeAtTheStep(F, torch.linalg.cholesky(Q))
+    filter.replace("transition", SizeAtTheStep(F, torch.linalg.cholesky(Q)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         out = filter.sequence(readings(2, 3))
@@ -173,11 +173,11 @@ def test_no_false_alarm_where_the_mask_is_read(make):
 def test_no_false_alarm_for_an_analysis_without_a_mask(case):
     filter = with_analysis(Perturbed())
     if case == "another reads it":
-        first = linear_denkf("etkf")["analysis"]
-        filter = linear_denkf("perturbed", noisy=True)
-        filter.module["second"] = Perturbed(reading="encoders", info="other")
-        filter.module["second"].in_keys[0] = ("belief", "ensemble")
-        filter.module["analysis"] = first
+        plain = linear_denkf("perturbed", noisy=True)
+        plain.replace("analysis", linear_denkf("etkf")["analysis"])
+        second = Perturbed(reading="encoders", info="other")
+        second.in_keys[0] = ("belief", "ensemble")
+        filter = Filter({**dict(plain.module.items()), "second": second}, initial=plain.initial)
     observed = {"no mask": None, "nothing hidden": torch.tensor([True])}.get(case, torch.tensor([False]))
     td = filter.initialise(readings(observed=observed).set("encoders", torch.zeros(2)))
     with warnings.catch_warnings():

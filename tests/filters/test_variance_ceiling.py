@@ -51,7 +51,7 @@ def test_members_that_are_not_held_do_not_move_by_a_bit():
     F = torch.diag(torch.tensor([1.7, 0.9]))
     held, free = linear_denkf(variance_ceiling=5.0), linear_denkf(variance_ceiling=None)
     for filter in (held, free):
-        filter.module["transition"] = NoisyLinear(F)
+        filter.replace("transition", NoisyLinear(F))
     td = free.initialise(unseen(2))
     td[ENSEMBLE] = td[ENSEMBLE] / 7 + torch.tensor([1.0, 1 / 3])
     td[ENSEMBLE][1, :, 0] *= 20.0

@@ -371,6 +371,7 @@ def test_readings_that_cannot_be_true_count_once_and_change_nothing(float64, kin
     given = {"members": members, "noisy": False} if kind == "ensemble" else {}
     filter = fused(kind, joint=joint, delay=delay, **given)
     filter.reject = True
+    filter._sort()  # as its constructor would
     broken = frames.copy()
     broken["second"] = frames["second"].clone()
     broken["second_observed"][:, 4:6] = True

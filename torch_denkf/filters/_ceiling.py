@@ -54,8 +54,8 @@ def hold_variances(
         ceiling: largest variance, in the state's units squared.
         say: told which variance is held.
     """
-    for key in _variances(belief):
-        variance = written.get(key)
+    for key in belief:
+        variance = written.get(key) if key[-1] == "var" else None
         if variance is None:
             continue
         exceeded = _exceeds(variance, ceiling)
@@ -103,14 +103,10 @@ def look_at_ceiling(filter: Filter, written: Entries) -> None:
     """Says whether a variance is held at the ceiling, where a compiled graph could not."""
     if filter.variance_ceiling is None or "ceiling" in filter._said or torch.compiler.is_compiling():
         return
-    for key in _variances(filter.structure.belief):
-        value = written.get(key)
+    for key in filter.structure.belief:
+        value = written.get(key) if key[-1] == "var" else None
         if value is not None and not value.is_cuda and (value >= 0.999 * filter.variance_ceiling).any():
             say_ceiling(filter, key)
-
-
-def _variances(belief: Iterable[NestedKey]) -> list[NestedKey]:
-    return [key for key in belief if key[-1] == "var"]
 
 
 def _exceeds(variance: Tensor, ceiling: float) -> bool | None:

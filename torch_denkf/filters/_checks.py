@@ -55,7 +55,7 @@ def check_inputs(
         without: readings that are missing on purpose.
         carry: whether the belief must be there.
     """
-    structure, name = filter._structure, type(filter).__name__
+    structure, name = filter.structure, type(filter).__name__
     for key in structure.carry if carry else ():
         if key not in entries:
             raise KeyError(
@@ -111,11 +111,11 @@ def refuse_non_finite(
         reject: whether readings that are not finite were rejected, and are no mistake.
         unread: rows ``[*B]`` or ``[*B, 1]`` whose readings were not used.
     """
-    sound = [_is_sound(key, of[key]) for of in (entries, written) for key in structure.carry if key in of]
-    if None in sound:
+    sound = _is_sound(structure.carry, entries, written)
+    if sound is None:
         return
     absurd = [] if reject else rejected_keys(structure.guards, _without_rows(structure, entries, unread))
-    if all(sound) and not absurd:
+    if sound and not absurd:
         return
     refuse_far_belief(entries, structure.carry)
     finite = all(is_finite(key, written[key]) for key in structure.carry if key in written)
@@ -143,11 +143,16 @@ def masks_in(optional: Iterable[NestedKey]) -> list[NestedKey]:
     return [key for key in optional if key[-1] != "log_weight"]
 
 
-def _is_sound(key: NestedKey, value: Tensor) -> bool | None:
-    """Whether an entry of a belief is finite and not far, at once; ``None`` where it has no values, as in vmap."""
-    if not value.is_floating_point():
-        return True
-    return flag_value(((value if key[-1] == "log_weight" else value.abs()) <= LARGEST_READING).all())
+def _is_sound(carry: Sequence[NestedKey], *beliefs: Entries) -> bool | None:
+    """Whether beliefs are finite and not far, looked at once; ``None`` where there are no values, as in vmap."""
+    sound = None
+    for key in carry:
+        for belief in beliefs:
+            value = belief.get(key)
+            if value is not None and value.is_floating_point():
+                fine = ((value if key[-1] == "log_weight" else value.abs()) <= LARGEST_READING).all()
+                sound = fine if sound is None else sound & fine
+    return True if sound is None else flag_value(sound)
 
 
 def _without_rows(structure: Structure, entries: Entries, rows: Tensor | None) -> Entries:

@@ -6,16 +6,15 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torch_denkf.filters._checks import refuse_unknown_noise
-from torch_denkf.modules._call import Entries, flat_noise
+from torch_denkf.modules._call import Entries
 
 if TYPE_CHECKING:
     from torch_denkf.filters.base import Filter
 
-__all__ = ["entries_of", "of_one_robot", "own", "write"]
+__all__ = ["of_one_robot", "own", "write"]
 
 
 def of_one_robot(filter: Filter, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
@@ -33,24 +32,6 @@ def of_one_robot(filter: Filter, tensordict: TensorDictBase | Mapping[str, Any])
     if like is None:
         return out
     return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
-
-
-def entries_of(filter: Filter, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Entries:
-    """The entries ``keys``, as far as they are there, and the noise.
-
-    Raises:
-        KeyError: if there is noise that no module draws.
-    """
-    entries = {}
-    for key in keys:
-        value = tensordict.get(filter.outer(key), None)
-        if value is not None:
-            entries[key] = value
-    noise = flat_noise(tensordict.get(filter.outer("noise"), None))
-    if noise:
-        refuse_unknown_noise(filter, noise)
-        entries.update(noise)
-    return entries
 
 
 def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
@@ -73,7 +54,8 @@ def write(filter: Filter, tensordict: TensorDictBase, written: Entries) -> None:
     """Sets entries, looking up each nested tensordict once."""
     owners: dict[tuple, Any] = {}
     for key, value in written.items():
-        key = filter.outer(key)
+        if filter.prefix is not None:
+            key = filter.outer(key)
         prefix = () if isinstance(key, str) else key[:-1]
         owner = tensordict if not prefix else owners.get(prefix)
         if owner is None:

@@ -82,7 +82,7 @@ def draw_noise(
 
 def _sizes(filter: Filter, entries: Entries) -> tuple[int | None, int | None]:
     """E and S of the belief."""
-    for key in filter._structure.carry:
+    for key in filter.structure.carry:
         if key[-1] == "ensemble" and key in entries:
             members, state_dim = entries[key].shape[-2:]
             return members, state_dim
@@ -95,7 +95,7 @@ def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | 
 
     A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
     """
-    known = filter._structure.observation_dims
+    known = filter.structure.observation_dims
     key = part.noise_variance_key
     if key is not None:
         return entries[key].shape[-1] if key in entries else known.get(key)

@@ -36,8 +36,9 @@ __all__ = ["first_belief", "initial_belief", "policy_step", "step", "step_withou
 def step(filter: Filter, tensordict: TensorDictBase, without: Sequence[NestedKey]) -> TensorDictBase:
     """See :meth:`Filter.step`."""
     structure = filter.structure
-    without = refuse_unknown_readings(structure, without)
-    refuse_single_readings(structure, without)
+    if without:
+        without = refuse_unknown_readings(structure, without)
+        refuse_single_readings(structure, without)
     entries = filter.entries_of(tensordict, one_step=True)
     check_inputs(filter, entries, tensordict, without)
     if without:
@@ -111,8 +112,7 @@ def policy_step(filter: Filter, tensordict: TensorDictBase) -> TensorDictBase:
 
 def take_step(filter: Filter, entries: Entries, batch_size: torch.Size, reject: bool | None = None) -> Entries:
     """See :meth:`Filter.take_step`."""
-    structure = filter.structure  # first: it sorts replaced modules anew
-    steps = filter.steps(reject=reject)
+    structure, steps = filter.structure, filter.steps(reject=reject)
     if filter.compiled is not None:
         drawn = draw_noise(filter, entries, batch_size, structure.modules)
         if drawn is not None:

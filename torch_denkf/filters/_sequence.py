@@ -65,7 +65,6 @@ def filter_sequence(
             "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
             f"batch_size {list(size)}."
         )
-    filter.structure  # noqa: B018 - sorts the modules anew where one has been replaced
     inner = {filter.outer(key): key for key in (*filter.structure.frame_keys, *filter.steps().step_keys)}
     keep = list(inner.values()) if keep is None else [inner.get(key, key) for key in map(unravel_key, keep)]
     unknown = [key for key in keep if key not in inner.values()]

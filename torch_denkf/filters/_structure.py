@@ -12,9 +12,18 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters._rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import declared, in_sequences, is_sequence, marks_of, reads, reads_of, writes
+from torch_denkf.modules._running import (
+    declared,
+    in_sequences,
+    is_sequence,
+    marks_of,
+    named_modules_of,
+    reads,
+    reads_of,
+    writes,
+)
 
-__all__ = ["KNOWN", "Placed", "Structure", "all_modules", "previous_key", "submodels"]
+__all__ = ["KNOWN", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
@@ -34,12 +43,12 @@ def submodels(module: torch.nn.Module) -> list[SubModel]:
     return [part for part in module.modules() if isinstance(part, SubModel)]
 
 
-def all_modules(sequence: TensorDictSequential) -> Iterator[TensorDictModuleBase]:
-    """The modules of a filter, and those of the plain sequences among them."""
-    for module in sequence._modules["module"]._modules.values():
-        yield module
+def sequences_in(sequence: TensorDictSequential) -> Iterator[TensorDictSequential]:
+    """A filter, and the plain sequences inside it."""
+    yield sequence
+    for _, module in named_modules_of(sequence):
         if is_sequence(module):
-            yield from all_modules(module)
+            yield from sequences_in(module)
 
 
 class Structure(NamedTuple):

@@ -27,16 +27,16 @@ from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters import _one_step
 from torch_denkf.filters._ceiling import say_ceiling
-from torch_denkf.filters._checks import refuse_two_precisions, refuse_unguarded
+from torch_denkf.filters._checks import refuse_two_precisions, refuse_unguarded, refuse_unknown_noise
 from torch_denkf.filters._compiled import CompiledSteps
-from torch_denkf.filters._entries import entries_of, of_one_robot
+from torch_denkf.filters._entries import of_one_robot
 from torch_denkf.filters._noise import write_noise
 from torch_denkf.filters._primer import belief_primer
 from torch_denkf.filters._sequence import filter_sequence, stepped
 from torch_denkf.filters._steps import Steps
-from torch_denkf.filters._structure import Structure, all_modules
+from torch_denkf.filters._structure import Structure, sequences_in
 from torch_denkf.filters._summaries import summarise
-from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._call import Call, Entries, flat_noise
 from torch_denkf.modules._running import check_module, named_modules_of, reads
 
 __all__ = ["Filter"]
@@ -137,26 +137,68 @@ class Filter(Checked, TensorDictSequential):
         refuse_two_precisions(self)
         self._sort()
 
-    @property
-    def structure(self) -> Structure:
-        """The modules by what they read; found anew where one of them has been replaced."""
-        if self._sorted_for != (*all_modules(self), self.initial, *self.control_keys, self.reject):
-            self._sort()
-        return self._structure
-
     def _sort(self) -> None:
         """Sorts the modules, and says what they read and write."""
         structure = Structure.of(named_modules_of(self), self.initial, self.control_keys, self.forecast_keys)
-        self._sorted_for = (*all_modules(self), self.initial, *self.control_keys, self.reject)
-        self._structure = structure
+        if self.reject:
+            refuse_unguarded(structure, type(self).__name__)
+        self.structure = structure
+        self._sequences = list(sequences_in(self))
+        self._sorted = self._parts()
         written = [*structure.frame_keys, *self.steps().step_keys]
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
-        self._all_keys = list(dict.fromkeys([*structure.in_keys(self.init_key), *chain(*reads(self.initial))]))
-        if self.reject:
-            refuse_unguarded(structure, type(self).__name__)
-        self._step_keys = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
+        everything = [*structure.in_keys(self.init_key), *chain(*reads(self.initial))]
+        a_step = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
+        self._all_keys, self._step_keys = ({key: self.outer(key) for key in keys} for keys in (everything, a_step))
+
+    def _parts(self) -> list:
+        """What the structure was made of."""
+        parts = [part for sequence in self._sequences for part in sequence.module._modules.values()]
+        return [*parts, self.initial, self.reject, self.prefix]
+
+    def replace(self, place: str, module: TensorDictModuleBase) -> Filter:
+        """Puts a module in the place of another one, and sorts the modules anew.
+
+        Args:
+            place: name or number of the module; of one inside a sequence both names, ``"second.1"``; ``"initial"`` for
+                the initial belief.
+            module: the new one.
+
+        Returns:
+            This filter.
+
+        Raises:
+            KeyError: if there is no such place.
+            TypeError: if ``module`` is no TensorDict module.
+            ValueError: if the new module does not fit the others. The old one then stays.
+
+        Example:
+            >>> from torch_denkf.filters import KalmanFilter
+            >>> from torch_denkf.modules import KalmanAnalysis
+            >>> one = torch.eye(1)
+            >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
+            >>> kf.replace("analysis", KalmanAnalysis(one, 4 * one)).module["analysis"].noise_cov
+            tensor([[4.]])
+        """
+        check_module("module", module)
+        *path, name = place.split(".")
+        try:
+            sequences = (f"{step}.module" for step in path)
+            where = self if place == "initial" else self.get_submodule(".".join(["module", *sequences]))
+            old = where.get_submodule(name)
+        except AttributeError:
+            names = [name for name, _ in named_modules_of(self)]
+            raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {names}.") from None
+        setattr(where, name, module)
+        try:
+            self._sort()
+        except ValueError:
+            setattr(where, name, old)
+            self._sort()
+            raise
+        return self
 
     @property
     def carry_keys(self) -> list[NestedKey]:
@@ -357,12 +399,32 @@ class Filter(Checked, TensorDictSequential):
         """What one step does, on entries; ``update_at_reset`` and ``reject`` as the filter's by default."""
         update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
         reject = self.reject if reject is None else reject
-        return Steps(self._structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self), reject)
+        return Steps(self.structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self), reject)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
-        """What the modules may read, as far as it is there; for ``one_step`` not what starts a sequence."""
-        self.structure  # noqa: B018 - sorts the modules anew where one has been replaced
-        return entries_of(self, tensordict, self._step_keys if one_step else self._all_keys)
+        """What the modules may read, as far as it is there, and noise; for ``one_step`` not what starts a sequence.
+
+        Raises:
+            KeyError: if there is noise that no module draws.
+            RuntimeError: if a module was exchanged without :meth:`replace`.
+        """
+        if not torch.compiler.is_compiling() and self._parts() != self._sorted:
+            raise RuntimeError(
+                f"A module of {type(self).__name__}, its initial belief, reject or prefix was exchanged after it was "
+                'made. Let the filter do it, which then sorts its modules anew: filter.replace("analysis", module); '
+                "the two options are arguments of its constructor."
+            )
+        keys = self._step_keys if one_step else self._all_keys
+        entries = {}
+        for key, outer in keys.items():
+            value = tensordict.get(outer, None)
+            if value is not None:
+                entries[key] = value
+        noise = flat_noise(tensordict.get(self.outer("noise"), None))
+        if noise:
+            refuse_unknown_noise(self, noise)
+            entries.update(noise)
+        return entries
 
     def initial_belief(self, entries: Entries, call: Call) -> Entries:
         """The belief at the start of an episode."""

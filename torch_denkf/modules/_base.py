@@ -174,7 +174,10 @@ class SubModel(Checked, TensorDictModule):
         Raises:
             KeyError: if an entry is missing.
         """
-        values: list[Tensor | None] = [self.required(entries, key) for key in self.in_keys]
+        try:
+            values: list[Tensor | None] = [entries[key] for key in self.in_keys]
+        except KeyError:  # the message says what there is
+            values = [self.required(entries, key) for key in self.in_keys]
         values += [entries.get(key) for key in self.optional_keys]
         extra: dict[str, Any] = {}
         if "batch_size" in self._wants:

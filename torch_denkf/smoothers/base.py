@@ -97,11 +97,10 @@ class Smoother(Checked, TensorDictModuleBase):
 
     def _filter_for(self, count: int) -> Filter:
         """The filter that runs on sequences of ``count`` steps; made anew where a module has been replaced."""
-        self.filter.structure  # noqa: B018 - sorts the modules anew
-        made_for = (self.lag if self.lag is not None else max(count - 1, 1), *self.filter._sorted_for)
-        if self._running[0] != made_for:
-            self._running = (made_for, self._extended(made_for[0]))
-        filter, compiled = self._running[1], self.filter.compiled
+        lag = self.lag if self.lag is not None else max(count - 1, 1)
+        if self._running[0] != lag or self._running[1] is not self.filter.structure:
+            self._running = (lag, self.filter.structure, self._extended(lag))
+        filter, compiled = self._running[2], self.filter.compiled
         if filter is not self.filter and (filter.compiled is None) != (compiled is None):
             filter.compile(**({"chunk": 0} if compiled is None else {"chunk": compiled.chunk, **compiled.options}))
         return filter

@@ -328,6 +328,7 @@ def test_a_rejected_reading_counts_as_not_observed(float64, masked):
         del bad["observed"]
     filter, outs = pair_filter(16), []
     filter.reject = True
+    filter._sort()  # as its constructor would
     for data in (bad, hidden):
         torch.manual_seed(3)
         outs.append(filter.sequence(data))
