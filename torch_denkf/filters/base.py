@@ -179,7 +179,7 @@ class Filter(Checked, TensorDictSequential):
             >>> from torch_denkf.modules import KalmanAnalysis
             >>> one = torch.eye(1)
             >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
-            >>> kf.replace("analysis", KalmanAnalysis(one, 4 * one)).module["analysis"].noise_cov
+            >>> kf.replace("analysis", KalmanAnalysis(one, 4 * one)).module["analysis"].noise
             tensor([[4.]])
         """
         check_module("module", module)
