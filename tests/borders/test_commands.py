@@ -39,7 +39,7 @@ def test_drives_without_a_root(tmp_path, capsys):
 def test_images_without_poses(tmp_path, capsys):
     (tmp_path / "sequences" / "town" / "image_2").mkdir(parents=True)
     assert main(["evaluate", "--root", str(tmp_path)]) == 2
-    message = f"error: no drive below {tmp_path} has both images and poses: no poses/NAME.txt for ['town']\n"
+    message = f"error: no drive below {tmp_path} has both images and poses: no poses/town.txt\n"
     assert capsys.readouterr().err == message
 
 

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from tests.filters.factories import FixedEnsemble, NoisyLinear, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import directional_check
 from torch_denkf.filters import EKF, DEnKF, Filter
-from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.functional import wrap_angles
 from torch_denkf.fusion import FusedFilter, FusedSensor, Refiltering
 from torch_denkf.fusion.parts import JoinedReading

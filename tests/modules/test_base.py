@@ -11,7 +11,7 @@ from torch import nn
 
 from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
-from torch_denkf.filters._steps import _without_reading
+from torch_denkf.filters.scan import _without_reading
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,

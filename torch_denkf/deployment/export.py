@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_denkf._files import write_bytes
 from torch_denkf.deployment.package import SIGNATURE
 from torch_denkf.filters import Filter
-from torch_denkf.filters._rejection import REJECTED
+from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.inductor import (
     clear_damaged_libraries,
     clear_full_cache,

@@ -9,8 +9,8 @@ from typing import Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules._running import check_module
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]

@@ -14,30 +14,48 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.modules import set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.filters import _one_step
-from torch_denkf.filters._ceiling import say_ceiling
-from torch_denkf.filters._checks import refuse_two_precisions, refuse_unguarded, refuse_unknown_noise
-from torch_denkf.filters._compiled import CompiledSteps
-from torch_denkf.filters._entries import of_one_robot
-from torch_denkf.filters._noise import write_noise
-from torch_denkf.filters._primer import belief_primer
-from torch_denkf.filters._sequence import filter_sequence, stepped
-from torch_denkf.filters._steps import Steps
-from torch_denkf.filters._structure import Structure, sequences_in
-from torch_denkf.filters._summaries import summarise
+from torch_denkf._slices import as_rows, starts_of
+from torch_denkf.filters.compiled import CompiledSteps
+from torch_denkf.filters.finish import (
+    own,
+    refuse_absurd_readings,
+    refuse_far_belief,
+    refuse_non_finite,
+    write,
+)
+from torch_denkf.filters.gather import gather_rows
+from torch_denkf.filters.gather import of_one_robot as _of_one_robot
+from torch_denkf.filters.messages import Messages
+from torch_denkf.filters.noise import draw_noise
+from torch_denkf.filters.options import FilterOptions
+from torch_denkf.filters.primer import LastAction
+from torch_denkf.filters.refusals import (
+    check_inputs,
+    refuse_missing_actions,
+    refuse_single_readings,
+    refuse_two_precisions,
+    refuse_unguarded,
+    refuse_unknown_noise,
+    refuse_unknown_readings,
+)
+from torch_denkf.filters.scan import Steps, where_rows
+from torch_denkf.filters.structure import KNOWN, Structure, previous_key, sequences_in, submodels
 from torch_denkf.modules._call import Call, Entries, flat_noise
-from torch_denkf.modules._running import check_module, named_modules_of, reads
+from torch_denkf.modules._running import check_module, declared, named_modules_of, reads, run_module
+from torch_denkf.modules._summaries import summaries
 
 __all__ = ["Filter"]
 
@@ -133,7 +151,7 @@ class Filter(Checked, TensorDictSequential):
             raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
         self.prefix = prefix
         self.compiled: CompiledSteps | None = None
-        self._said: set[str] = set()
+        self.messages = Messages(type(self).__name__)
         refuse_two_precisions(self)
         self._sort()
 
@@ -262,7 +280,19 @@ class Filter(Checked, TensorDictSequential):
         Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
         the last action (:class:`torch_denkf.transforms.LastAction`).
         """
-        return belief_primer(self)
+        told, like = declared(self.initial), self.like()
+        like = torch.zeros(()) if like is None else like
+        size = told.input_dim or told.state_dim or 1
+        zeros = torch.zeros(size, dtype=like.dtype, device=like.device)
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            belief = self.initial(TensorDict({key: zeros.clone() for key in self.initial.in_keys}))
+        primers = Composite()
+        for key in self.structure.carry:
+            value = belief.get(key)
+            kept = self.outer(previous_key(key))
+            primers[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
+        primers[self.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
+        return LastAction({key: self.outer(previous_key(key)) for key in self.structure.controls}, primers=primers)
 
     def compile(self, *, chunk: int = 4, **options) -> Filter:
         """From now on runs steps, and sequences in chunks of steps, through ``torch.compile``.
@@ -301,7 +331,35 @@ class Filter(Checked, TensorDictSequential):
         """Takes one step, or filters a sequence in recurrent mode; writes into ``tensordict``."""
         if recurrent_mode():
             return self.sequence(tensordict)
-        return _one_step.policy_step(self, tensordict)
+        structure, size = self.structure, tensordict.batch_size
+        entries = self.entries_of(tensordict)
+        given = list(entries.values())
+        refuse_missing_actions(structure, entries, all(previous_key(key) in entries for key in structure.carry))
+        for key in (*structure.carry, *structure.controls):
+            if previous_key(key) in entries:
+                entries[key] = entries[previous_key(key)]
+        check_inputs(structure, type(self).__name__, entries, tensordict)
+        self.messages.ignored_masks(structure, tensordict)
+        self.messages.wrong_start(entries[structure.carry[0]])
+        # A mark may be that of a slice of data, which goes on from the belief before it.
+        known = entries.get(KNOWN)
+        reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
+        if reset is None:
+            written = self.take_step(entries, size)
+        else:
+            steps, call = self.steps(), Call(size)
+            written = steps.step(entries, call, reset=reset, start=lambda now: self.initial_belief(now, call))
+            steps.blank(written, reset)
+            # What went before does not count where an episode begins.
+            entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
+        if self.check_finite and not torch.compiler.is_compiling():
+            unread = None if self.update_at_reset else reset
+            refuse_non_finite(structure, entries, written, self.reject, unread)
+        following = {("next", *previous_key(key)): written[key] for key in structure.carry}
+        following["next", *KNOWN] = torch.ones(*size, 1, dtype=torch.bool, device=written[structure.carry[0]].device)
+        self.write(tensordict, own({**written, **following}, given))
+        self.messages.mark_carried(tensordict.get(self.outer(("next", *previous_key(structure.carry[0])))))
+        return tensordict
 
     def step(
         self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
@@ -323,18 +381,62 @@ class Filter(Checked, TensorDictSequential):
             ValueError: with ``check_finite``, if a reading or the new belief is not finite; or if readings are looked
                 at together, and ``without`` names some of them, not all.
         """
-        return _one_step.step(self, of_one_robot(self, tensordict), without)
+        structure, steps = self.structure, self.steps()
+        tensordict = self.of_one_robot(tensordict)
+        if without:
+            without = refuse_unknown_readings(structure, without)
+            refuse_single_readings(structure, without)
+        entries, size = self.entries_of(tensordict, one_step=True), tensordict.batch_size
+        check_inputs(structure, type(self).__name__, entries, tensordict, without)
+        if without:
+            if self.compiled is not None:
+                self.messages.eager(
+                    "predict() and step(without=...) leave readings out.",
+                    "Hide what is missing with a mask instead, which keeps the step compiled.",
+                )
+            entries = {key: value for key, value in entries.items() if key not in without}
+            written = steps.step(entries, Call(size), missing=without)
+            lost = [key for key in structure.carry if key in structure.step_keys and key not in written]
+            if lost:
+                raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
+        else:
+            self.messages.ignored_masks(structure, tensordict)
+            if self.compiled is None:
+                written = steps.step(entries, Call(size))
+            else:
+                written = self.take_step(entries, size)
+        if self.check_finite and not torch.compiler.is_compiling():
+            refuse_non_finite(structure, entries, written, self.reject)
+        self.write(tensordict, own(written, entries.values()))
+        return tensordict
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
         """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does."""
-        return _one_step.step_without_frame(self, of_one_robot(self, tensordict))
+        tensordict = self.of_one_robot(tensordict)
+        hidden = tensordict.copy()
+        for key in dict.fromkeys(part.mask_key for part in submodels(self.module) if part.mask_key is not None):
+            hidden.set(key, torch.zeros(*tensordict.batch_size, 1, dtype=torch.bool, device=tensordict.device))
+        out = self.step(hidden, without=self.structure.readings)
+        written = [key for key in self.out_keys if out.get(key, None) is not None]
+        return tensordict.update(out.select(*written))
 
     def take_step(self, entries: Entries, batch_size: torch.Size, *, reject: bool | None = None) -> Entries:
         """What one step writes where ``entries`` are, compiled or not, unchecked; ``reject`` as the filter's."""
-        return _one_step.take_step(self, entries, batch_size, reject)
+        structure, steps = self.structure, self.steps(reject=reject)
+        if self.compiled is not None:
+            drawn, complete = self.missing_noise(entries, batch_size, structure.modules)
+            if complete:
+                written = self.compiled.step(steps, {**entries, **drawn}, batch_size)
+                self.messages.ceiling_in(structure, self.variance_ceiling, written)
+                return written
+        return steps.step(entries, Call(batch_size))
 
     def initialise(
-        self, tensordict: TensorDictBase | Mapping[str, Any], *, without: Sequence[NestedKey] = ()
+        self,
+        tensordict: TensorDictBase | Mapping[str, Any],
+        *,
+        without: Sequence[NestedKey] = (),
+        reject: bool | None = None,
     ) -> TensorDictBase:
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
 
@@ -342,22 +444,45 @@ class Filter(Checked, TensorDictSequential):
             tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
             without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
                 its prior.
+            reject: whether readings that cannot be true count as not observed; as the filter's by default.
 
         Raises:
             KeyError: if an entry is missing, or ``without`` names what no module reads.
         """
-        return _one_step.first_belief(self, of_one_robot(self, tensordict), without)
+        tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps(reject=reject)
+        entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
+        given, missing, written = list(entries.values()), set(refuse_unknown_readings(structure, without)), {}
+        entries = steps.guarded(entries, call)
+        if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
+            written = steps.run(structure.frames, entries, call, missing)
+        entries = {key: value for key, value in entries.items() if key not in missing}
+        start = self.initial_belief(entries, call._replace(missing=frozenset(missing)))
+        if self.update_at_reset:
+            written.update(steps.first(entries, call, start, in_sequence=False, missing=missing))
+        else:
+            written.update(start)
+            written.update({forecast: start[key] for key, forecast in structure.forecast_of.items()})
+        self.write(tensordict, own(written, given))
+        return tensordict
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
-        return summarise(self, tensordict)
+        stored = {key: tensordict.get(self.outer(key), None) for key in self.structure.belief}
+        stored = {key: value for key, value in stored.items() if value is not None}
+        carry = {key: tensordict.get(self.outer(key)) for key in self.structure.carry}
+        self.write(tensordict, own(summaries(self.structure.belief, self.initial, carry, stored)))
+        return tensordict
 
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
 
         Noise that is there already is kept. Noise that depends on a size which only the step knows is drawn there.
         """
-        return write_noise(self, tensordict, generator)
+        size, modules = tensordict.batch_size, (*self.structure.modules, ("initial", self.initial))
+        entries = self.entries_of(tensordict)
+        drawn, _ = self.missing_noise(entries, size, modules, time=len(size) > 0, generator=generator, say=False)
+        self.write(tensordict, drawn)
+        return tensordict
 
     def sequence(
         self,
@@ -385,11 +510,76 @@ class Filter(Checked, TensorDictSequential):
         """
         if detach_every is not None:
             check_count("detach_every", detach_every)
-        return filter_sequence(self, tensordict, detach_every, keep)
+        size = tensordict.batch_size
+        if not size or not size[-1]:
+            raise ValueError(
+                "A sequence has time as its last batch dimension, and at least one step; this tensordict has "
+                f"batch_size {list(size)}."
+            )
+        inner = {self.outer(key): key for key in (*self.structure.frame_keys, *self.steps().step_keys)}
+        kept = list(inner.values()) if keep is None else [inner.get(key, key) for key in map(unravel_key, keep)]
+        unknown = [key for key in kept if key not in inner.values()]
+        if unknown:
+            raise ValueError(f"keep names {unknown}; the filter writes {list(inner)}.")
+        rows, marks = as_rows(tensordict, starts_of(tensordict, self.init_key))
+        outputs = self._scan(rows, marks, detach_every, kept)
+        if rows is not tensordict:
+            outputs = {key: value.flatten(0, 1) for key, value in outputs.items()}
+        self.write(tensordict, {key: outputs[key] for key in kept})
+        return tensordict
+
+    def _scan(
+        self, rows: TensorDictBase, marks: Tensor | None, detach_every: int | None, keep: Sequence[NestedKey]
+    ) -> Entries:
+        """The outputs ``keep`` of sequences ``[*B, T]`` that begin at ``marks``, and at their first element."""
+        structure, steps, size = self.structure, self.steps(), rows.batch_size
+        entries, call = self.entries_of(rows), Call(size, time=True)
+        given = list(entries.values())
+        check_inputs(structure, type(self).__name__, entries, rows, carry=False)
+        if self.check_finite and not self.reject and not torch.compiler.is_compiling():
+            refuse_far_belief(entries, [name for key in structure.carry for name in (key, previous_key(key))])
+            refuse_absurd_readings(structure, entries)
+        self.messages.ignored_masks(structure, rows)
+        entries = steps.guarded(entries, call)
+        with set_recurrent_mode(True):  # for modules that are not this package's
+            frames = steps.run(structure.frames, entries, call)
+        gathered = gather_rows(structure, entries, marks, size, self.initial_belief, self.initial)
+        if gathered.stored:  # these have seen their frame
+            steps = steps._replace(update_at_reset=False)
+        later = (structure.transition, *structure.update)
+        drawn, complete = self.missing_noise({**entries, **gathered.starts}, size, later, time=True)
+        if complete:
+            gathered.inputs.update(drawn)
+        step_keys = tuple(key for key in keep if key in steps.step_keys)
+        cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
+        with set_recurrent_mode(False):
+            if self.compiled is not None and complete and gathered.before is None:
+                outputs = self.compiled.sequence(steps, gathered, cuts, step_keys)
+                self.messages.ceiling_in(structure, self.variance_ceiling, outputs)
+            else:
+                outputs = steps.scan(
+                    gathered.before,
+                    gathered.inputs,
+                    Call(torch.Size(size[:-1])),
+                    gathered.begins,
+                    gathered.starts,
+                    cuts,
+                    step_keys,
+                )[1]
+        steps.blank(outputs, gathered.fresh)
+        return {**own({key: frames[key] for key in keep if key in frames}, given), **outputs}
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
         """``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
-        return stepped(self, tensordict)
+        size = tensordict.batch_size
+        marks = starts_of(tensordict, self.init_key)
+        first = torch.zeros(size, dtype=torch.bool, device=tensordict.device)
+        first[..., 0] = True
+        first = first if marks is None else first | marks.reshape(size)
+        if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
+            return ~first
+        known = tensordict.get(self.outer(KNOWN), None)  # a policy's data: what has a belief before it is a step
+        return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:
         """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
@@ -399,7 +589,8 @@ class Filter(Checked, TensorDictSequential):
         """What one step does, on entries; ``update_at_reset`` and ``reject`` as the filter's by default."""
         update_at_reset = self.update_at_reset if update_at_reset is None else update_at_reset
         reject = self.reject if reject is None else reject
-        return Steps(self.structure, update_at_reset, self.variance_ceiling, partial(say_ceiling, self), reject)
+        say = partial(self.messages.ceiling, self.structure, self.variance_ceiling)
+        return Steps(self.structure, update_at_reset, self.variance_ceiling, say, reject)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
         """What the modules may read, as far as it is there, and noise; for ``one_step`` not what starts a sequence.
@@ -422,10 +613,35 @@ class Filter(Checked, TensorDictSequential):
                 entries[key] = value
         noise = flat_noise(tensordict.get(self.outer("noise"), None))
         if noise:
-            refuse_unknown_noise(self, noise)
+            refuse_unknown_noise((*self.structure.modules, ("initial", self.initial)), type(self).__name__, noise)
             entries.update(noise)
         return entries
 
     def initial_belief(self, entries: Entries, call: Call) -> Entries:
         """The belief at the start of an episode."""
-        return _one_step.initial_belief(self, entries, call)
+        belief = self.structure.belief
+        hidden = {key: value for key, value in entries.items() if key not in belief}
+        start = run_module(self.initial, hidden, call.part("initial"))
+        return own(summaries(belief, self.initial, start), entries.values())
+
+    def write(self, tensordict: TensorDictBase, written: Entries) -> None:
+        """Sets entries, under the names that they have outside of the filter."""
+        write(tensordict, written, None if self.prefix is None else self.outer)
+
+    def options(self) -> FilterOptions:
+        """The options that the filter was made with."""
+        return cast(FilterOptions, {key: getattr(self, key) for key in FilterOptions.__annotations__})
+
+    def of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+        """A tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and on its device."""
+        if isinstance(tensordict, TensorDictBase):
+            return tensordict
+        return _of_one_robot(type(self).__name__, self.like(), tensordict)
+
+    def missing_noise(
+        self, entries: Entries, size: torch.Size, modules: Sequence, *, say: bool = True, **options
+    ) -> tuple[Entries, bool]:
+        """The noise of modules that is not among the entries, and whether that is all of it."""
+        say_eager = self.messages.eager if say and self.compiled is not None else None
+        options |= {"like": self.like(), "say_eager": say_eager}
+        return draw_noise(self.structure, self.initial, entries, size, modules, **options)

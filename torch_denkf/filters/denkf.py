@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,

@@ -10,8 +10,8 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules._tensors import as_floating, check_dims
 

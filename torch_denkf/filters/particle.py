@@ -9,8 +9,8 @@ from typing import Literal, Unpack
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
 from torch_denkf.modules._running import check_module
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights

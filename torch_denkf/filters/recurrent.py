@@ -10,8 +10,8 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import refuse_other_beliefs
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules.kalman import MomentPrior
 from torch_denkf.modules.recurrent import LSTMTransition, LSTMUpdate, with_memory

@@ -11,8 +11,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf._checks import check_count
-from torch_denkf.filters._options import FilterOptions
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint
 from torch_denkf.fusion.sensor import FusedSensor, wire

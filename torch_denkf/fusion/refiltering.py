@@ -11,11 +11,9 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torch_denkf._checks import check_count, check_mask, check_shape
-from torch_denkf.filters._entries import of_one_robot, write
-from torch_denkf.filters._noise import draw_noise
-from torch_denkf.filters._slices import starts_of
-from torch_denkf.filters._steps import where_rows
+from torch_denkf._slices import starts_of
 from torch_denkf.filters.base import Filter
+from torch_denkf.filters.scan import where_rows
 from torch_denkf.fusion.parts import StateObservation
 
 __all__ = ["Refiltering", "RefilteringWindow"]
@@ -91,7 +89,7 @@ class Refiltering:
 
     def start(self, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
         """The belief at the start of an episode, see :meth:`Filter.initialise`."""
-        return RefilteringWindow((), (self.filter.initialise(of_one_robot(self.filter, row).copy()),))
+        return RefilteringWindow((), (self.filter.initialise(self.filter.of_one_robot(row).copy()),))
 
     def step(self, window: RefilteringWindow, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
         """One step.
@@ -108,7 +106,7 @@ class Refiltering:
             ValueError: if a module can draw its noise only within the step, the row begins another episode, or an entry
                 of ``late`` is not of whole numbers ``[*B, 1]``.
         """
-        row = of_one_robot(self.filter, row)
+        row = self.filter.of_one_robot(row)
         begins = starts_of(row, self.filter.init_key, step=True)
         if begins is not None and begins.any():
             raise ValueError(f"{self.filter.init_key!r} marks a row that begins another episode; take it to start().")
@@ -148,10 +146,10 @@ class Refiltering:
         row = row.copy()
         carry = {key: belief[key] for key in self.filter.carry_keys}
         entries = {**self.filter.entries_of(row, one_step=True), **carry}
-        drawn = draw_noise(self.filter, entries, row.batch_size, self.filter.structure.modules)
-        if drawn is None:
+        drawn, complete = self.filter.missing_noise(entries, row.batch_size, self.filter.structure.modules)
+        if not complete:
             raise ValueError("A module cannot draw its noise before the step, so that the step cannot be made again.")
-        write(self.filter, row, drawn)
+        self.filter.write(row, drawn)
         return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
-from torch_denkf.filters._options import options_of
 from torch_denkf.filters.base import Filter
 from torch_denkf.fusion.parts import StateObservation
 from torch_denkf.modules import KalmanAnalysis
@@ -75,7 +74,7 @@ class Monitored(Filter):
         while place in modules:
             place += "_"
         modules[place] = monitor if like is None else monitor.to(like.device, like.dtype)
-        super().__init__(modules, initial=with_state(filter.initial, [monitor]), **options_of(filter))
+        super().__init__(modules, initial=with_state(filter.initial, [monitor]), **filter.options())
         self._place = place
 
     @property
@@ -169,7 +168,7 @@ class Gated(Filter):
                 like = filter.like()
                 gates[-1] = gates[-1] if like is None else gates[-1].to(like.device, like.dtype)
                 modules[name] = _with(modules[name], analysis, gates[-1])
-        super().__init__(modules, initial=with_state(filter.initial, gates), **options_of(filter))
+        super().__init__(modules, initial=with_state(filter.initial, gates), **filter.options())
 
     @property
     def gates(self) -> list[GatedAnalysis]:

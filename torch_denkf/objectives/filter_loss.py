@@ -14,8 +14,8 @@ from torchrl.objectives import LossModule
 
 from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_number
+from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
-from torch_denkf.filters._one_sequence import refuse_unmarked_slices
 from torch_denkf.modules._tensors import as_floating, check_dims
 from torch_denkf.objectives._labels import Keys, Truth
 

@@ -15,9 +15,9 @@ from torchrl.modules.tensordict_module.rnn import set_recurrent_mode
 
 from torch_denkf._arguments import check_key
 from torch_denkf._checks import check_count
+from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
-from torch_denkf.filters._one_sequence import refuse_unmarked_slices
-from torch_denkf.filters._structure import previous_key
+from torch_denkf.filters.structure import previous_key
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import declared, reads, reads_of, run_module, run_modules
 from torch_denkf.modules._tensors import as_floating

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_denkf._arguments import Checked
+from torch_denkf._slices import as_rows, starts_of
 from torch_denkf.filters import Filter
-from torch_denkf.filters._slices import as_rows, starts_of
 from torch_denkf.functional.smoothing import check_lag
 from torch_denkf.modules._call import Entries
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_number
 from torch_denkf.filters import Filter
-from torch_denkf.filters._structure import submodels
+from torch_denkf.filters.structure import submodels
 from torch_denkf.functional.smoothing_ensemble import enrts_smooth
 from torch_denkf.smoothers.base import Smoother, last_of_runs
 from torch_denkf.smoothers.fixed_lag import FixedLag, kind_of

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters._options import options_of
 from torch_denkf.modules._running import declared, is_sequence, named_modules_of
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.particles import ResampledTransition
@@ -92,7 +91,7 @@ class FixedLag(Filter):
             if index == place and past is not None:
                 ordered["past"] = past
         ordered["smoothed"] = last
-        super().__init__(ordered, initial=initial, **options_of(filter))
+        super().__init__(ordered, initial=initial, **filter.options())
         self.lag, self._without_lag = lag, list(filter.carry_keys)
 
     def sequence(self, tensordict, *, detach_every=None, keep=None):
@@ -143,7 +142,7 @@ def rebuilt(filter: Filter, changed: Mapping[str, TensorDictModuleBase]) -> Filt
     """A filter of the same modules, some of which are replaced in their places."""
     modules = OrderedDict(named_modules_of(filter))
     modules.update(changed)
-    return Filter(modules, initial=filter.initial, **options_of(filter))
+    return Filter(modules, initial=filter.initial, **filter.options())
 
 
 def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> OrderedDict[str, TensorDictModuleBase]:

@@ -10,7 +10,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters._options import FilterOptions
+from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules import NoisyTransition, as_process_noise
 from torch_denkf.modules._running import check_module
 from torch_denkf.smoothers.iterated_analysis import IteratedAnalysis, with_smoothed

@@ -9,7 +9,7 @@ from tensordict import unravel_key
 from torch import Tensor
 
 from torch_denkf.filters import Filter
-from torch_denkf.filters._structure import previous_key
+from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.linalg import cholesky
 from torch_denkf.functional.smoothing_particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean

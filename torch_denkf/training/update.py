@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
-from torch_denkf.filters._checks import AbsurdReading
+from torch_denkf.filters.finish import AbsurdReading
 from torch_denkf.training.distributed import Processes
 from torch_denkf.training.stage import Stage
 

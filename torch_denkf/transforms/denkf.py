@@ -14,15 +14,14 @@ from torchrl.envs.transforms import Transform
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
+from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
-from torch_denkf.filters._checks import is_finite, masks_in, refuse_far_belief, refuse_unguarded
-from torch_denkf.filters._entries import own
-from torch_denkf.filters._one_sequence import refuse_unmarked_slices
-from torch_denkf.filters._one_step import first_belief
-from torch_denkf.filters._primer import refuse_resets_of_groups
-from torch_denkf.filters._rejection import LARGEST_READING, REJECTED, rejected_keys
-from torch_denkf.filters._said import mark_up_to_date, say_ignored_mask
-from torch_denkf.filters._steps import where_rows
+from torch_denkf.filters.finish import is_finite, masks_in, own, refuse_far_belief
+from torch_denkf.filters.messages import mark_up_to_date
+from torch_denkf.filters.primer import refuse_resets_of_groups
+from torch_denkf.filters.refusals import refuse_unguarded
+from torch_denkf.filters.rejection import LARGEST_READING, REJECTED, rejected_keys
+from torch_denkf.filters.scan import where_rows
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
@@ -177,7 +176,7 @@ class DEnKFTransform(Checked, Transform):
             value = next_tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
-        say_ignored_mask(self.filter, next_tensordict)
+        self.filter.messages.ignored_masks(self.filter.structure, next_tensordict)
         with self._grad_mode(), set_recurrent_mode(False):
             written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
         if self.check_finite:
@@ -198,7 +197,7 @@ class DEnKFTransform(Checked, Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         with self._grad_mode(), set_recurrent_mode(False):
-            start = first_belief(self.filter, tensordict_reset.copy(), reject=self._reject)
+            start = self.filter.initialise(tensordict_reset.copy(), reject=self._reject)
             lacking = [key for key in self._keep if start.get(self.filter.outer(key), None) is None]
             if lacking:
                 # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.

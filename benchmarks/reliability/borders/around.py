@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.reliability import damage as d
 from benchmarks.reliability.borders import kitti, pretrained
 from benchmarks.reliability.target import Subject, Target, targets_of
@@ -183,7 +182,6 @@ def _car() -> Iterator[Subject]:
     }
     updates = dict.fromkeys(("sensor", "filter", "end_to_end", "length"), d.COUNT)
     named = dict.fromkeys(updates, ("Updates",))
-    step = {"dt": d.POSITIVE, "state": d.Wrong({"three numbers": torch.zeros(3)})}
     batch = lambda: {"mean": torch.zeros(2, 2), "cov": eye.expand(2, 2, 2)}  # noqa: E731
     yield Subject(car_filter, wrong=pretrained.CAR)
     yield Subject(_tracked, wrong=_track(), also={"frames": ("frame",), "times": ("time",)}, name="track")
@@ -191,7 +189,6 @@ def _car() -> Iterator[Subject]:
     yield Subject(Updates, wrong=updates, also=named)
     yield Subject(bridge_gaps, lambda: {"drive": kitti.DRIVES.reference()})
     yield Subject(sigma_points, batch, wrong=points, right={"cov": _no_moments})
-    yield Subject(lorenz96_step, lambda: {"state": torch.zeros(5)}, wrong=step)
 
 
 def targets() -> Iterator[Target]:

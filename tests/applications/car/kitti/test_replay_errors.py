@@ -26,7 +26,7 @@ def test_folders_that_lack_something(tmp_path):
     make(tmp_path, sequence="05", images=[])
     make(tmp_path, sequence="07")
     (tmp_path / "poses/07.txt").unlink()
-    message = r"no poses/NAME.txt for \['07'\]; no images sequences/NAME/image_\*/FFFFFF.png for \['05'\]"
+    message = r"no poses/07.txt; no images sequences/NAME/image_\*/FFFFFF.png for \['05'\]"
     fails(FileNotFoundError, message, tmp_path)
     make(tmp_path, sequence="02")
     assert [e.drive for e in open_dataset(tmp_path).episodes] == ["02"]

@@ -66,7 +66,7 @@ def _what_is_there(root: Path) -> str:
     return "; ".join(
         text
         for text in (
-            f"no poses/NAME.txt for {without}" if without else "",
+            f"no {', '.join(f'poses/{name}.txt' for name in without)}" if without else "",
             f"no images sequences/NAME/image_*/FFFFFF.png for {others}" if others else "",
         )
         if text

@@ -1,4 +1,4 @@
-"""One step of a filter on a flat dictionary of tensors; a sequence, a compiled graph and an export are made of it."""
+"""The steps of a filter, one after the other, on flat dictionaries of tensors: what is run, compiled and exported."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
-from torch_denkf.filters._ceiling import hold_variances
-from torch_denkf.filters._rejection import REJECTED, usable
-from torch_denkf.filters._structure import Placed, Structure, previous_key
+from torch_denkf.filters.rejection import REJECTED, usable
+from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._held import hold_variances
 from torch_denkf.modules._running import is_sequence, named_modules_of, run_module
 
-__all__ = ["Steps", "blank", "where_rows"]
+__all__ = ["Steps", "where_rows"]
 
 
 def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -48,24 +48,28 @@ class Steps(NamedTuple):
         """What transition and update write, and how many readings were rejected."""
         return (*self.structure.step_keys, REJECTED) if self.reject else self.structure.step_keys
 
-    def usable(self, entries: Entries, call: Call) -> Entries:
-        """What the modules may read: without readings that cannot be true, if they are to be rejected."""
-        refuse_group_readings(self.structure, entries, call.batch_size)
-        return usable(self.structure.guards, entries, call.batch_size) if self.reject else entries
+    def guarded(self, entries: Entries, call: Call) -> Entries:
+        """A copy of what the modules may read: without readings that cannot be true, if they are to be rejected."""
+        size = len(call.batch_size)
+        for key in self.structure.plain:
+            value = entries.get(key)
+            if value is not None and value.ndim > size + 1:
+                _refuse_groups(self.structure, key, entries, call.batch_size)
+        return usable(self.structure.guards, entries, call.batch_size) if self.reject else dict(entries)
 
     def run(
         self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
     ) -> Entries:
-        """What modules write, one after the other.
+        """What modules write, one after the other; each finds in ``entries`` what those before it wrote.
 
         ``missing`` names readings that are not there. What a module that needs them would have written is added to it,
         unless the module knows what to write without a reading.
         """
-        entries, written = dict(entries), {}
+        written: Entries = {}
         for place, module in modules:
             if missing and not missing.isdisjoint(module.in_keys):
                 if is_sequence(module):
-                    out = self.run(named_modules_of(module), entries, call.part(place), missing)
+                    out = self.run(named_modules_of(module), dict(entries), call.part(place), missing)
                 else:
                     out = _without_reading(module, entries)
                 missing.update(key for key in map(unravel_key, module.out_keys) if key not in out)
@@ -81,66 +85,57 @@ class Steps(NamedTuple):
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
         return written
 
-    def frames(self, entries: Entries, call: Call, missing: set[NestedKey] | None = None) -> Entries:
-        """What the modules that read frames alone write."""
-        return self.run(self.structure.frames, entries, call, missing)
-
-    def take(
+    def step(
         self,
         entries: Entries,
         call: Call,
         *,
+        frames: bool = True,
         reset: Tensor | None = None,
-        start_of: Callable[[Entries], Entries] | None = None,
+        start: Entries | Callable[[Entries], Entries] | None = None,
+        forecast: Entries | None = None,
         missing: Collection[NestedKey] = (),
     ) -> Entries:
-        """A whole step, on ``[*B]``: frames, transition, update.
+        """One step on ``[*B]``: frames, transition, update.
 
         Args:
             entries: the carry, which is the belief at t-1, and the frame of t.
             call: batch size and whether noise is drawn.
-            reset: rows that start anew; ``None`` for none.
-            start_of: the initial belief from entries, the frame modules' among them; for ``reset``.
-            missing: readings that are not among the entries, see :meth:`run`.
-        """
-        lost = set(missing)
-        entries = self.usable(entries, call)
-        written = self.frames(entries, call, lost)
-        entries = {**entries, **written}
-        start = None if reset is None or start_of is None else start_of(entries)
-        written.update(self.advance(entries, call, reset, start, lost))
-        return written
-
-    def advance(
-        self,
-        entries: Entries,
-        call: Call,
-        reset: Tensor | None = None,
-        start: Entries | None = None,
-        missing: set[NestedKey] | None = None,
-    ) -> Entries:
-        """One step: the carry in ``entries`` is the belief at t-1, the frame that of t.
-
-        Args:
-            entries: what the frame modules wrote, too.
-            call: batch size and whether noise is drawn.
+            frames: whether the modules that read frames are to run; if not, ``entries`` hold what they wrote.
             reset: rows ``[*B]`` or ``[*B, 1]`` that forecast their ``start``, and believe it; ``None`` for none.
-            start: initial beliefs, read only with ``reset``.
-            missing: readings that are not there, see :meth:`run`.
+            start: initial beliefs, or what makes them of entries; read only with ``reset``.
+            forecast: what the transition would write, in its place.
+            missing: readings that are not among the entries, see :meth:`run`.
 
         Returns:
-            What transition and update write.
+            What the modules write.
         """
-        structure, start = self.structure, {} if start is None else start
-        entries = dict(entries)
-        if reset is not None:
-            # Before the transition, too: its gradient would be NaN where the episode before diverged.
-            entries.update({key: where_rows(reset, start[key], entries[key]) for key in structure.carry})
-        written = self.run([structure.transition], entries, call)
-        if reset is not None:
-            for key, forecast_key in structure.forecast_of.items():
-                written[forecast_key] = where_rows(reset, start[key], written[forecast_key])
-        return self._update(entries, written, call, reset, start, missing)
+        structure, lost, written = self.structure, set(missing), {}
+        if frames:
+            entries = self.guarded(entries, call)
+            written = self.run(structure.frames, entries, call, lost)
+        else:
+            entries = dict(entries)
+        begin = start or {} if start is None or isinstance(start, dict) else start(entries)
+        if forecast is None:
+            if reset is not None:
+                # Before the transition, too: its gradient would be NaN where the episode before diverged.
+                entries.update({key: where_rows(reset, begin[key], entries[key]) for key in structure.carry})
+            forecast = self.run((structure.transition,), entries, call)
+            if reset is not None:
+                for key, name in structure.forecast_of.items():
+                    forecast[name] = where_rows(reset, begin[key], forecast[name])
+        entries.update(forecast)
+        written.update(forecast)
+        written.update(self.run(structure.update, entries, call, lost))
+        if reset is not None and not self.update_at_reset:
+            for key in structure.belief:
+                written[key] = where_rows(reset, begin[key], written[key])
+        if self.ceiling is not None:
+            hold_variances(written, structure.belief, self.ceiling, self.say)
+        if self.reject:
+            written[REJECTED] = entries[REJECTED]
+        return written
 
     def first(
         self,
@@ -149,40 +144,19 @@ class Steps(NamedTuple):
         start: Entries,
         *,
         in_sequence: bool = True,
-        missing: set[NestedKey] | None = None,
+        missing: Collection[NestedKey] = (),
     ) -> Entries:
-        """The first step of a sequence: its belief is ``start``; the update is made if that is to see its frame."""
+        """The first step of a sequence: its forecast is ``start``; it is updated if that is to see its frame."""
         structure = self.structure
         entries = {**entries, **{key: start[key] for key in structure.carry}}
-        forecast = {forecast_key: start[key] for key, forecast_key in structure.forecast_of.items()}
+        forecast = {name: start[key] for key, name in structure.forecast_of.items()}
         if structure.beside and in_sequence:  # their shapes follow from a step out of the start
-            out = self.run([structure.transition], entries, call)
+            out = self.run((structure.transition,), dict(entries), call)
             forecast |= {key: torch.zeros_like(out[key]) for key in structure.beside}
         elif structure.beside and isinstance(structure.transition[1], SubModel):
             forecast |= structure.transition[1].without_step(entries)
         every = torch.ones(*call.batch_size, 1, dtype=torch.bool, device=next(iter(start.values())).device)
-        return self._update(entries, forecast, call, every, start, missing)
-
-    def _update(
-        self,
-        entries: Entries,
-        written: Entries,
-        call: Call,
-        reset: Tensor | None,
-        start: Entries,
-        missing: set[NestedKey] | None,
-    ) -> Entries:
-        structure = self.structure
-        entries.update(written)
-        written.update(self.run(structure.update, entries, call, missing))
-        if reset is not None and not self.update_at_reset:
-            for key in structure.belief:
-                written[key] = where_rows(reset, start[key], written[key])
-        if self.ceiling is not None:
-            hold_variances(written, structure.belief, self.ceiling, self.say)
-        if self.reject:
-            written[REJECTED] = entries[REJECTED]
-        return written
+        return self.step(entries, call, frames=False, reset=every, start=start, forecast=forecast, missing=missing)
 
     def scan(
         self,
@@ -198,8 +172,8 @@ class Steps(NamedTuple):
 
         Args:
             carry: the belief before the first step; ``None`` if the first element is where a sequence starts.
-            inputs: what each step reads beside the carry, ``[*B, T, ...]``. What stands under ``("previous", ...)`` is
-                where the step begins in rows that ``("previous", "resumes")`` marks.
+            inputs: what each step reads beside the carry, ``[*B, T, ...]``, with what the frames' modules wrote. What
+                stands under ``("previous", ...)`` is where the step begins in rows that :data:`RESUMES` marks.
             call: of one step ``[*B]``.
             resets: which rows start anew at each step, ``[*B, T, 1]``; ``None`` for none but those of a start.
             starts: their beliefs, ``[*B, T, ...]``, or without ``resets`` that of the first element, ``[*B, 1, ...]``.
@@ -219,17 +193,28 @@ class Steps(NamedTuple):
             else:
                 if cuts[t]:
                     carry = {key: value.detach() for key, value in carry.items()}
-                row = {**row, **self._resume(carry, row)}
-                out = self.advance(row, call) if marks is None else self.advance(row, call, marks[t], begins[t])
+                if RESUMES in row:
+                    carry = {
+                        key: where_rows(row[RESUMES], row[previous_key(key)], value) for key, value in carry.items()
+                    }
+                reset, start = (None, None) if marks is None else (marks[t], begins[t])
+                out = self.step({**row, **carry}, call, frames=False, reset=reset, start=start)
             carry = {key: out[key] if key in out else row[key] for key in self.structure.carry}
             outputs.append(out)
         return carry or {}, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
-    def _resume(self, carry: Entries, row: Entries) -> Entries:
-        resumes = row.get(("previous", "resumes"))
-        if resumes is None:
-            return carry
-        return {key: where_rows(resumes, row[previous_key(key)], value) for key, value in carry.items()}
+    def blank(self, written: Entries, fresh: Tensor) -> None:
+        """Zero for what a step writes, and a belief that starts does not have: innovations and the like.
+
+        Args:
+            written: by a step, or by those of a sequence; changed.
+            fresh: elements that start from an initial or stored belief, ``[*B, 1]`` or ``[*B, T, 1]``.
+        """
+        structure = self.structure
+        at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
+        for key in structure.beside if self.update_at_reset else self.step_keys:
+            if key in written and key not in at_start:
+                written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
 
 
 def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
@@ -238,38 +223,18 @@ def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
     return [{key: column[t] for key, column in columns.items()} for t in range(count)]
 
 
-def refuse_group_readings(structure: Structure, entries: Entries, batch_size: Sequence[int]) -> None:
+def _refuse_groups(structure: Structure, key: NestedKey, entries: Entries, batch_size: Sequence[int]) -> None:
     """Raises a ``ValueError`` where a raw reading has dimensions that neither the batch nor an ensemble has."""
-    size = len(batch_size)
-    members = next(
-        (entries[key].shape[-2] for key in structure.carry if key[-1] == "ensemble" and key in entries), None
-    )
-    for key in structure.plain:
-        value = entries.get(key)
-        samples = key[-1] == "ensemble" or (value is not None and value.shape[-2:-1] == (members,))
-        if value is None or value.ndim <= size + 1 + samples:
-            continue
+    size, value = len(batch_size), entries[key]
+    members = next((entries[k].shape[-2] for k in structure.carry if k[-1] == "ensemble" and k in entries), None)
+    samples = key[-1] == "ensemble" or value.shape[-2:-1] == (members,)
+    if value.ndim > size + 1 + samples:
         raise ValueError(
             f"The reading {key!r} is {list(value.shape)}, and the batch is {list(batch_size)}: {value.ndim - size - 1} "
             "dimension(s) too many. Readings of several robots need a belief for each: filter a tensordict whose batch "
             "holds the robots, such as tensordict['agents'] of a group. Readings of one robot: put them side by side, "
             "with flatten(-2). Samples of one reading: under a key whose last name is 'ensemble'."
         )
-
-
-def blank(steps: Steps, written: Entries, fresh: Tensor) -> None:
-    """Zero for what a step writes, and a belief that starts does not have: innovations and the like.
-
-    Args:
-        steps: the filter's.
-        written: by a step, or by those of a sequence; changed.
-        fresh: elements that start from an initial or stored belief, ``[*B, 1]`` or ``[*B, T, 1]``.
-    """
-    structure = steps.structure
-    at_start = (*structure.carry, *structure.belief, *structure.forecast_of.values())
-    for key in structure.beside if steps.update_at_reset else steps.step_keys:
-        if key in written and key not in at_start:
-            written[key] = where_rows(fresh, torch.zeros_like(written[key]), written[key])
 
 
 def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:

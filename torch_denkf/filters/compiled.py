@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import FunctionType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -13,11 +13,9 @@ from torch import Tensor
 
 from torch_denkf._checks import has_values
 from torch_denkf._registered import compiler
-from torch_denkf.filters._steps import Steps
+from torch_denkf.filters.gather import Rows
+from torch_denkf.filters.scan import Steps
 from torch_denkf.modules._call import Call, Entries
-
-if TYPE_CHECKING:
-    from torch_denkf.filters._sequence import Rows
 
 __all__ = ["CompiledSteps"]
 
@@ -53,24 +51,24 @@ class CompiledSteps:
         values = self._call(("step", keys, batch_size), steps, make, tuple(entries.values()), keys, writes)
         return dict(zip(writes, values, strict=True))
 
-    def sequence(self, steps: Steps, todo: Rows) -> Entries:
+    def sequence(self, steps: Steps, rows: Rows, cuts: Sequence[bool], keep: tuple[NestedKey, ...]) -> Entries:
         """What the steps write on a sequence ``[*B, T]``, in chunks; all noise is among the inputs."""
-        time, count = len(todo.size) - 1, todo.size[-1]
-        batch = torch.Size(todo.size[:-1])
-        inputs, starts, begins, keep = todo.inputs, todo.starts, todo.begins, todo.keep
-        detach_every, keys, start_keys = todo.detach_every or 0, tuple(inputs), tuple(starts)
+        time, count = len(rows.size) - 1, rows.size[-1]
+        batch = torch.Size(rows.size[:-1])
+        inputs, starts, begins = rows.inputs, rows.starts, rows.begins
+        keys, start_keys = tuple(inputs), tuple(starts)
         carry, outputs, begin = (), [], 0
         while begin < count:
             first = begin == 0  # which also takes the first chunk's steps, if there are as many
             length = first + (self.chunk if count - begin - first >= self.chunk else int(not first))
-            cuts = tuple(bool(detach_every) and t > 0 and t % detach_every == 0 for t in range(begin, begin + length))
+            here = tuple(cuts[begin : begin + length])
             now = tuple(inputs[key].narrow(time, begin, length) for key in keys)
             resets, now_starts = None, tuple(value.narrow(time, 0, 1) for value in starts.values()) if first else ()
             if begins is not None:
                 resets = begins.narrow(time, begin, length)
                 now_starts = tuple(value.narrow(time, begin, length) for value in starts.values())
-            kind = ("first" if first else "chunk", begins is not None, keys, start_keys, batch, cuts, keep)
-            make = partial(_chunk, steps, keys, start_keys, keep, batch, cuts, first)
+            kind = ("first" if first else "chunk", begins is not None, keys, start_keys, batch, here, keep)
+            make = partial(_chunk, steps, keys, start_keys, keep, batch, here, first)
             carried = () if first else steps.structure.carry
             names = (*carried, *keys, *(() if begins is None else (_BEGINS,)), *(start_keys if now_starts else ()))
             given, writes = (carry, now, resets, now_starts), (*steps.structure.carry, *keep)
@@ -158,7 +156,7 @@ def _parameters(steps: Steps) -> dict[str, Tensor]:
 
 def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        written = steps.take(dict(zip(keys, values, strict=True)), Call(batch))
+        written = steps.step(dict(zip(keys, values, strict=True)), Call(batch))
         return tuple(written[key] for key in writes)
 
     return step

@@ -1,18 +1,16 @@
 """What follows from a belief that is carried on; oracle: by hand."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
-from torch_denkf.filters import _summaries
+from torch_denkf.modules import _summaries
 
 PREFIX = ("belief",)
 
 
 def summaries(given, wanted):
     """Of a filter whose belief these are."""
-    return _summaries.summaries(SimpleNamespace(structure=SimpleNamespace(belief=wanted), initial=None), given)
+    return _summaries.summaries(wanted, None, given)
 
 
 def entries(**values):

@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torch_denkf.filters._slices import starts_of
+from torch_denkf._slices import starts_of
 
 __all__ = ["refuse_unmarked_slices"]
 

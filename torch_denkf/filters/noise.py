@@ -2,63 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-from torch_denkf.filters._entries import write
-from torch_denkf.filters._said import say_eager
-from torch_denkf.filters._structure import Placed
+from torch_denkf.filters.structure import Placed, Structure
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries, flat_noise
 from torch_denkf.modules._running import declared, random_parts
 
-if TYPE_CHECKING:
-    from torch_denkf.filters.base import Filter
-
-__all__ = ["draw_noise", "write_noise"]
-
-
-def write_noise(filter: Filter, tensordict: TensorDictBase, generator: torch.Generator | None) -> TensorDictBase:
-    """See :meth:`Filter.draw_noise`."""
-    entries, size = filter.entries_of(tensordict), tensordict.batch_size
-    modules = (*filter.structure.modules, ("initial", filter.initial))
-    drawn = draw_noise(filter, entries, size, modules, time=len(size) > 0, generator=generator, as_far_as_known=True)
-    write(filter, tensordict, drawn or {})
-    return tensordict
+__all__ = ["draw_noise"]
 
 
 def draw_noise(
-    filter: Filter,
+    structure: Structure,
+    initial: TensorDictModuleBase,
     entries: Entries,
     batch_size: torch.Size,
     modules: Iterable[Placed],
     *,
+    like: Tensor | None = None,
     time: bool = False,
     generator: torch.Generator | None = None,
-    as_far_as_known: bool = False,
-) -> Entries | None:
+    say_eager: Callable[[str, str], None] | None = None,
+) -> tuple[Entries, bool]:
     """The noise of ``modules`` that is not among the entries.
 
     Args:
-        filter: theirs.
+        structure: of the filter that they are of.
+        initial: its initial belief.
         entries: what is known of the step: the carry and the frames' outputs tell sizes.
         batch_size: ``[*B]``, or ``[*B, T]``.
         modules: with their places.
+        like: has the filter's precision.
         time: whether the last of ``batch_size`` is time.
         generator: source of randomness; torch's global one by default.
-        as_far_as_known: what to do about noise whose size the step alone knows: leave it out, or return ``None``.
+        say_eager: told why a noise could not be drawn, and what to do.
+
+    Returns:
+        The noise, as far as its size is known before the step; and whether that is all.
     """
     parts = [found for place, module in modules for found in random_parts(module, place)]
     drawn: Entries = {}
     if not parts:
-        return drawn
-    like, complete = filter.like(), True
+        return drawn, True
+    complete = True
     device = next((value.device for value in entries.values()), None if like is None else like.device)
     dtype = None if like is None else like.dtype
-    members, state_dim = _sizes(filter, entries)
+    members, state_dim = _sizes(structure, initial, entries)
     for place, part in parts:
         keys = [("noise", place, name) if name else ("noise", place) for name in part.noise_names]
         if not all(key in entries for key in keys):
@@ -66,7 +60,7 @@ def draw_noise(
                 batch_size,
                 members=members,
                 state_dim=state_dim,
-                observation_dim=_observation_dim(filter, part, entries),
+                observation_dim=_observation_dim(structure, part, entries),
                 time=time,
                 device=device,
                 dtype=dtype,
@@ -74,28 +68,28 @@ def draw_noise(
             )
             if noise is None:
                 complete = False
-                if not as_far_as_known:
-                    say_eager(filter, *_undrawn(place, part))
+                if say_eager is not None:
+                    say_eager(*_undrawn(place, part))
             drawn.update(flat_noise(noise, place))
-    return drawn if complete or as_far_as_known else None
+    return drawn, complete
 
 
-def _sizes(filter: Filter, entries: Entries) -> tuple[int | None, int | None]:
+def _sizes(structure: Structure, initial: TensorDictModuleBase, entries: Entries) -> tuple[int | None, int | None]:
     """E and S of the belief."""
-    for key in filter.structure.carry:
+    for key in structure.carry:
         if key[-1] == "ensemble" and key in entries:
             members, state_dim = entries[key].shape[-2:]
             return members, state_dim
-    initial = declared(filter.initial)
-    return initial.ensemble_size, initial.state_dim
+    told = declared(initial)
+    return told.ensemble_size, told.state_dim
 
 
-def _observation_dim(filter: Filter, part: SubModel, entries: Entries) -> int | None:
+def _observation_dim(structure: Structure, part: SubModel, entries: Entries) -> int | None:
     """O of the reading that a sub-model uses: from the entry, or from the module that writes it.
 
     A sub-model that does not name the entry of its variances is told where all that is known of what it reads agrees.
     """
-    known = filter.structure.observation_dims
+    known = structure.observation_dims
     key = part.noise_variance_key
     if key is not None:
         return entries[key].shape[-1] if key in entries else known.get(key)

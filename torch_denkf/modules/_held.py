@@ -1,43 +1,22 @@
-"""A belief that explodes: its variances are held at a ceiling, and that is said once."""
+"""A belief that explodes: its variances are held at a ceiling."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from math import sqrt
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import flag_value
-from torch_denkf.filters._said import say_once
 from torch_denkf.functional.weighted import weighted_mean, weighted_median
 from torch_denkf.modules._call import Entries
 
-if TYPE_CHECKING:
-    from torch_denkf.filters.base import Filter
-
-__all__ = ["hold_variances", "look_at_ceiling", "say_ceiling"]
+__all__ = ["hold_variances"]
 
 #: The mean is held within so many of the largest standard deviations that a variance ceiling allows.
 _FARTHEST = 1000.0
-
-
-def say_ceiling(filter: Filter, key: NestedKey) -> None:
-    """Warns that the variance ``key`` is held at the ceiling, once."""
-    why = "nothing observes what grows."
-    if (*key[:-1], "log_weight") in filter.structure.carry:
-        why = (
-            "some particles have run away, or nothing observes what grows. Particles are held near their weighted "
-            "median until a reading takes their weight. If the motion throws single particles away, start from a "
-            "narrower belief, or bound the motion."
-        )
-    say_once(
-        filter,
-        "ceiling",
-        f"The variance in {key!r} has reached variance_ceiling={filter.variance_ceiling:g} and is held there: {why}",
-    )
 
 
 def hold_variances(
@@ -97,16 +76,6 @@ def _held_particles(
     centre = weighted_median(particles, log_weights).clamp(-farthest, farthest).unsqueeze(-2)
     held = particles.clamp(centre - sqrt(ceiling), centre + sqrt(ceiling))
     return torch.where(exceeded.unsqueeze(-2), held, particles)
-
-
-def look_at_ceiling(filter: Filter, written: Entries) -> None:
-    """Says whether a variance is held at the ceiling, where a compiled graph could not."""
-    if filter.variance_ceiling is None or "ceiling" in filter._said or torch.compiler.is_compiling():
-        return
-    for key in filter.structure.belief:
-        value = written.get(key) if key[-1] == "var" else None
-        if value is not None and not value.is_cuda and (value >= 0.999 * filter.variance_ceiling).any():
-            say_ceiling(filter, key)
 
 
 def _exceeds(variance: Tensor, ceiling: float) -> bool | None:

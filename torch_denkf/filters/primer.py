@@ -1,23 +1,14 @@
-"""What an environment must carry where a filter is part of the policy: the last belief, and the action since."""
+"""What an environment must carry where a filter is part of the policy, beside the last belief: the action since."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import chain
-from typing import TYPE_CHECKING
 
-import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torch_denkf.filters._structure import KNOWN, previous_key
-from torch_denkf.modules._running import declared
-
-if TYPE_CHECKING:
-    from torch_denkf.filters.base import Filter
-
-__all__ = ["LastAction", "belief_primer", "refuse_resets_of_groups"]
+__all__ = ["LastAction", "refuse_resets_of_groups"]
 
 
 def refuse_resets_of_groups(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
@@ -110,23 +101,3 @@ class LastAction(TensorDictPrimer):
         for key, kept in self.actions.items():
             next_tensordict.set(kept, tensordict.get(key))
         return next_tensordict
-
-
-def belief_primer(filter: Filter) -> TensorDictPrimer:
-    """The transform behind :meth:`Filter.make_tensordict_primer`."""
-    initial = filter.initial
-    told = declared(initial)
-    size = told.input_dim or told.state_dim or 1
-    tensors = chain(filter.parameters(), filter.buffers(), (torch.zeros(()),))
-    like = next(tensor for tensor in tensors if tensor.is_floating_point())
-    probe = TensorDict({key: torch.zeros(size, dtype=like.dtype, device=like.device) for key in initial.in_keys})
-    with torch.no_grad(), torch.random.fork_rng(devices=[]):
-        belief = initial(probe)
-    primers = Composite()
-    for key in filter.structure.carry:
-        value = belief.get(key)
-        kept = filter.outer(previous_key(key))
-        primers[kept] = Unbounded(shape=value.shape, dtype=value.dtype, device=value.device)
-    primers[filter.outer(KNOWN)] = Unbounded(shape=(1,), dtype=torch.bool, device=like.device)
-    actions = {key: filter.outer(previous_key(key)) for key in filter.structure.controls}
-    return LastAction(actions, primers=primers)

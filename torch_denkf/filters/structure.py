@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
-from torch_denkf.filters._rejection import Guard, guards_of
+from torch_denkf.filters.rejection import Guard, guards_of
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import (
     declared,
@@ -23,13 +23,15 @@ from torch_denkf.modules._running import (
     writes,
 )
 
-__all__ = ["KNOWN", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
+__all__ = ["KNOWN", "RESUMES", "Placed", "Structure", "previous_key", "sequences_in", "submodels"]
 
 #: A module and its place in the filter, which names its noise.
 Placed = tuple[str, TensorDictModuleBase]
 
 #: Whether a policy has a belief before this element.
 KNOWN = ("previous", "known")
+#: Whether an element of a sequence begins with the belief that is stored before it.
+RESUMES = ("previous", "resumes")
 _SUMMARIES = ("mean", "var", "cov")
 
 

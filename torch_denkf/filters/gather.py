@@ -1,0 +1,116 @@
+"""What steps read: entries of a tensordict, and where each element of a sequence starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torch_denkf.filters.refusals import refuse_missing_actions
+from torch_denkf.filters.rejection import REJECTED
+from torch_denkf.filters.structure import KNOWN, RESUMES, Structure, previous_key
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._summaries import summaries
+
+__all__ = ["Rows", "gather_rows", "of_one_robot"]
+
+
+class Rows(NamedTuple):
+    """What the steps of a sequence read.
+
+    Attributes:
+        size: ``[*B, T]``.
+        inputs: entries ``[*B, T, ...]``.
+        begins: elements that start from ``starts``, ``[*B, T, 1]``; ``None`` for the first alone.
+        starts: initial or stored beliefs ``[*B, T]``, or ``[*B, 1]`` where ``begins`` is ``None``.
+        stored: whether these beliefs are stored ones, which have seen their frame.
+        before: the belief before the first element, where that is a step, too; ``None`` where it is a start.
+    """
+
+    size: torch.Size
+    inputs: Entries
+    begins: Tensor | None
+    starts: Entries
+    stored: bool
+    before: Entries | None
+
+    @property
+    def fresh(self) -> Tensor:
+        """Elements that start anew, ``[*B, T, 1]``."""
+        if self.before is not None and self.begins is not None:
+            return self.begins
+        return _or_first(self.begins, self.size, next(iter(self.starts.values())).device)
+
+
+def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+    """A tensordict as it is; of a dictionary a new one, ``[]``, in the precision and on the device of ``like``."""
+    if isinstance(tensordict, TensorDictBase):
+        return tensordict
+    if not isinstance(tensordict, Mapping):
+        raise TypeError(
+            f"{name} takes a tensordict, or a dictionary of numbers, arrays or tensors; got {type(tensordict).__name__}"
+        )
+    out = TensorDict(dict(tensordict), batch_size=[])
+    out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
+    if like is None:
+        return out
+    return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
+
+
+def gather_rows(
+    structure: Structure,
+    entries: Entries,
+    marks: Tensor | None,
+    size: torch.Size,
+    start_of: Callable[[Entries, Call], Entries],
+    initial: TensorDictModuleBase,
+) -> Rows:
+    """Where each element of a sequence starts from, and what its step reads.
+
+    Args:
+        structure: of the filter.
+        entries: of the sequence, with what the frames' modules wrote.
+        marks: first elements, see :func:`torch_denkf._slices.starts_of`.
+        size: ``[*B, T]``.
+        start_of: the initial beliefs, from entries.
+        initial: the filter's initial belief.
+    """
+    time, call = len(size) - 1, Call(size, time=True)
+    carry, begins = structure.carry, marks
+    resumed = all(previous_key(key) in entries for key in carry)
+    stored = not resumed and all(key in entries for key in carry)
+    read = (*structure.needed, *structure.optional, *structure.controls, *structure.frame_keys, REJECTED)
+    inputs = {key: entries[key] for key in read if key in entries}
+    inputs.update({key: value for key, value in entries.items() if key[0] == "noise"})
+    if resumed:  # a policy's data: what is known before an element is where its step begins
+        refuse_missing_actions(structure, entries, resumed=True)
+        first = _or_first(marks, size, entries[previous_key(carry[0])].device)
+        known = entries.get(KNOWN, torch.ones_like(first))
+        begins, inputs[RESUMES] = ~known, first & known
+        inputs.update({previous_key(key): entries[previous_key(key)] for key in carry})
+    if stored:
+        starts = summaries(structure.belief, initial, {key: entries[key] for key in carry}, entries)
+    elif begins is None:  # where only the first element starts, only its initial belief is needed
+        head = {key: value.narrow(time, 0, 1) for key, value in entries.items()}
+        starts = start_of(head, call._replace(batch_size=torch.Size((*size[:-1], 1))))
+    else:
+        starts = start_of(entries, call)
+    for key in structure.controls:  # stored one step earlier than they are read
+        if previous_key(key) in entries:
+            inputs[key] = entries[previous_key(key)]
+        elif key in inputs:
+            value = inputs[key]
+            inputs[key] = torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, size[-1] - 1)], time)
+    before = {key: starts[key].select(time, 0) for key in carry} if resumed else None
+    return Rows(size, inputs, begins, starts, stored, before)
+
+
+def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:
+    """Marks ``[*B, T, 1]``, and the first element of each sequence."""
+    first = torch.zeros(*size, 1, dtype=torch.bool, device=device)
+    first.narrow(len(size) - 1, 0, 1).fill_(True)
+    return first if marks is None else first | marks.reshape(*size, 1)

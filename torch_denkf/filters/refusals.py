@@ -1,0 +1,142 @@
+"""What a filter refuses before a step: entries that are missing or unknown, mixed precision."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+
+from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels
+from torch_denkf.modules._call import Entries
+from torch_denkf.modules._running import random_parts
+
+__all__ = [
+    "check_inputs",
+    "refuse_missing_actions",
+    "refuse_single_readings",
+    "refuse_two_precisions",
+    "refuse_unguarded",
+    "refuse_unknown_noise",
+    "refuse_unknown_readings",
+]
+
+
+def check_inputs(
+    structure: Structure,
+    name: str,
+    entries: Entries,
+    tensordict: TensorDictBase,
+    without: Collection[NestedKey] = (),
+    *,
+    carry: bool = True,
+) -> None:
+    """Raises a ``KeyError`` that names what the modules miss, who reads it, and what is there.
+
+    Args:
+        structure: of the filter.
+        name: of the filter's class.
+        entries: what was found.
+        tensordict: where.
+        without: readings that are missing on purpose.
+        carry: whether the belief must be there.
+    """
+    for key in structure.carry if carry else ():
+        if key not in entries:
+            raise KeyError(
+                f"{name} carries its belief in {key!r}, which the tensordict lacks. Call "
+                "filter.initialise(tensordict) at the start of an episode; in an environment append "
+                "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
+                "part of the policy."
+            )
+    missing = [
+        key
+        for key in (*structure.needed, *structure.required_controls)
+        if key not in entries and key not in without and previous_key(key) not in entries
+    ]
+    if missing:
+        readers = [
+            type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))
+        ]
+        present = ", ".join(sorted(map(str, tensordict.keys(True, True)))) or "nothing"
+        raise KeyError(
+            f"{', '.join(readers) or name} reads {', '.join(map(repr, missing))}, which the tensordict lacks. It holds "
+            f"{present}. Rename the key in the constructor, or put the module that writes it in front. A reading that "
+            "is missing on purpose: step(..., without=[key]), predict(...), or a mask."
+        )
+
+
+def refuse_unguarded(structure: Structure, name: str) -> None:
+    """Raises a ``ValueError`` where readings are to be rejected, and one cannot be hidden."""
+    for place, module in structure.unmasked:
+        raise ValueError(
+            f"{name} is to reject readings that cannot be true, and {type(module).__name__} at place {place!r} reads "
+            'no mask that could hide one: name it in optional_keys=["observed"], and say self.observed_key = '
+            '"observed".'
+        )
+    guarded = {key for guard in structure.guards for key in (*guard.whole, *guard.components)}
+    for key in structure.readings:
+        if key not in guarded:
+            readers = [type(part).__name__ for part in structure.readers(key)]
+            raise ValueError(
+                f"{name} is to reject readings that cannot be true, and {', '.join(readers)} does not say which entry "
+                f'is the mask of {key!r}: self.observed_key = "observed", for example.'
+            )
+
+
+def refuse_missing_actions(structure: Structure, entries: Entries, resumed: bool) -> None:
+    """Raises a ``KeyError`` where a step resumes from a policy's belief, and the action before it is not there."""
+    missing = [key for key in structure.required_controls if previous_key(key) not in entries]
+    if resumed and missing:
+        raise KeyError(
+            f"The belief is that of a policy, one step before, and {missing} drives the step. The action before it is "
+            f"missing: {[previous_key(key) for key in missing]}. Put filter.make_tensordict_primer(), which brings it, "
+            "into the environment."
+        )
+
+
+def refuse_unknown_noise(modules: Iterable[Placed], name: str, noise: Entries) -> None:
+    """Raises a ``KeyError`` where noise is given for a place that draws none: it would be ignored."""
+    places = {place for inner, module in modules for place, _ in random_parts(module, inner)}
+    unknown = [key for key in noise if len(key) < 2 or key[1] not in places]
+    if unknown:
+        raise KeyError(f"{unknown} is noise of no module of {name}; noise is drawn at {sorted(places)}.")
+
+
+def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) -> list[NestedKey]:
+    """The readings to leave out, unravelled.
+
+    Raises:
+        KeyError: if no module reads one of them.
+        TypeError: if it is a string and no list of them.
+    """
+    if isinstance(without, str):
+        raise TypeError(f"without is a list of keys: [{without!r}].")
+    keys = [unravel_key(key) for key in without]
+    unknown = [key for key in keys if key not in structure.needed]
+    if unknown:
+        raise KeyError(f"without names {unknown}, which no module must find; they read {list(structure.needed)}.")
+    return keys
+
+
+def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:
+    """Raises a ``ValueError`` where some readings are to be left out, not all, of those that a module joins."""
+    joined = any(part.joins_readings for _, module in structure.modules for part in submodels(module))
+    if joined and without and set(without) != set(structure.readings):
+        raise ValueError(
+            f"Where readings are looked at together, step(without={list(without)}) cannot leave out single ones: "
+            "hide them with their masks."
+        )
+
+
+def refuse_two_precisions(filter: torch.nn.Module) -> None:
+    """Raises a ``TypeError`` where parameters or constants are of float32 and float64."""
+    named = [*filter.named_parameters(), *filter.named_buffers()]
+    doubles = [name for name, value in named if value.dtype == torch.float64]
+    singles = [name for name, value in named if value.dtype == torch.float32]
+    if doubles and singles:
+        raise TypeError(
+            f"The parts of a filter compute in one precision; {', '.join(doubles[:5])} is float64 and "
+            f"{', '.join(singles[:5])} float32. Convert what you passed in with .float(), or build everything under "
+            "torch.set_default_dtype(torch.float64)."
+        )
