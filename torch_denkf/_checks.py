@@ -54,6 +54,13 @@ def check_shape(name: str, tensor: Tensor, shape: Sequence[int], layout: str) ->
         )
 
 
+def check_shapes(*checks: tuple[str, Tensor, Sequence[int], str]) -> None:
+    """Makes several checks, each of which takes the arguments of :func:`check_shape`."""
+    for name, tensor, shape, layout in checks:
+        if tensor.shape != tuple(shape):
+            check_shape(name, tensor, shape, layout)
+
+
 def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
     """Raise unless ``ensemble`` is ``[*B, E, S]`` with ``E >= min_size``.
 

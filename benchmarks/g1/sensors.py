@@ -96,7 +96,7 @@ def read_code(
     for k, (one, own) in enumerate(zip(sensors, code.chunk(len(sensors), -1), strict=True)):
         head, count = one.module["head"], size // len(sensors) + (k < size % len(sensors))
         noise = head.draw_noise(own.shape[:-1], count, dtype=own.dtype, generator=generator)
-        samples, seen = head.forward_with_hidden(own.unsqueeze(-2), noise)
+        samples, seen = head(own.unsqueeze(-2), noise, with_hidden=True)
         parts.append(samples.expand(*own.shape[:-1], count, -1))
         hidden.append(seen.mean(-2))
     samples = torch.cat(parts, -2)

@@ -69,7 +69,7 @@ def read_head(
     """A copy with ``("sensor", "ensemble")`` ``[*B, E, O]`` and ``("sensor", "encoding")`` of the sensor's head."""
     head, code = sensor.module["head"], codes["code"]
     noise = head.draw_noise(code.shape[:-1], size, dtype=code.dtype, generator=generator)
-    samples, hidden = head.forward_with_hidden(code.unsqueeze(-2), noise)
+    samples, hidden = head(code.unsqueeze(-2), noise, with_hidden=True)
     samples = (sensor.loc + sensor.scale * samples).expand(*code.shape[:-1], size, -1)
     out = codes.exclude("code")
     out["sensor"] = TensorDict({"ensemble": samples, "encoding": hidden.mean(-2)}, batch_size=out.batch_size)

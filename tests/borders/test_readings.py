@@ -15,7 +15,7 @@ from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf._checks import has_values
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter, _checks
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter, LSTMFilter, ParticleFilter, finish
 from torch_denkf.functional import soft_resample, systematic_resample
 from torch_denkf.modules import (
     ConstantNoise,
@@ -456,7 +456,7 @@ def test_only_what_nobody_can_look_at_is_passed_over(monkeypatch):
     def broken(*_):
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(_checks, "rejected_keys", broken)
+    monkeypatch.setattr(finish, "rejected_keys", broken)
     torch.vmap(means)(readings)
     with pytest.raises(RuntimeError, match="out of memory"):
         means(readings)

@@ -122,11 +122,12 @@ def test_encoding_is_the_mean_hidden_layer(float64, layer):
     td = sensor(TensorDict({"pixels": frames, ("noise", "self"): noise}, [3]))
     hidden = torch.stack(
         [
-            sensor.module["head"].forward_with_hidden(
+            sensor.module["head"](
                 sensor.module["trunk"](frames),
                 noise[:, e]
                 if layer == "dropout"
                 else {"signs": noise["signs"][:, e], "perturbation": noise["perturbation"][0]},
+                with_hidden=True,
             )[1]
             for e in range(5)
         ]

@@ -36,7 +36,7 @@ class TestDropout:
         net = StochasticMLP(3, 2, (16,), rate=0.25)
         x = torch.randn(3)
         draws = net(x.expand(100_000, 3)).detach()
-        expected, hidden = (value.detach() for value in net.forward_with_hidden(x, sample=False))
+        expected, hidden = (value.detach() for value in net(x, sample=False, with_hidden=True))
         assert_mean(draws, expected)
         # Var of a kept-and-rescaled Bernoulli factor is p / (1 - p).
         variance = (net.layers[-1].weight.detach() ** 2 * hidden**2).sum(-1) * 0.25 / 0.75
@@ -53,7 +53,7 @@ class TestDropout:
         hidden = F.relu(first(x)) * mask[:, :3] * 2
         hidden = F.relu(second(hidden)) * mask[:, 3:] * 2
         torch.testing.assert_close(net(x, mask), last(hidden), rtol=0, atol=1e-15)
-        torch.testing.assert_close(net.forward_with_hidden(x, mask)[1], hidden, rtol=0, atol=1e-15)
+        torch.testing.assert_close(net(x, mask, with_hidden=True)[1], hidden, rtol=0, atol=1e-15)
 
 
 class TestFlipout:

@@ -161,20 +161,17 @@ class Filter(Checked, TensorDictSequential):
         if self.reject:
             refuse_unguarded(structure, type(self).__name__)
         self.structure = structure
-        self._sequences = list(sequences_in(self))
-        self._sorted = self._parts()
+        places = [sequence.module._modules for sequence in sequences_in(self)]
+        self._sorted = [(modules, tuple(modules.values())) for modules in places]
+        self._sorted_with = (self.initial, self.reject, self.prefix)
         written = [*structure.frame_keys, *self.steps().step_keys]
         self._own_keys = {*written, *map(unravel_key, self.initial.out_keys)}
         self.in_keys = [self.outer(key) for key in structure.in_keys(self.init_key)]
         self.out_keys = [self.outer(key) for key in written]
+        self._noise_key = self.outer("noise")
         everything = [*structure.in_keys(self.init_key), *chain(*reads(self.initial))]
         a_step = [*structure.needed, *structure.optional, *structure.controls, *structure.carry]
         self._all_keys, self._step_keys = ({key: self.outer(key) for key in keys} for keys in (everything, a_step))
-
-    def _parts(self) -> list:
-        """What the structure was made of."""
-        parts = [part for sequence in self._sequences for part in sequence.module._modules.values()]
-        return [*parts, self.initial, self.reject, self.prefix]
 
     def replace(self, place: str, module: TensorDictModuleBase) -> Filter:
         """Puts a module in the place of another one, and sorts the modules anew.
@@ -382,7 +379,8 @@ class Filter(Checked, TensorDictSequential):
                 at together, and ``without`` names some of them, not all.
         """
         structure, steps = self.structure, self.steps()
-        tensordict = self.of_one_robot(tensordict)
+        if not isinstance(tensordict, TensorDictBase):
+            tensordict = self.of_one_robot(tensordict)
         if without:
             without = refuse_unknown_readings(structure, without)
             refuse_single_readings(structure, without)
@@ -407,7 +405,7 @@ class Filter(Checked, TensorDictSequential):
                 written = self.take_step(entries, size)
         if self.check_finite and not torch.compiler.is_compiling():
             refuse_non_finite(structure, entries, written, self.reject)
-        self.write(tensordict, own(written, entries.values()))
+        write(tensordict, own(written, entries.values()), None if self.prefix is None else self.outer)
         return tensordict
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
@@ -599,20 +597,25 @@ class Filter(Checked, TensorDictSequential):
             KeyError: if there is noise that no module draws.
             RuntimeError: if a module was exchanged without :meth:`replace`.
         """
-        if not torch.compiler.is_compiling() and self._parts() != self._sorted:
-            raise RuntimeError(
-                f"A module of {type(self).__name__}, its initial belief, reject or prefix was exchanged after it was "
-                'made. Let the filter do it, which then sorts its modules anew: filter.replace("analysis", module); '
-                "the two options are arguments of its constructor."
-            )
+        if not torch.compiler.is_compiling():
+            same = (self.initial, self.reject, self.prefix) == self._sorted_with
+            for modules, before in self._sorted:
+                same = same and tuple(modules.values()) == before
+            if not same:
+                raise RuntimeError(
+                    f"A module of {type(self).__name__}, its initial belief, reject or prefix was exchanged after it "
+                    "was made. Let the filter do it, which then sorts its modules anew: "
+                    'filter.replace("analysis", module); the two options are arguments of its constructor.'
+                )
         keys = self._step_keys if one_step else self._all_keys
         entries = {}
         for key, outer in keys.items():
             value = tensordict.get(outer, None)
             if value is not None:
                 entries[key] = value
-        noise = flat_noise(tensordict.get(self.outer("noise"), None))
-        if noise:
+        given = tensordict.get(self._noise_key, None)
+        if given is not None:
+            noise = flat_noise(given)
             refuse_unknown_noise((*self.structure.modules, ("initial", self.initial)), type(self).__name__, noise)
             entries.update(noise)
         return entries

@@ -40,7 +40,7 @@ def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
     """
     if torch.compiler.is_compiling():  # what a graph returns is its own
         return written
-    seen, out = {id(value) for value in given}, {}
+    seen, out = set(map(id, given)), {}
     for key, value in written.items():
         out[key] = value.clone() if value._is_view() or id(value) in seen else value
         seen.add(id(value))
@@ -79,7 +79,11 @@ def refuse_non_finite(
     sound = _is_sound(structure.carry, entries, written)
     if sound is None:
         return
-    absurd = [] if reject else rejected_keys(structure.guards, _without_rows(structure, entries, unread))
+    absurd = (
+        []
+        if reject
+        else rejected_keys(structure.guards, entries if unread is None else _without_rows(structure, entries, unread))
+    )
     if sound and not absurd:
         return
     refuse_far_belief(entries, structure.carry)
@@ -120,10 +124,8 @@ def _is_sound(carry: Sequence[NestedKey], *beliefs: Entries) -> bool | None:
     return True if sound is None else flag_value(sound)
 
 
-def _without_rows(structure: Structure, entries: Entries, rows: Tensor | None) -> Entries:
+def _without_rows(structure: Structure, entries: Entries, rows: Tensor) -> Entries:
     """The entries, with zeros in place of the readings of some rows."""
-    if rows is None:
-        return entries
     keys = {key for guard in structure.guards for key in (*guard.whole, *guard.components) if key in entries}
     return {**entries, **{key: where_rows(rows, torch.zeros_like(entries[key]), entries[key]) for key in keys}}
 

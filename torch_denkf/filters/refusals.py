@@ -49,11 +49,10 @@ def check_inputs(
                 "DEnKFTransform(filter), or InitTracker() and filter.make_tensordict_primer() where the filter is "
                 "part of the policy."
             )
-    missing = [
-        key
-        for key in (*structure.needed, *structure.required_controls)
-        if key not in entries and key not in without and previous_key(key) not in entries
-    ]
+    missing = []
+    for key in (*structure.needed, *structure.required_controls):
+        if key not in entries and key not in without and previous_key(key) not in entries:
+            missing.append(key)
     if missing:
         readers = [
             type(m).__name__ for _, m in structure.modules if not set(missing).isdisjoint(map(unravel_key, m.in_keys))

@@ -20,6 +20,7 @@ __all__ = ["LARGEST_READING", "REJECTED", "Guard", "guards_of", "rejected_keys",
 
 #: The largest value of a reading, in any unit: squares of larger ones leave float32.
 LARGEST_READING = 1e18
+_LARGEST = {torch.float16: torch.finfo(torch.float16).max}
 #: How many readings a step rejected, ``[*B, 1]``, int64.
 REJECTED = ("info", "rejected")
 
@@ -93,7 +94,7 @@ def usable(guards: Sequence[Guard], entries: Entries, batch_size: Sequence[int])
     for key in (key for guard in guards for key in (*guard.whole, *guard.components)):
         value = entries.get(key)
         if value is not None and value.is_floating_point() and key not in good:
-            good[key] = value.abs() <= _largest(value)  # also false for NaN
+            good[key] = value.abs() <= _LARGEST.get(value.dtype, LARGEST_READING)  # also false for NaN
             out[key] = torch.where(good[key], value, torch.zeros_like(value))
     for guard in guards:
         parts = [good[key].flatten(size).all(-1, keepdim=True) for key in guard.whole if key in good]
@@ -134,9 +135,13 @@ def rejected_keys(guards: Sequence[Guard], entries: Mapping[NestedKey, Tensor]) 
             value = entries.get(key)
             if value is None or not value.is_floating_point():
                 continue
-            if not value.numel() or _all_small(value):
+            largest = _LARGEST.get(value.dtype, LARGEST_READING)
+            if not value.numel():
                 continue
-            bad = ~(value.abs() <= _largest(value))
+            least, most = value.detach().aminmax()  # in one pass: images are large, and rarely wrong
+            if bool((most <= largest) & (least >= -largest)):
+                continue
+            bad = ~(value.abs() <= largest)
             if observed is not None:
                 size = observed.ndim - 1
                 seen = observed
@@ -146,14 +151,3 @@ def rejected_keys(guards: Sequence[Guard], entries: Mapping[NestedKey, Tensor]) 
             if bool(bad.any()):
                 found[key] = None
     return list(found)
-
-
-def _all_small(value: Tensor) -> bool:
-    """In one pass: images are large, and rarely wrong."""
-    least, most = value.detach().aminmax()
-    largest = _largest(value)
-    return bool((most <= largest) & (least >= -largest))
-
-
-def _largest(value: Tensor) -> float:
-    return min(LARGEST_READING, torch.finfo(value.dtype).max)

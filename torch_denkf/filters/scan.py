@@ -53,7 +53,7 @@ class Steps(NamedTuple):
         size = len(call.batch_size)
         for key in self.structure.plain:
             value = entries.get(key)
-            if value is not None and value.ndim > size + 1:
+            if value is not None and value.ndim > size + 1 + (key[-1] == "ensemble"):
                 _refuse_groups(self.structure, key, entries, call.batch_size)
         return usable(self.structure.guards, entries, call.batch_size) if self.reject else dict(entries)
 
@@ -74,7 +74,8 @@ class Steps(NamedTuple):
                     out = _without_reading(module, entries)
                 missing.update(key for key in map(unravel_key, module.out_keys) if key not in out)
             else:
-                out = run_module(module, entries, call.part(place))
+                part = call._replace(place=place) if call.place == "self" else call.part(place)
+                out = run_module(module, entries, part)
             names = self.structure.own_info.get(place)
             if names:
                 out = {names.get(key, key): value for key, value in out.items()}

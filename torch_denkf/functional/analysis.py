@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
+from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._ensemble_space import analyse_in_tiles, columns_in_a_tile, solve_ensemble_space
 from torch_denkf.functional._small_system import LARGEST, solve_written_out
 from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
@@ -142,21 +142,21 @@ def check_analysis_arguments(
     """Refuses arguments of :func:`analyse` that do not fit each other."""
     check_ensemble("forecast", forecast, min_size=2)
     check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
-    check_mask("observed", observed)
     if predicted.ndim < 2:
         raise ValueError(f"predicted must be [*B, E, O], got {list(predicted.shape)}")
     batch, size, dim = forecast.shape[:-2], forecast.shape[-2], predicted.shape[-1]
-    check_shape("predicted", predicted, (*batch, size, dim), "[*B, E, O]")
-    check_shape("noise", noise, (*batch, dim), "[*B, O]")
-    if observation.ndim == forecast.ndim:
-        if observation.shape[-2] != size:
-            raise ValueError(
-                f"observation must be [*B, E, O], a sample for each of E = {size} members, got {observation.shape[-2]} "
-                "samples; give the sensor the ensemble_size of the initial belief"
-            )
-        check_shape("observation", observation, (*batch, size, dim), "[*B, E, O]")
-    else:
-        check_shape("observation", observation, (*batch, dim), "[*B, O]")
+    samples = observation.ndim == forecast.ndim
+    if samples and observation.shape[-2] != size:
+        raise ValueError(
+            f"observation must be [*B, E, O], a sample for each of E = {size} members, got {observation.shape[-2]} "
+            "samples; give the sensor the ensemble_size of the initial belief"
+        )
+    each, single = ((*batch, size, dim), "[*B, E, O]"), ((*batch, dim), "[*B, O]")
+    check_shapes(
+        ("predicted", predicted, *each),
+        ("noise", noise, *single),
+        ("observation", observation, *(each if samples else single)),
+    )
     if scheme not in get_args(Scheme):
         raise ValueError(f"scheme must be one of {', '.join(get_args(Scheme))}, got {scheme!r}")
     if space not in get_args(Space):
@@ -167,6 +167,7 @@ def check_analysis_arguments(
             "use 'perturbed', 'etkf' or 'sakov' for a single observation"
         )
     if observed is not None:
+        check_mask("observed", observed)
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
         check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
     if perturbation is not None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_denkf._checks import check_mask, check_one_dtype, check_shape
+from torch_denkf._checks import check_mask, check_one_dtype, check_shape, check_shapes
 from torch_denkf.functional._small_system import LARGEST, gain_written_out
 from torch_denkf.functional.linalg import cholesky
 
@@ -56,12 +56,13 @@ def kalman_predict(mean: Tensor, cov: Tensor, transition: Tensor, noise: Tensor)
         (tensor([0.5000, 1.0000]), tensor([[1.2500, 0.5000],
                 [0.5000, 1.0000]]))
     """
-    _check_moments(mean, cov)
-    dim = mean.shape[-1]
     check_one_dtype(mean=mean, cov=cov, transition=transition)
-    _check_noise(mean, noise)
-    _check_matrix("transition", transition, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
-    _check_matrix("noise", noise, mean.shape[:-1], (dim, dim), "[S, S] or [*B, S, S]")
+    _check_moments(mean, cov, noise)
+    square = cov.shape[-2:]
+    check_shapes(
+        ("transition", transition, square if transition.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
+        ("noise", noise, square if noise.ndim == 2 else cov.shape, "[S, S] or [*B, S, S]"),
+    )
     return _apply(transition, mean), transition @ cov @ transition.mT + noise
 
 
@@ -101,21 +102,22 @@ def kalman_update(
         >>> update.mean, update.cov
         (tensor([1.]), tensor([[0.5000]]))
     """
-    _check_moments(mean, cov)
     check_one_dtype(mean=mean, cov=cov, observation=observation, observation_matrix=observation_matrix)
-    _check_noise(mean, noise)
-    check_mask("observed", observed)
+    _check_moments(mean, cov, noise)
     batch, state_dim, dim = mean.shape[:-1], mean.shape[-1], observation.shape[-1]
-    check_shape("observation", observation, (*batch, dim), "[*B, O]")
-    _check_matrix("observation_matrix", observation_matrix, batch, (dim, state_dim), "[O, S] or [*B, O, S]")
+    matrix_batch = () if observation_matrix.ndim == 2 else batch
+    noise_shape = (*batch, dim) if noise.ndim == mean.ndim else (*batch, dim, dim)
+    check_shapes(
+        ("observation", observation, (*batch, dim), "[*B, O]"),
+        ("observation_matrix", observation_matrix, (*matrix_batch, dim, state_dim), "[O, S] or [*B, O, S]"),
+        ("noise", noise, noise_shape, "variances [*B, O] or covariances [*B, O, O]"),
+    )
     if noise.ndim == mean.ndim:
-        check_shape("noise", noise, (*batch, dim), "variances [*B, O]")
         noise = noise.diag_embed()
-    else:
-        check_shape("noise", noise, (*batch, dim, dim), "variances [*B, O] or covariances [*B, O, O]")
     identity = torch.eye(dim, dtype=mean.dtype, device=mean.device)
     count: int | Tensor = dim
     if observed is not None:
+        check_mask("observed", observed)
         width = 1 if observed.ndim and observed.shape[-1] == 1 else dim
         check_shape("observed", observed, (*batch, width), "[*B, 1] or [*B, O]")
         observed = observed.expand(observation.shape)
@@ -189,17 +191,10 @@ def _whiten(residual: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
     return whitened.square().sum(-2), 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
 
 
-def _check_moments(mean: Tensor, cov: Tensor) -> None:
+def _check_moments(mean: Tensor, cov: Tensor, noise: Tensor | None = None) -> None:
     if mean.ndim < 1:
         raise ValueError("mean must be [*B, S], got a scalar; add the dimension with unsqueeze")
     check_shape("cov", cov, (*mean.shape, mean.shape[-1]), "[*B, S, S]")
-
-
-def _check_noise(mean: Tensor, noise: Tensor) -> None:
-    """Noise is only added: one of lower precision will do."""
-    if torch.promote_types(mean.dtype, noise.dtype) != mean.dtype:
+    # Noise is only added: one of lower precision will do.
+    if noise is not None and torch.promote_types(mean.dtype, noise.dtype) != mean.dtype:
         check_one_dtype(mean=mean, noise=noise)
-
-
-def _check_matrix(name: str, matrix: Tensor, batch: torch.Size, shape: tuple[int, int], layout: str) -> None:
-    check_shape(name, matrix, shape if matrix.ndim == 2 else (*batch, *shape), layout)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch_denkf._arguments import Checked
 from torch_denkf.modules._call import Call, Entries, Noise, flat_noise
 
-__all__ = ["SubModel"]
+__all__ = ["EXPLAINED", "SubModel"]
 
 
 class SubModel(Checked, TensorDictModule):
@@ -175,16 +175,29 @@ class SubModel(Checked, TensorDictModule):
             KeyError: if an entry is missing.
         """
         try:
-            values: list[Tensor | None] = [entries[key] for key in self.in_keys]
+            values: list[Any] = list(map(entries.__getitem__, self.in_keys))
+            values.extend(map(entries.get, self.optional_keys))
         except KeyError:  # the message says what there is
-            values = [self.required(entries, key) for key in self.in_keys]
-        values += [entries.get(key) for key in self.optional_keys]
+            values = self.values(entries)
         extra: dict[str, Any] = {}
         if "batch_size" in self._wants:
             extra["batch_size"] = call.batch_size
         if "noise" in self._wants:
             extra["noise"] = self._noise(entries, values, call)
-        return self.by_key(self.compute(*values, **extra))
+        out = self.compute(*values, **extra)
+        if type(out) is tuple and len(out) == len(self.out_keys):
+            return dict(zip(self.out_keys, out, strict=True))
+        if isinstance(out, Tensor) and len(self.out_keys) == 1:
+            return {self.out_keys[0]: out}
+        return self.by_key(out)
+
+    def values(self, entries: Entries) -> list[Any]:
+        """The entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+
+        Raises:
+            KeyError: if an entry of ``in_keys`` is missing.
+        """
+        return [*(self.required(entries, key) for key in self.in_keys), *map(entries.get, self.optional_keys)]
 
     def by_key(self, out: Tensor | Sequence[Tensor] | None, method: str = "compute") -> Entries:
         """What ``method`` returned, under :attr:`out_keys`.
@@ -227,26 +240,24 @@ class SubModel(Checked, TensorDictModule):
         if len(entries) < len(self.in_keys):  # the message is to list all that is there
             entries = dict.fromkeys(map(unravel_key, tensordict.keys(True, True))) | entries
         entries.update(flat_noise(tensordict.get("noise", None)))
-        for key, value in self.run(entries, Call(tensordict.batch_size)).items():
+        try:
+            written = self.on_entries(entries, Call(tensordict.batch_size))
+        except EXPLAINED as error:
+            raise self.explained(error, entries) from error
+        for key, value in written.items():
             tensordict.set(key, value)
         return tensordict
 
-    def run(self, entries: Entries, call: Call) -> Entries:
-        """What :meth:`on_entries` gives.
+    def explained(self, error: Exception, entries: Entries) -> Exception:
+        """The error with what was read, and constants, in its message; one of another kind as it is.
 
         Raises:
             TypeError: if entries and parameters differ in precision, or a mask is not boolean.
-            ValueError: and other errors of what is computed, if shapes do not fit: with what was read, and constants.
         """
-        if torch.compiler.is_compiling():
-            return self.on_entries(entries, call)
-        try:
-            return self.on_entries(entries, call)
-        except (RuntimeError, TypeError, ValueError, IndexError) as error:
-            self._explain_dtypes(error, entries)
-            if type(error) not in _EXPLAINED:  # it may not be made of a message alone
-                raise
-            raise type(error)(f"{error} {self._what_there_was(entries)}") from error
+        self._explain_dtypes(error, entries)
+        if type(error) not in EXPLAINED:  # it may not be made of a message alone
+            return error
+        return type(error)(f"{error} {self._what_there_was(entries)}")
 
     def _what_there_was(self, entries: Entries) -> str:
         """What was read, and constants, with their shapes: for the message of an error."""
@@ -269,11 +280,12 @@ class SubModel(Checked, TensorDictModule):
             given = {name: value for name, value in found.items() if value is not None}
             given = given if len(given) == len(found) else None
         if given is None:
-            like = next((value for value in values if value is not None and value.is_floating_point()), None)
-            if like is None:  # nothing is read: what is drawn lies beside the constants
-                own = (*self.parameters(), *self.buffers())
-                like = next((value for value in own if value.is_floating_point()), None)
-            where: dict[str, Any] = {} if like is None else {"device": like.device, "dtype": like.dtype}
+            where: dict[str, Any] = {}
+            # Where nothing is read, what is drawn lies beside the constants.
+            for value in values if values else (*self.parameters(), *self.buffers()):
+                if value is not None and value.is_floating_point():
+                    where = {"device": value.device, "dtype": value.dtype}
+                    break
             where.update(self.noise_sizes(*values))
             given = self.draw_noise(call.batch_size, time=call.time, **where)
             if given is None:  # it would run as if no noise were wanted
@@ -306,7 +318,7 @@ class SubModel(Checked, TensorDictModule):
 
 
 #: Errors that can be raised again with more words.
-_EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
+EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)
 
 
 def _shown(key: NestedKey, value: Tensor) -> str:

@@ -93,7 +93,7 @@ class EnsembleUpdate(SubModel):
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""
-        return self.on_aligned(self.aligned(entries), call)
+        return super().on_entries(self.aligned(entries) if self.angles else entries, call)
 
     def aligned(self, entries: Entries) -> Entries:
         """The entries with all angles on one turn, see :func:`~torch_denkf.functional.angles.align_angles`.

@@ -37,7 +37,9 @@ def hold_variances(
         variance = written.get(key) if key[-1] == "var" else None
         if variance is None:
             continue
-        exceeded = _exceeds(variance, ceiling)
+        # Not known where to look would wait for a device, or is not possible.
+        unknown = torch.compiler.is_compiling() or variance.is_cuda
+        exceeded = None if unknown else flag_value((variance > ceiling).any())
         if exceeded is False:
             continue
         if exceeded:
@@ -76,10 +78,3 @@ def _held_particles(
     centre = weighted_median(particles, log_weights).clamp(-farthest, farthest).unsqueeze(-2)
     held = particles.clamp(centre - sqrt(ceiling), centre + sqrt(ceiling))
     return torch.where(exceeded.unsqueeze(-2), held, particles)
-
-
-def _exceeds(variance: Tensor, ceiling: float) -> bool | None:
-    """Whether any variance is above the ceiling; ``None`` where to look would wait for a device, or is not possible."""
-    if torch.compiler.is_compiling() or variance.is_cuda:
-        return None
-    return flag_value((variance > ceiling).any())

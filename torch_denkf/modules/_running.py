@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeGuard, cast
 
+import torch
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._base import EXPLAINED, SubModel
 from torch_denkf.modules._call import Call, Entries
 
 __all__ = [
@@ -57,7 +58,12 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
     """
     if not (module._forward_hooks or module._forward_pre_hooks):
         if isinstance(module, SubModel) and type(module).forward is SubModel.forward:
-            return module.run(entries, call)
+            try:
+                return module.on_entries(entries, call)
+            except EXPLAINED as error:
+                if torch.compiler.is_compiling():
+                    raise
+                raise module.explained(error, entries) from error
         if is_sequence(module):
             return run_modules(named_modules_of(module), entries, call)
     keys, optional = reads(module)

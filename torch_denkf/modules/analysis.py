@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, Unpack
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Unpack
 
 import torch
 from tensordict import unravel_key
 
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
-from torch_denkf.functional.analysis import Analysis
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
@@ -51,6 +50,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         >>> EnsembleAnalysis("sensor")(td)["belief", "mean"].shape
         torch.Size([3])
     """
+
+    _formula: Callable[..., Any] = staticmethod(analyse)
 
     def __init__(
         self,
@@ -117,9 +118,13 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
-        taper = self.state_taper
-        ensemble, innovation, nis, log_likelihood = self._analyse(
-            forecast, predicted, observation, variance, observed, noise, taper
+        ensemble, innovation, nis, log_likelihood = self._formula(
+            forecast,
+            predicted,
+            observation,
+            variance,
+            observed=observed,
+            **self._options(noise, self.state_taper),
         )
         if self.relaxation:
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
@@ -157,24 +162,21 @@ class EnsembleAnalysis(EnsembleUpdate):
         lag, dim = past.shape[-2:]
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
-        moved = self._analyse(past.flatten(-2), predicted, observation, variance, observed, noise, taper)
+        options = self._options(noise, taper)
+        moved = self._formula(past.flatten(-2), predicted, observation, variance, observed=observed, **options)
         return moved.ensemble.unflatten(-1, past.shape[-2:])
 
     def _any(self, observed):
         """Where anything is observed, ``[*B]``."""
         return observed.any(-1)
 
-    def _analyse(self, ensemble, predicted, observation, variance, observed, noise, taper) -> Analysis:
+    def _options(self, noise: torch.Tensor | None, taper: torch.Tensor | None) -> dict[str, Any]:
+        """Of :func:`analyse`."""
         if self.scheme == "perturbed" and noise is None:
             raise ValueError('the scheme "perturbed" has no deterministic forward; use "etkf" or "sakov".')
-        return analyse(
-            ensemble,
-            predicted,
-            observation,
-            variance,
-            scheme=self.scheme,
-            observed=observed,
-            perturbation=noise if self.scheme == "perturbed" else None,
-            rotation=noise if self.rotate else None,
-            taper=None if taper is None else (taper, self.observation_taper),
-        )
+        return {
+            "scheme": self.scheme,
+            "perturbation": noise if self.scheme == "perturbed" else None,
+            "rotation": noise if self.rotate else None,
+            "taper": None if taper is None else (taper, self.observation_taper),
+        }

@@ -157,7 +157,7 @@ class LinearTransition(SubModel):
 
     def with_cross(self, entries: Entries, call: Call, *, wanted: bool = False) -> tuple[Entries, torch.Tensor | None]:
         """The forecast; and, where wanted, the covariance of the states before and after ``[*B, S, S]``."""
-        mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
+        mean, cov = self.values(entries)[:2]
         noise = self.noise
         constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
         # A module's is added below, because it may read the forecast's mean.

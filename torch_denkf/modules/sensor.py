@@ -112,7 +112,7 @@ class _Sensor(StochasticSensor):
         code = self._features(frames, seen)
         code = code.reshape(*batch_size, code.shape[-1])
         # [*B, 1, F] against noise [*B, E, N]: what is equal for all members is computed once.
-        samples, hidden = self.module["head"].forward_with_hidden(code.unsqueeze(-2), noise, sample=noise is not None)
+        samples, hidden = self.module["head"](code.unsqueeze(-2), noise, sample=noise is not None, with_hidden=True)
         samples = (self.loc + self.scale * samples).expand(*batch_size, self.ensemble_size, self.observation_dim)
         return (samples, hidden.mean(-2)) if len(self.out_keys) > 1 else samples
 

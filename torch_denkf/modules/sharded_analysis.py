@@ -6,7 +6,6 @@ from typing import Literal, Unpack
 
 import torch.distributed as dist
 
-from torch_denkf.functional.analysis import Analysis
 from torch_denkf.functional.sharded import analyse_sharded
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys
 from torch_denkf.modules.analysis import EnsembleAnalysis
@@ -49,6 +48,8 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         torch.Size([3])
     """
 
+    _formula = staticmethod(analyse_sharded)
+
     def __init__(
         self,
         scheme: Literal["sensor", "etkf", "sakov"] = "etkf",
@@ -70,8 +71,6 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
             dist.all_reduce(seen, dist.ReduceOp.MAX, group=self.group)
         return seen.bool()
 
-    def _analyse(self, ensemble, predicted, observation, variance, observed, noise, taper) -> Analysis:
-        """The analysis of this process's components; there is neither noise nor taper."""
-        return analyse_sharded(
-            ensemble, predicted, observation, variance, scheme=self.scheme, observed=observed, group=self.group
-        )
+    def _options(self, noise, taper):
+        """Of :func:`analyse_sharded`; there is neither noise nor taper."""
+        return {"scheme": self.scheme, "group": self.group}

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import Literal
 
 import torch
@@ -174,11 +174,8 @@ class StochasticMLP(nn.Module):
             self.noise_splits = [n_in + n_out for n_in, n_out in pairwise(sizes)]
         else:
             self.noise_splits = []
-
-    @property
-    def noise_size(self) -> int:
-        """Random bytes (dropout) or signs (flipout) that one row of the input needs."""
-        return sum(self.noise_splits)
+        #: Random bytes (dropout) or signs (flipout) that one row of the input needs.
+        self.noise_size = sum(self.noise_splits)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -216,12 +213,15 @@ class StochasticMLP(nn.Module):
         # Expanded dimensions take no memory.
         return {"signs": signs, "perturbation": perturbation.expand(*batch_size, size)}
 
-    def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None) -> torch.Tensor:
-        """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn."""
-        return self.forward_with_hidden(x, noise, sample=sample)[0]
+    def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None, with_hidden: bool = False):
+        """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn.
 
-    def forward_with_hidden(self, x: torch.Tensor, noise=None, *, sample: bool | None = None):
-        """Like ``forward``; returns the output and the last hidden layer ``[*, num_cells[-1]]``."""
+        Args:
+            x: the input.
+            noise: see the class.
+            sample: whether to draw; ``False`` for the deterministic forward.
+            with_hidden: also return the last hidden layer, ``[*, num_cells[-1]]``.
+        """
         sample = self.sample if sample is None else sample
         if sample and noise is None and self.noise_size:
             noise = self.draw_noise((), *x.shape[:-1], device=x.device, dtype=x.dtype)
@@ -229,9 +229,10 @@ class StochasticMLP(nn.Module):
         if self.layer == "flipout":
             run = self._flipout(noise) if sample else [(partial(layer, sample=False), None) for layer in self.layers]
         elif self.layer == "dropout" and sample:
-            run = self._dropout(noise, x.dtype)
+            factors = dropout_factor(noise, self.rate, x.dtype).split(self.noise_splits, -1)
+            run = list(zip(self.layers, (*factors, None), strict=True))
         else:
-            run = [(layer, None) for layer in self.layers]
+            run = list(zip(self.layers, repeat(None)))
         hidden = x
         for layer, factor in run[:-1]:
             hidden = layer(hidden)
@@ -241,11 +242,8 @@ class StochasticMLP(nn.Module):
                 hidden = dropped_relu(hidden, factor, self.rate)
             else:
                 hidden = self.activation(hidden) * factor
-        return run[-1][0](hidden), hidden
-
-    def _dropout(self, draws: torch.Tensor, dtype: torch.dtype) -> list[tuple[nn.Module, torch.Tensor | None]]:
-        factors = dropout_factor(draws, self.rate, dtype).split(self.noise_splits, -1)
-        return list(zip(self.layers, (*factors, None), strict=True))
+        out = run[-1][0](hidden)
+        return (out, hidden) if with_hidden else out
 
     def _perturbation_sizes(self) -> list[int]:
         """Numbers of perturbed weights and biases; those of flipout's layers."""

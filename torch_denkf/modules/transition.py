@@ -26,7 +26,7 @@ class MemberNetwork(SubModel):
 
     def draw_noise(self, batch_size, *, members=None, time=False, device=None, dtype=None, generator=None, **_):
         """Draws the network's noise for ``[*batch_size, E]`` rows."""
-        if members is None or not self.noise_names:
+        if members is None or not hasattr(self.module, "draw_noise"):
             return None
         return self.module.draw_noise(batch_size, members, time=time, device=device, dtype=dtype, generator=generator)
 
