@@ -11,7 +11,6 @@ from torch import nn
 
 from tests.functional.checks import assert_refused
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
-from torch_denkf.filters.scan import _without_reading
 from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
@@ -258,9 +257,6 @@ class Returns(SubModel):
     def compute(self, x):
         return self.out
 
-    def without_reading(self, x):
-        return self.out
-
 
 @pytest.mark.parametrize(
     ("out", "got"),
@@ -274,4 +270,3 @@ class Returns(SubModel):
 def test_too_few_or_too_many_values_name_the_module_and_its_keys(out, got):
     keys = r"\[\('belief', 'mean'\), \('belief', 'var'\)\], 2 values; it returned "
     assert_refused(ValueError, r"Returns.compute\(\) .*" + keys + got, Returns(out), TensorDict({"x": torch.zeros(2)}))
-    assert_refused(ValueError, r"Returns.without_reading\(\) .*" + keys + got, _without_reading, Returns(out), {})

@@ -104,11 +104,6 @@ class Own(SubModel):
         mean = ensemble_mean(forecast if self.mistake == "mean of the forecast" else ensemble)
         return ensemble, mean, ensemble_var(ensemble), result.innovation, nis, result.log_likelihood
 
-    def without_reading(self, forecast, predicted, *_):
-        ensemble = forecast + 1 if self.mistake == "without" else forecast
-        zeros = torch.zeros_like(predicted[..., 0, :])
-        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), zeros, zeros[..., :1], zeros[..., :1]
-
 
 GENERATOR = torch.Generator()
 
@@ -130,7 +125,6 @@ def test_an_analysis_of_ones_own_passes():
         ("no mask", "the mask 'observed', read"),
         ("noise", "draw_noise of Own"),
         ("own seed", "same seed"),
-        ("without", "without_reading: mean"),
     ],
 )
 def test_a_mistake_is_named(mistake, said):

@@ -387,22 +387,13 @@ class Filter(Checked, TensorDictSequential):
         entries, size = self.entries_of(tensordict, one_step=True), tensordict.batch_size
         check_inputs(structure, type(self).__name__, entries, tensordict, without)
         if without:
-            if self.compiled is not None:
-                self.messages.eager(
-                    "predict() and step(without=...) leave readings out.",
-                    "Hide what is missing with a mask instead, which keeps the step compiled.",
-                )
             entries = {key: value for key, value in entries.items() if key not in without}
-            written = steps.step(entries, Call(size), missing=without)
-            lost = [key for key in structure.carry if key in structure.step_keys and key not in written]
-            if lost:
-                raise KeyError(f"Without {list(without)} no module writes {lost}; give a mask that hides the reading.")
         else:
             self.messages.ignored_masks(structure, tensordict)
-            if self.compiled is None:
-                written = steps.step(entries, Call(size))
-            else:
-                written = self.take_step(entries, size)
+        if self.compiled is None:
+            written = steps.step(entries, Call(size), missing=structure.lost(without) if without else frozenset())
+        else:
+            written = self.take_step(entries, size, without=without)
         if self.check_finite and not torch.compiler.is_compiling():
             refuse_non_finite(structure, entries, written, self.reject)
         write(tensordict, own(written, entries.values()), None if self.prefix is None else self.outer)
@@ -418,16 +409,24 @@ class Filter(Checked, TensorDictSequential):
         written = [key for key in self.out_keys if out.get(key, None) is not None]
         return tensordict.update(out.select(*written))
 
-    def take_step(self, entries: Entries, batch_size: torch.Size, *, reject: bool | None = None) -> Entries:
+    def take_step(
+        self,
+        entries: Entries,
+        batch_size: torch.Size,
+        *,
+        reject: bool | None = None,
+        without: Sequence[NestedKey] = (),
+    ) -> Entries:
         """What one step writes where ``entries`` are, compiled or not, unchecked; ``reject`` as the filter's."""
         structure, steps = self.structure, self.steps(reject=reject)
+        missing = structure.lost(without) if without else frozenset()
         if self.compiled is not None:
             drawn, complete = self.missing_noise(entries, batch_size, structure.modules)
             if complete:
-                written = self.compiled.step(steps, {**entries, **drawn}, batch_size)
+                written = self.compiled.step(steps, {**entries, **drawn}, batch_size, missing)
                 self.messages.ceiling_in(structure, self.variance_ceiling, written)
                 return written
-        return steps.step(entries, Call(batch_size))
+        return steps.step(entries, Call(batch_size), missing=missing)
 
     def initialise(
         self,
@@ -449,12 +448,13 @@ class Filter(Checked, TensorDictSequential):
         """
         tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps(reject=reject)
         entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
-        given, missing, written = list(entries.values()), set(refuse_unknown_readings(structure, without)), {}
+        given, written = list(entries.values()), {}
+        missing = structure.lost(refuse_unknown_readings(structure, without))
         entries = steps.guarded(entries, call)
         if self.update_at_reset or not set(structure.frame_keys).isdisjoint(chain(*reads(self.initial))):
             written = steps.run(structure.frames, entries, call, missing)
         entries = {key: value for key, value in entries.items() if key not in missing}
-        start = self.initial_belief(entries, call._replace(missing=frozenset(missing)))
+        start = self.initial_belief(entries, call._replace(missing=missing))
         if self.update_at_reset:
             written.update(steps.first(entries, call, start, in_sequence=False, missing=missing))
         else:

@@ -44,11 +44,14 @@ class CompiledSteps:
     def __getstate__(self) -> dict:
         return {"chunk": self.chunk, "options": self.options, "_functions": {}}
 
-    def step(self, steps: Steps, entries: Entries, batch_size: torch.Size) -> Entries:
-        """What one step writes; ``entries`` hold its noise."""
+    def step(
+        self, steps: Steps, entries: Entries, batch_size: torch.Size, missing: frozenset[NestedKey] = frozenset()
+    ) -> Entries:
+        """What one step writes; ``entries`` hold its noise, and ``missing`` names what they do not hold."""
         keys, writes = tuple(entries), (*steps.structure.frame_keys, *steps.step_keys)
-        make = partial(_step, steps, keys, writes, batch_size)
-        values = self._call(("step", keys, batch_size), steps, make, tuple(entries.values()), keys, writes)
+        writes = tuple(key for key in writes if key not in missing)
+        make = partial(_step, steps, keys, writes, batch_size, missing)
+        values = self._call(("step", keys, batch_size, missing), steps, make, tuple(entries.values()), keys, writes)
         return dict(zip(writes, values, strict=True))
 
     def sequence(self, steps: Steps, rows: Rows, cuts: Sequence[bool], keep: tuple[NestedKey, ...]) -> Entries:
@@ -154,9 +157,9 @@ def _parameters(steps: Steps) -> dict[str, Tensor]:
     return {f"{place}.{name}": value for place, module in modules for name, value in module.named_parameters()}
 
 
-def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size) -> Callable:
+def _step(steps: Steps, keys: tuple, writes: tuple, batch: torch.Size, missing: frozenset) -> Callable:
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        written = steps.step(dict(zip(keys, values, strict=True)), Call(batch))
+        written = steps.step(dict(zip(keys, values, strict=True)), Call(batch), missing=missing)
         return tuple(written[key] for key in writes)
 
     return step

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
 from torch_denkf.filters.rejection import REJECTED, usable
-from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key
+from torch_denkf.filters.structure import RESUMES, Placed, Structure, previous_key, takes_reading
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._held import hold_variances
@@ -58,24 +58,27 @@ class Steps(NamedTuple):
         return usable(self.structure.guards, entries, call.batch_size) if self.reject else dict(entries)
 
     def run(
-        self, modules: Iterable[Placed], entries: Entries, call: Call, missing: set[NestedKey] | None = None
+        self,
+        modules: Iterable[Placed],
+        entries: Entries,
+        call: Call,
+        missing: AbstractSet[NestedKey] = frozenset(),
     ) -> Entries:
         """What modules write, one after the other; each finds in ``entries`` what those before it wrote.
 
-        ``missing`` names readings that are not there. What a module that needs them would have written is added to it,
-        unless the module knows what to write without a reading.
+        ``missing`` names what is not there, see :meth:`Structure.lost`. An analysis gets a mask in its place.
         """
         written: Entries = {}
         for place, module in modules:
-            if missing and not missing.isdisjoint(module.in_keys):
-                if is_sequence(module):
-                    out = self.run(named_modules_of(module), dict(entries), call.part(place), missing)
-                else:
-                    out = _without_reading(module, entries)
-                missing.update(key for key in map(unravel_key, module.out_keys) if key not in out)
-            else:
-                part = call._replace(place=place) if call.place == "self" else call.part(place)
+            part = call._replace(place=place) if call.place == "self" else call.part(place)
+            if not missing or missing.isdisjoint(module.in_keys):
                 out = run_module(module, entries, part)
+            elif is_sequence(module):
+                out = self.run(named_modules_of(module), dict(entries), part, missing)
+            elif takes_reading(module):
+                out = run_module(module, _hidden(module, entries, call), part)
+            else:
+                continue
             names = self.structure.own_info.get(place)
             if names:
                 out = {names.get(key, key): value for key, value in out.items()}
@@ -95,7 +98,7 @@ class Steps(NamedTuple):
         reset: Tensor | None = None,
         start: Entries | Callable[[Entries], Entries] | None = None,
         forecast: Entries | None = None,
-        missing: Collection[NestedKey] = (),
+        missing: AbstractSet[NestedKey] = frozenset(),
     ) -> Entries:
         """One step on ``[*B]``: frames, transition, update.
 
@@ -106,15 +109,20 @@ class Steps(NamedTuple):
             reset: rows ``[*B]`` or ``[*B, 1]`` that forecast their ``start``, and believe it; ``None`` for none.
             start: initial beliefs, or what makes them of entries; read only with ``reset``.
             forecast: what the transition would write, in its place.
-            missing: readings that are not among the entries, see :meth:`run`.
+            missing: what is not among the entries, see :meth:`run`.
 
         Returns:
             What the modules write.
         """
-        structure, lost, written = self.structure, set(missing), {}
+        structure, written = self.structure, {}
+        if missing and not missing.isdisjoint(structure.carry):
+            raise KeyError(
+                f"Without {sorted(map(str, missing))} no module writes {list(structure.carry)}: give a mask that hides "
+                "the reading, or let the analysis name its reading_keys and its observed_key."
+            )
         if frames:
             entries = self.guarded(entries, call)
-            written = self.run(structure.frames, entries, call, lost)
+            written = self.run(structure.frames, entries, call, missing)
         else:
             entries = dict(entries)
         begin = start or {} if start is None or isinstance(start, dict) else start(entries)
@@ -128,7 +136,7 @@ class Steps(NamedTuple):
                     forecast[name] = where_rows(reset, begin[key], forecast[name])
         entries.update(forecast)
         written.update(forecast)
-        written.update(self.run(structure.update, entries, call, lost))
+        written.update(self.run(structure.update, entries, call, missing))
         if reset is not None and not self.update_at_reset:
             for key in structure.belief:
                 written[key] = where_rows(reset, begin[key], written[key])
@@ -145,7 +153,7 @@ class Steps(NamedTuple):
         start: Entries,
         *,
         in_sequence: bool = True,
-        missing: Collection[NestedKey] = (),
+        missing: AbstractSet[NestedKey] = frozenset(),
     ) -> Entries:
         """The first step of a sequence: its forecast is ``start``; it is updated if that is to see its frame."""
         structure = self.structure
@@ -238,13 +246,10 @@ def _refuse_groups(structure: Structure, key: NestedKey, entries: Entries, batch
         )
 
 
-def _without_reading(module: TensorDictModuleBase, entries: Entries) -> Entries:
-    """What a module writes where its reading is missing; nothing if it does not know."""
-    if not isinstance(module, SubModel) or not module.reading_keys:
-        return {}
-    if type(module).without_reading is SubModel.without_reading:
-        return {}
-    readings = set(module.reading_keys)
-    values: list[Tensor | None] = [None if key in readings else module.required(entries, key) for key in module.in_keys]
-    told = module.without_reading(*values, *(entries.get(key) for key in module.optional_keys))
-    return module.by_key(told, "without_reading")
+def _hidden(module: SubModel, entries: Entries, call: Call) -> Entries:
+    """The entries with ones in the place of readings that are missing, and a mask that hides them."""
+    like = next(entries[key] for key in module.in_keys if key in entries)
+    dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
+    ones = {unravel_key(key): like.new_ones(*call.batch_size, dim) for key, dim in dims}
+    mask = torch.zeros(*call.batch_size, 1, dtype=torch.bool, device=like.device)
+    return {**ones, **entries, module.observed_key: mask}

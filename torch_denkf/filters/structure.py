@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -43,6 +43,11 @@ def previous_key(key: NestedKey) -> tuple[str, ...]:
 def submodels(module: torch.nn.Module) -> list[SubModel]:
     """Returns the sub-models inside ``module``, also those inside others."""
     return [part for part in module.modules() if isinstance(part, SubModel)]
+
+
+def takes_reading(module: TensorDictModuleBase) -> TypeGuard[SubModel]:
+    """Whether a module takes in a reading, and heeds a mask that hides it."""
+    return isinstance(module, SubModel) and bool(module.reading_keys) and module.observed_key is not None
 
 
 def sequences_in(sequence: TensorDictSequential) -> Iterator[TensorDictSequential]:
@@ -112,6 +117,17 @@ class Structure(NamedTuple):
         parts = [part for _, module in self.update for part in submodels(module)]
         direct = [part for part in parts if key in map(unravel_key, part.reading_keys)]
         return direct or [part for part in parts if part.reading_keys]
+
+    def lost(self, missing: Iterable[NestedKey]) -> frozenset[NestedKey]:
+        """Without some entries, what is not there: they, and all that is made of them up to an analysis."""
+        lost, written = set(missing), set()
+        for _, module in self.modules:
+            for part in in_sequences(module):
+                if lost.isdisjoint(part.in_keys) or takes_reading(part):
+                    written.update(writes(part))
+                else:  # an entry that another module wrote before stays
+                    lost.update(key for key in writes(part) if key not in written)
+        return frozenset(lost)
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
         """All that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""

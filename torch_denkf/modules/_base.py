@@ -41,6 +41,7 @@ class SubModel(Checked, TensorDictModule):
         source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
         reads_components: whether each component of a reading counts, and is hidden, by itself.
         joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
+        predicted_key: what predicts that reading, ``[*B, E, O]``, which tells how many components it has.
         noise_variance_key: the variances of its reading, which tell how many components that has.
         mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
         info_prefix: prefix of its diagnostics.
@@ -76,6 +77,7 @@ class SubModel(Checked, TensorDictModule):
     source_keys: Sequence[NestedKey] = ()
     reads_components: bool = False
     joins_readings: bool = False
+    predicted_key: NestedKey = ("forecast", "observation")
     noise_variance_key: NestedKey | None = None
     mask_key: NestedKey | None = None
     info_prefix: str | None = None
@@ -153,12 +155,24 @@ class SubModel(Checked, TensorDictModule):
         """The modules inside that may draw noise of their own, by name."""
         return {}
 
-    def without_reading(self, *values: Any) -> Tensor | tuple[Tensor, ...] | None:
-        """What is written where there is no reading, from the values that :meth:`compute` gets by position.
+    def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
+        """How many numbers each of ``reading_keys`` has, where it is missing and zeros behind a mask stand for it.
 
-        Those of readings are ``None``. ``None`` is returned by a sub-model that does not know.
+        By default O: ``observation_dim``, or what :attr:`predicted_key` holds.
+
+        Raises:
+            KeyError: if that is not known.
         """
-        return None
+        dim, predicted = self.observation_dim, entries.get(self.predicted_key)
+        if predicted is not None:
+            dim = predicted.shape[-1]
+        if dim is None:
+            raise KeyError(
+                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
+                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
+                f"{type(self).__name__} say it."
+            )
+        return [dim] * len(self.reading_keys)
 
     def without_step(self, entries: Entries) -> Entries:
         """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
@@ -199,8 +213,8 @@ class SubModel(Checked, TensorDictModule):
         """
         return [*(self.required(entries, key) for key in self.in_keys), *map(entries.get, self.optional_keys)]
 
-    def by_key(self, out: Tensor | Sequence[Tensor] | None, method: str = "compute") -> Entries:
-        """What ``method`` returned, under :attr:`out_keys`.
+    def by_key(self, out: Tensor | Sequence[Tensor] | None) -> Entries:
+        """What :meth:`compute` returned, under :attr:`out_keys`.
 
         Raises:
             ValueError: if it is not one tensor for each of them.
@@ -209,7 +223,7 @@ class SubModel(Checked, TensorDictModule):
         if values is None or len(values) != len(self.out_keys):
             got = type(out).__name__ if values is None else f"{len(values)} values"
             raise ValueError(
-                f"{type(self).__name__}.{method}() returns a tensor for each of its out_keys, in their order: "
+                f"{type(self).__name__}.compute() returns a tensor for each of its out_keys, in their order: "
                 f"{list(self.out_keys)}, {len(self.out_keys)} values; it returned {got}."
             )
         return dict(zip(self.out_keys, values, strict=True))

@@ -88,7 +88,8 @@ class EnsembleUpdate(SubModel):
         check_number("relaxation", relaxation, least=0, most=1)
         check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
-        self.angles, self.info_prefix, self.reading_keys = list(angles), info_prefix, self.in_keys[2:]
+        self.angles, self.info_prefix = list(angles), info_prefix
+        self.predicted_key, self.reading_keys = self.in_keys[1], self.in_keys[2:]
         self.observed_key = unravel_key(observed_key)
 
     def on_entries(self, entries, call):

@@ -187,11 +187,10 @@ class GaussianAnalysis(SubModel):
         values = updated(update, observed, self.inflation)
         return dict(zip(self.out_keys, values, strict=True))
 
-    def without_reading(self, mean, cov, *_):
-        """The belief where there is no reading: the forecast; innovation and its kin are zero."""
-        predicted = self._observe({}, mean.unsqueeze(-2), Call(mean.shape[:-1], sample=False))[0]
-        zero = torch.zeros_like(predicted[..., 0, :])
-        return mean, cov, cov.diagonal(dim1=-2, dim2=-1), zero, zero[..., :1], zero[..., :1]
+    def reading_dims(self, entries, call):
+        """O, as the model predicts it."""
+        mean = self.required(entries, self.in_keys[0])
+        return [self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]] * 2
 
     def mask(self, entries: Entries, mean: torch.Tensor, call: Call) -> torch.Tensor | None:
         """What is observed, ``[*B, 1]`` or ``[*B, O]``, as the model says that the analysis runs inside."""
@@ -207,7 +206,9 @@ class GaussianAnalysis(SubModel):
         """Predicted observations ``[*B, E, O]`` of an ensemble, and the mask after the model ran."""
         with deterministic(self.module):
             written = run_module(self.module, {**entries, self.ensemble_key: states}, call)
-        return written[self.predicted_key], written.get(self.observed_key, entries.get(self.observed_key))
+        given, made = entries.get(self.observed_key), written.get(self.observed_key)
+        mask = given if made is None else made if given is None else made & given
+        return written[self.predicted_key], mask
 
 
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:

@@ -104,18 +104,6 @@ class EnsembleAnalysis(EnsembleUpdate):
         """E and O, from the ensemble and its predicted observations."""
         return {"members": forecast.shape[-2], "observation_dim": predicted.shape[-1]}
 
-    def without_reading(self, forecast, predicted, *_):
-        """The belief where there is no reading: the forecast."""
-        unseen = torch.zeros_like(predicted[..., 0, :1], dtype=torch.bool)
-        noise = torch.zeros_like(predicted) if self.scheme == "perturbed" else None
-        if self.rotate:
-            size = forecast.shape[-2]
-            noise = torch.eye(size, dtype=forecast.dtype, device=forecast.device).expand(
-                *forecast.shape[:-2], size, size
-            )
-        ones = torch.ones_like(predicted[..., 0, :])
-        return self.compute(forecast, predicted, torch.zeros_like(predicted), ones, unseen, noise=noise)
-
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
         ensemble, innovation, nis, log_likelihood = self._formula(

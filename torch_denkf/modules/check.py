@@ -14,7 +14,6 @@ from torch_denkf.functional import ensemble_mean, kalman_update
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean
-from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import random_parts, reads
 
 __all__ = ["check_analysis"]
@@ -49,8 +48,7 @@ def check_analysis(
       where some components are observed, the belief is that of the Kalman update with these alone;
     * batches ``[]``, ``[3]`` and ``[2, 3]`` give beliefs of these shapes, and inputs are left as they are;
     * the derivative of the mean by the reading is the gain;
-    * noise is drawn by ``draw_noise`` from the sizes that a filter knows beforehand, and by torch's generator;
-    * ``without_reading``, if there is one, gives the forecast.
+    * noise is drawn by ``draw_noise`` from the sizes that a filter knows beforehand, and by torch's generator.
 
     Args:
         analysis: a sub-model, or a ``TensorDictSequential`` of several, such as a likelihood and a particle analysis.
@@ -195,14 +193,6 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
         ):
             yield from _moments(name, analysis, case, case.hide(td, observed), tolerance)
         yield from _forecast("where nothing is observed: ", case, td, analysis(case.hide(td, nothing)))
-    if isinstance(analysis, SubModel):
-        hidden = set(map(unravel_key, analysis.reading_keys))
-        names = [*map(unravel_key, analysis.in_keys), *analysis.optional_keys]
-        values = [None if key in hidden else td.get(key, None) for key in names]
-        told = analysis.without_reading(*values)
-        if told is not None:
-            written = analysis.by_key(told, "without_reading")
-            yield from _forecast("without_reading: ", case, td, TensorDict(written, [2]))
 
 
 def _moments(

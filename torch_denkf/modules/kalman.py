@@ -248,10 +248,9 @@ class KalmanAnalysis(SubModel):
         """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""
         return product_of_known(self.matrix, state)
 
-    def without_reading(self, mean, cov, *_):
-        """The belief where there is no reading: the forecast; innovation and its kin are zero."""
-        zero = mean.new_zeros(*mean.shape[:-1], self.matrix.shape[0])
-        return mean, cov, cov.diagonal(dim1=-2, dim2=-1), zero, zero[..., :1], zero[..., :1]
+    def reading_dims(self, entries, call):
+        """O, the rows of H."""
+        return [len(self.matrix)] * len(self.reading_keys)
 
     def compute(self, mean, cov, observation, *rest):
         """The belief and the diagnostics."""

@@ -71,10 +71,7 @@ class GaussianLikelihood(SubModel):
         check_dims("angles", angles)
         self.angles = list(angles)
         self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
-
-    def without_reading(self, predicted, *_):
-        """The log-likelihoods where there is no reading: zero."""
-        return torch.zeros_like(predicted[..., 0])
+        self.predicted_key = self.in_keys[0]
 
     def compute(self, predicted, reading, variance, observed=None, *, batch_size):
         """The log-likelihoods."""
@@ -188,7 +185,7 @@ class LearnedLikelihood(SubModel):
             network = StochasticMLP(encoding_dim + observation_dim, 1, num_cells, layer="none")
         in_keys = [key for key in (encoding_key, predicted_key, observation_key) if key is not None]
         super().__init__(network, in_keys, [out_key], optional_keys=[observed_key])
-        self.bound, self.observation_dim = bound, observation_dim
+        self.bound, self.observation_dim, self.encoding_dim = bound, observation_dim, encoding_dim
         self.angles = list(angles)
         self.reading_keys = [key for key in self.in_keys if key != self.in_keys[1]]
         self.observed_key = unravel_key(observed_key)
@@ -197,9 +194,9 @@ class LearnedLikelihood(SubModel):
             vector = as_vector(name, default if value is None else value, observation_dim, above=limit)
             self.register_buffer(name, vector)
 
-    def without_reading(self, encoding, predicted, *_):
-        """The log-likelihoods where there is no reading: zero."""
-        return torch.zeros_like(predicted[..., 0])
+    def reading_dims(self, entries, call):
+        """Of the encoding, and of the reading."""
+        return [self.encoding_dim, self.observation_dim][: len(self.reading_keys)]
 
     def compute(self, encoding, predicted, *rest, batch_size):
         """The log-likelihoods."""

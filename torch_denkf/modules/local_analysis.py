@@ -131,12 +131,6 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         """E, from the ensemble."""
         return {"members": forecast.shape[-2]}
 
-    def without_reading(self, forecast, predicted, *_):
-        """The belief where there is no reading: the forecast."""
-        unseen = torch.zeros_like(predicted[..., 0, :1], dtype=torch.bool)
-        ones = torch.ones_like(predicted[..., 0, :])
-        return self.compute(forecast, predicted, torch.zeros_like(ones), ones, unseen, noise=None)
-
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
         observation = mean_of_members(observation, predicted.shape[:-2])

@@ -317,12 +317,9 @@ class ParticleAnalysis(SubModel):
         check_number("tempering", tempering, above=0)
         self.tempering, self.info_prefix = tempering, info_prefix
         self.angles: list[int] = [] if likelihood is None else likelihood.angles
-        self.reading_keys = [] if likelihood is None else likelihood.reading_keys
-
-    def without_reading(self, particles, prior, log_likelihood, predicted, *_):
-        """What is written where there is no reading: the likelihood says what the belief is, the innovation is zero."""
-        ones = torch.ones_like(predicted[..., 0, :])
-        return self.compute(particles, prior, log_likelihood, predicted, ones, ones, torch.zeros_like(ones).bool())
+        if likelihood is not None:
+            self.reading_keys, self.predicted_key = likelihood.reading_keys, likelihood.predicted_key
+            self.observed_key, self.reads_components = likelihood.observed_key, True
 
     def compute(self, particles, prior, log_likelihood, *of_reading):
         """The belief and the diagnostics."""

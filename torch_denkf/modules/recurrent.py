@@ -200,12 +200,9 @@ class LSTMUpdate(SubModel):
             self.register_buffer(name, as_vector(name, default if value is None else value, size, above=limit))
         self.feature_sizes = [size for size in (features, observation_dim) if size]
 
-    def without_reading(self, hidden, cell, *rest):
-        """Memory and belief where there is no reading: the flags say so."""
-        batch_size, count = hidden.shape[:-2], len(self.reading_keys)
-        unseen = torch.zeros(*batch_size, 1, dtype=torch.bool, device=hidden.device)
-        blank = [hidden.new_zeros(*batch_size, size) for size in self.feature_sizes]
-        return self.compute(hidden, cell, *blank, *rest[count:-1], unseen, batch_size=batch_size)
+    def reading_dims(self, entries, call):
+        """Of the encoding, and of the reading."""
+        return self.feature_sizes
 
     def compute(self, hidden, cell, *rest, batch_size):
         """The memory and the belief."""

@@ -8,7 +8,6 @@ from typing import Literal, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
@@ -267,15 +266,6 @@ class GatedAnalysis(AnalysisAround):
         own = (terms, shut, log_noise, log_inflation, factor, nis, innovation, part)
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
-    def without_reading(self, *values):
-        """The belief where there is no reading: the forecast; the state stays."""
-        inner = len(self.in_keys) - len(self.state_keys)
-        out = self.module.without_reading(*values[:inner])
-        by_key = dict(zip(map(unravel_key, self.module.out_keys), out, strict=True))
-        nis, innovation = (by_key[self.info_prefix, name] for name in ("nis", "innovation"))
-        none = nis.new_zeros(*nis.shape[:-1], self.parts_count)
-        return (*out, *values[inner : len(self.in_keys)], none + 1, nis, innovation, none)
-
     def _analyse(self, entries: Entries, call: Call) -> Entries:
         """What the analysis writes; the angles of an ensemble's entries are on one turn already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
@@ -337,14 +327,9 @@ class GatedAnalysis(AnalysisAround):
 
     def _without(self, entries: Entries, call: Call, rejected: Tensor) -> Entries:
         """What the analysis writes without what is rejected ``[*B, K]``."""
-        if self.by_component:
-            mask = entries.get(self.observed_key)
-            kept = ~rejected if mask is None else mask & ~rejected
-            return self._analyse({**entries, self.observed_key: kept}, call)
-        out = self._analyse(entries, call)
-        values = self.module.without_reading(*(entries[key] for key in self.module.in_keys))
-        none = dict(zip(map(unravel_key, self.module.out_keys), values, strict=True))
-        return {key: torch.where(expand_as_right(rejected, value), none[key], value) for key, value in out.items()}
+        mask = entries.get(self.observed_key)
+        kept = ~rejected if mask is None else mask & ~rejected
+        return self._analyse({**entries, self.observed_key: kept}, call)
 
     # --------------------------------------------------------------------------------------------------- calibration
 

@@ -173,13 +173,6 @@ class IteratedAnalysis(SubModel):
         )
         return dict(zip(self.out_keys, out, strict=True))
 
-    def without_reading(self, ensemble, *_):
-        """Nothing: the step of members that no reading moves asks for the entries that the transition reads."""
-        raise KeyError(
-            "IteratedAnalysis makes the step itself, so that a reading cannot be left out. Hide it with a mask: "
-            f"{self.observed_key!r}."
-        )
-
     def _motion_noise(self, entries: Entries, ensemble: torch.Tensor, call: Call) -> Entries:
         """The noise of the members' motion, drawn once for all iterations."""
         noise: Entries = {}

@@ -171,16 +171,11 @@ class LaggedAnalysis(InPlaceOf):
         )
         self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
-        self.noise_variance_key = analysis.noise_variance_key
+        self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
 
     def noise_sizes(self, *values):
         """Those of the analysis."""
         return self.module.noise_sizes(*values)
-
-    def without_reading(self, *values):
-        """The belief where there is no reading: the forecast, and the past as it is."""
-        past = values[len(self.module.in_keys)]
-        return *self.module.without_reading(*values), past
 
     def on_entries(self, entries, call):
         """The belief, the diagnostics, and the past."""
