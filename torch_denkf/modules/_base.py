@@ -174,6 +174,58 @@ class SubModel(Checked, TensorDictModule):
             )
         return [dim] * len(self.reading_keys)
 
+    @property
+    def draws(self) -> bool:
+        """Whether :meth:`compute` asks for noise."""
+        return "noise" in self._wants
+
+    @property
+    def updates_ensemble(self) -> bool:
+        """Whether it reads an ensemble, what its members predict of a reading, the reading, and its noise; and a mask.
+
+        Such an analysis can be given a past to correct (:meth:`move_past`).
+        """
+        keys = [unravel_key(key) for key in self.in_keys]
+        read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
+        return keys[1:] == read and keys[0][-1] == "ensemble" and self.optional_keys == [self.observed_key]
+
+    def move_past(
+        self,
+        past: Tensor,
+        predicted: Tensor,
+        observation: Tensor,
+        variance: Tensor,
+        observed: Tensor | None = None,
+        *,
+        noise: Noise = None,
+    ) -> Tensor:
+        """Of an analysis of an ensemble: what a reading says of earlier states of the same members.
+
+        By default what :meth:`compute` would do to them if they were the state, inflation and the like included.
+
+        Args:
+            past: ``[*B, E, L, S]``.
+            predicted: predicted observations ``[*B, E, O]``.
+            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
+            variance: of the reading, ``[*B, O]``.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
+            noise: what :meth:`compute` was given: the same draws.
+
+        Returns:
+            The updated past, ``[*B, E, L, S]``.
+        """
+        extra = {"noise": noise} if self.draws else {}
+        out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
+        return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
+
+    def aligned(self, entries: Entries) -> Entries:
+        """Of an analysis: the entries with all angles on one turn, so that they can be averaged like other numbers."""
+        return entries
+
+    def on_aligned(self, entries: Entries, call: Call) -> Entries:
+        """What :meth:`on_entries` gives of entries that are :meth:`aligned` already."""
+        return self.on_entries(entries, call)
+
     def without_step(self, entries: Entries) -> Entries:
         """Of a transition: what it writes beside the forecast where an episode begins, and no step leads there."""
         return {}

@@ -133,20 +133,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         factor[..., self.inflated] = self.inflation
         return factor
 
-    def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
-        """What the reading says of earlier states of the same members; neither inflation nor relaxation touches them.
-
-        Args:
-            past: ``[*B, E, L, S]``.
-            predicted: predicted observations ``[*B, E, O]``.
-            observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
-            variance: of the reading, ``[*B, O]``.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
-            noise: what :meth:`compute` was given: the same draws.
-
-        Returns:
-            The updated past, ``[*B, E, L, S]``.
-        """
+    def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
+        """See :meth:`SubModel.move_past`; neither inflation nor relaxation touches the past."""
         lag, dim = past.shape[-2:]
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)

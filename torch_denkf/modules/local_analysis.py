@@ -146,7 +146,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         diagnostics = _diagnostics(predicted, observation, variance, observed)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *diagnostics
 
-    def move_past(self, past, predicted, observation, variance, observed=None, *, noise):
+    def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
         """What the readings say of earlier states ``[*B, E, L, S]``: see :meth:`EnsembleAnalysis.move_past`.
 
         Each component learns from the observations near it now. What moves far in L steps needs a larger radius.

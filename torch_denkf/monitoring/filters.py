@@ -12,15 +12,12 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.base import Filter
 from torch_denkf.fusion.parts import StateObservation
-from torch_denkf.modules import KalmanAnalysis
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._ensemble import EnsembleUpdate
-from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._call import Call
 from torch_denkf.modules._running import check_module, is_sequence, named_modules_of
 from torch_denkf.modules.carried import with_state
-from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions
+from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions, can_be_gated
 from torch_denkf.monitoring.monitor import InnovationMonitor
-from torch_denkf.smoothers.past import LaggedAnalysis
 
 __all__ = ["Gated", "Monitored"]
 
@@ -210,7 +207,7 @@ def _analyses(module: TensorDictModuleBase) -> Iterator[SubModel]:
     if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from _analyses(part)
-    elif isinstance(module, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis | LaggedAnalysis):
+    elif can_be_gated(module):
         yield module
 
 
@@ -223,11 +220,12 @@ def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorD
 
 def _dim(filter: Filter, analysis: SubModel) -> int:
     """How many components an analysis' reading has."""
-    if isinstance(analysis, KalmanAnalysis):
-        return analysis.matrix.shape[0]
-    dim = filter.structure.observation_dims.get(unravel_key(analysis.in_keys[3]))
-    if dim is None:
+    known = [filter.structure.observation_dims.get(unravel_key(key)) for key in analysis.reading_keys[1:]]
+    if known and known[0] is not None:
+        return known[0]
+    try:
+        return analysis.reading_dims({}, Call(torch.Size()))[0]
+    except KeyError:
         raise ValueError(
             f"how many components the reading of {type(analysis).__name__} has is not known; pass observation_dim"
-        )
-    return dim
+        ) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, TypedDict
+from typing import Literal, TypedDict, TypeGuard
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries, flat_noise
-from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis
 from torch_denkf.modules._running import writes
 from torch_denkf.modules.carried import AnalysisAround
@@ -61,6 +60,16 @@ class GateOptions(TypedDict, total=False):
     adapt_noise: float
     adapt_inflation: float
     gate_prefix: str
+
+
+def can_be_gated(analysis: nn.Module) -> TypeGuard[SubModel]:
+    """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
+    if not isinstance(analysis, SubModel) or analysis.observed_key is None or isinstance(analysis, GatedAnalysis):
+        return False
+    read = [unravel_key(key) for key in analysis.reading_keys]
+    scores = {(analysis.info_prefix, name) for name in ("nis", "innovation")}
+    in_place = [unravel_key(key) for key in analysis.in_keys[2 : 2 + len(read)]] == read
+    return bool(read) and in_place and scores <= set(map(unravel_key, analysis.out_keys))
 
 
 class GatedAnalysis(AnalysisAround):
@@ -142,13 +151,14 @@ class GatedAnalysis(AnalysisAround):
         adapt_inflation: float = 0.0,
         gate_prefix: str = "gate",
     ):
-        update = analysis.module if isinstance(analysis, LaggedAnalysis) else analysis
-        if not isinstance(update, EnsembleUpdate | GaussianAnalysis | KalmanAnalysis):
+        if not can_be_gated(analysis):
             raise TypeError(
                 f"{type(analysis).__name__} does not say where its variances and its forecast are. A gate goes around "
-                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis."
+                "an EnsembleAnalysis, LocalEnsembleAnalysis, KalmanAnalysis, EKFAnalysis or UKFAnalysis, or one of "
+                "your own: its in_keys begin with two of the forecast and its reading_keys, it names its observed_key, "
+                "and it writes nis and innovation under its info_prefix."
             )
-        of_ensemble = isinstance(update, EnsembleUpdate)
+        of_ensemble = analysis.updates_ensemble
         if by_component and not of_ensemble:
             raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
         if response not in ("reject", "student", "huber"):

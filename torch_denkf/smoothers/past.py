@@ -23,9 +23,7 @@ from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
-from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.carried import Beside, InPlaceOf
-from torch_denkf.modules.local_analysis import LocalEnsembleAnalysis
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "with_past"]
 
@@ -134,7 +132,8 @@ class LaggedAnalysis(InPlaceOf):
     It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
 
     Args:
-        analysis: :class:`EnsembleAnalysis` or :class:`LocalEnsembleAnalysis`; its keys and its noise are kept.
+        analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, or one of your own that updates an
+            ensemble; its keys and its noise are kept.
         past_key: the past ``[*B, E, L, S]``, read and written.
 
     Raises:
@@ -154,14 +153,15 @@ class LaggedAnalysis(InPlaceOf):
 
     def __init__(
         self,
-        analysis: EnsembleAnalysis | LocalEnsembleAnalysis,
+        analysis: SubModel,
         *,
         past_key: NestedKey = ("forecast", "past"),
     ):
-        if not isinstance(analysis, EnsembleAnalysis | LocalEnsembleAnalysis):
+        if not (isinstance(analysis, SubModel) and analysis.updates_ensemble):
             raise TypeError(
                 f"{type(analysis).__name__} does not say what a reading means for earlier states. A lag needs an "
-                "EnsembleAnalysis or a LocalEnsembleAnalysis; smooth other ensembles with EnRTS."
+                "EnsembleAnalysis, a LocalEnsembleAnalysis, or one of your own whose in_keys begin with the ensemble, "
+                "its predicted_key and its reading_keys; smooth other ensembles with EnRTS."
             )
         super().__init__(
             analysis,
@@ -172,6 +172,11 @@ class LaggedAnalysis(InPlaceOf):
         self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
         self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
+
+    @property
+    def updates_ensemble(self) -> bool:
+        """As the analysis inside."""
+        return True
 
     def noise_sizes(self, *values):
         """Those of the analysis."""
@@ -191,8 +196,9 @@ class LaggedAnalysis(InPlaceOf):
 
     def compute(self, forecast, predicted, observation, variance, past, observed=None, *, noise):
         """The belief, the diagnostics, and the past."""
-        out = self.module.compute(forecast, predicted, observation, variance, observed, noise=noise)
-        return *out, self.module.move_past(past, predicted, observation, variance, observed, noise=noise)
+        read, analysis = (predicted, observation, variance, observed), self.module
+        out = analysis.by_key(analysis.compute(forecast, *read, **({"noise": noise} if analysis.draws else {})))
+        return *out.values(), analysis.move_past(past, *read, noise=noise)
 
 
 class LaggedBelief(SubModel):

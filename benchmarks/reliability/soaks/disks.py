@@ -232,7 +232,7 @@ PAIRS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], bool]] = {
     ),
     "cache of a drive": (_cached, _cached, False),
     "package": (_package, lambda folder: str(_package(folder)), False),
-    "pretrained folder": (_pretrained, lambda folder: _files(folder / "filter"), False),
+    "pretrained folder": (_pretrained, lambda folder: _files(folder / "filter"), True),
     "checkpoint": (_checkpoint, lambda folder: _checkpoint(folder)["weight"].sum().item(), False),
 }
 
