@@ -117,7 +117,7 @@ def inverse_square_root(matrix: Tensor) -> Tensor:
         tensor([[0.5000, 0.0000],
                 [0.0000, 0.3333]])
     """
-    return _SymmetricFunction.apply(matrix, False)[0]
+    return _symmetric_function(matrix, difference=False)
 
 
 def inverse_square_root_difference(matrix: Tensor) -> Tensor:
@@ -142,7 +142,13 @@ def inverse_square_root_difference(matrix: Tensor) -> Tensor:
         tensor([[-0.1667,  0.0000],
                 [ 0.0000, -0.5000]])
     """
-    return _SymmetricFunction.apply(matrix, True)[0]
+    return _symmetric_function(matrix, difference=True)
+
+
+def _symmetric_function(matrix: Tensor, *, difference: bool) -> Tensor:
+    # Torch looks up the arguments' names at each call of apply, which takes longer than a small matrix does.
+    run = _SymmetricFunction.apply if torch.is_grad_enabled() else _SymmetricFunction.forward
+    return run(matrix, difference)[0]
 
 
 class _SymmetricFunction(torch.autograd.Function):
