@@ -187,7 +187,7 @@ class SubModel(Checked, TensorDictModule):
         """
         keys = [unravel_key(key) for key in self.in_keys]
         read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
-        return keys[1:] == read and keys[0][-1] == "ensemble" and self.optional_keys == [self.observed_key]
+        return keys[1:] == read and self.optional_keys == [self.observed_key]
 
     def move_past(
         self,

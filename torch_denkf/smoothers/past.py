@@ -141,6 +141,7 @@ class LaggedAnalysis(InPlaceOf):
 
     Example:
         >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import EnsembleAnalysis
         >>> members = torch.tensor([[-1.0], [1.0]])
         >>> td = TensorDict({
         ...     "forecast": {"ensemble": members, "observation": members, "past": members.unsqueeze(-1) / 2},
