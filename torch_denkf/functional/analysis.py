@@ -55,6 +55,7 @@ def analyse(
     perturbation: Tensor | None = None,
     rotation: Tensor | None = None,
     taper: tuple[Tensor, Tensor] | None = None,
+    significance: float | Tensor | None = None,
     space: Space = "auto",
 ) -> Analysis:
     """Condition a forecast ensemble on an observation.
@@ -87,6 +88,9 @@ def analyse(
         taper: localisation: factors in [0, 1] on the sample covariances of state and predicted observation
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
+        significance: localisation by what the members themselves say, see :func:`significant`: how many standard
+            deviations a sample correlation must be away from zero to be believed, such as 3. ``None`` believes all.
+            Needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
             ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one. Without
             gradients, ensemble space takes large states in tiles: memory is the result's and a few tiles.
@@ -108,9 +112,11 @@ def analyse(
         2.00 1.00
     """
     given = forecast, predicted, observation, noise
-    check_analysis_arguments(*given, scheme, observed, perturbation, rotation, taper, space)
+    check_analysis_arguments(*given, scheme, observed, perturbation, rotation, taper, significance, space)
     size, dim = predicted.shape[-2:]
-    in_observation_space = space == "observation" or (space == "auto" and (dim < size or taper is not None))
+    in_observation_space = space == "observation" or (
+        space == "auto" and (dim < size or taper is not None or significance is not None)
+    )
     columns = None if in_observation_space else columns_in_a_tile(*given, perturbation)
     if columns is not None:
         tiled = partial(analyse_in_tiles, scheme=scheme, columns=columns, rotation=rotation)
@@ -122,7 +128,8 @@ def analyse(
     anomalies = forecast - mean  # A, eq. 10
     acted_on = shift(scheme, reading, observed, perturbation)
     # Both spaces solve with S, eq. 9, in units of the noise; the increment is K, eq. 11, times what it acts on.
-    solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
+    observation_space = partial(_observation_space, taper=taper, significance=significance)
+    solve = observation_space if in_observation_space else _ensemble_space
     increment, root, square, log_det = solve(reading, anomalies, acted_on, square_root=scheme == "etkf")
     if root is not None and rotation is not None:
         root = rotation @ root
@@ -137,7 +144,7 @@ def analyse(
 
 
 def check_analysis_arguments(
-    forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, space
+    forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, taper, significance, space
 ) -> None:
     """Refuses arguments of :func:`analyse` that do not fit each other."""
     check_ensemble("forecast", forecast, min_size=2)
@@ -180,6 +187,8 @@ def check_analysis_arguments(
         for name, value, rows in zip(("state", "observation"), taper, (forecast.shape[-1], dim), strict=True):
             if value.shape[-2:] != (rows, dim):
                 raise ValueError(f"the {name}'s taper must be [*B, {rows}, {dim}], got {list(value.shape)}")
+    if significance is not None and space == "ensemble":
+        raise ValueError("significance needs observation space; leave space out")
     if rotation is not None:
         if scheme != "etkf":
             raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")
@@ -193,6 +202,7 @@ def _observation_space(
     *,
     square_root: bool,
     taper: tuple[Tensor, Tensor] | None = None,
+    significance: float | Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
     """Solve with I + YᵀY, O x O.
 
@@ -204,6 +214,8 @@ def _observation_space(
     gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
     if taper is not None:
         gram, cross = gram * taper[1], cross * taper[0].mT
+    if significance is not None:
+        cross = cross * significant(cross, normalised, anomalies, significance)
     transformed = None
     if square_root:
         transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
@@ -215,6 +227,39 @@ def _observation_space(
     whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
     increment = acted_on @ torch.cholesky_solve(cross, factor)  # by the gain K, eq. 11
     return increment, transformed, whitened.square().sum(-2), log_det
+
+
+def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: float | Tensor) -> Tensor:
+    r"""How far sample covariances are to be believed: :math:`\max(0, 1 - (z_0 / z)^2)`.
+
+    The correlation r of two components of E members that have nothing to do with each other is not zero: its standard
+    deviation is :math:`1 / \sqrt{E - 1}`. So :math:`z = |r| \sqrt{E - 1}` says how significant r is. Each update
+    multiplies a gain by this factor, and what chance alone explains moves nothing. With fast sensors, thousands of such
+    updates would otherwise shrink what the readings say nothing about. Members enough, and the factor is 1.
+
+    Correlation-based localisation: Anderson, Monthly Weather Review 140, 2012; Luo & Bhakta, Computational Geosciences
+    24, 2020; Vishny, Morzfeld, Gwirtz, Bach, Dunbar & Hodyss, JAMES 16, 2024. This factor is smooth, and may be
+    trained through its threshold.
+
+    Args:
+        cross: products of the anomalies, ``[*B, O, S]``.
+        predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
+        state: anomalies of the state, ``[*B, E, S]``.
+        threshold: :math:`z_0`, positive, one number or ``[S]``.
+
+    Returns:
+        Factors in [0, 1), ``[*B, O, S]``.
+
+    Example:
+        >>> anomalies = torch.tensor([[-1.0, 1.0], [0.0, -2.0], [1.0, 1.0]])  # the second knows nothing of the first
+        >>> significant(anomalies[:, :1].mT @ anomalies, anomalies[:, :1], anomalies, 1.0)
+        tensor([[0.5000, 0.0000]])
+    """
+    spread = predicted.square().sum(-2).unsqueeze(-1) * state.square().sum(-2, keepdim=True)
+    limit = threshold**2 * spread / (state.shape[-2] - 1)
+    explained = cross.square()
+    believed = explained > limit
+    return torch.where(believed, 1 - limit / torch.where(believed, explained, 1), 0)
 
 
 def _ensemble_space(

@@ -65,7 +65,7 @@ def analyse_sharded(
         2.00 1.00
     """
     check_analysis_arguments(
-        forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, None, "ensemble"
+        forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, None, None, "ensemble"
     )
     if scheme == "perturbed" and perturbation is None:
         raise ValueError("scheme 'perturbed' needs perturbation: draw it with another seed in each process")

@@ -32,6 +32,11 @@ class EnsembleAnalysis(EnsembleUpdate):
         taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
             ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
             nothing about a component of the state but what E members happen to show, the factor is 0.
+        localisation: ``"significance"`` believes a covariance of state and observation as far as E members can tell it
+            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps 32 to 64 members honest
+            where fast sensors make thousands of updates. ``None`` believes all.
+        threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
+            more updates a component sees between two readings about it, the larger.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         **keys: see :class:`EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned observations, not one reading.
@@ -62,10 +67,14 @@ class EnsembleAnalysis(EnsembleUpdate):
         relaxation: float = 0.0,
         rotate: bool = False,
         taper: tuple[torch.Tensor, torch.Tensor] | None = None,
+        localisation: Literal["significance"] | None = None,
+        threshold: float | torch.Tensor = 3.0,
         angles: Sequence[int] = (),
         covariance: bool = False,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
+        if localisation not in (None, "significance"):
+            raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
         pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
         if taper is not None and not pair:
             raise TypeError(f"taper is two tensors, [S, O] and [O, O], or None; got {type(taper).__name__}")
@@ -78,6 +87,12 @@ class EnsembleAnalysis(EnsembleUpdate):
         )
         check_dims("inflated", inflated or [])
         self.inflated = None if inflated is None else list(inflated)
+        self.localisation, self.threshold = localisation, threshold
+        if localisation is not None:
+            check_values("threshold", torch.as_tensor(threshold), above=0)
+        if isinstance(threshold, torch.Tensor) and not isinstance(threshold, torch.nn.Parameter):
+            del self.threshold
+            self.register_buffer("threshold", threshold)
         self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
@@ -139,6 +154,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
         options = self._options(noise, taper)
+        if isinstance(self.threshold, torch.Tensor) and self.threshold.numel() > 1 and self.localisation is not None:
+            options["significance"] = self.threshold.repeat(lag)
         moved = self._formula(past.flatten(-2), predicted, observation, variance, observed=observed, **options)
         return moved.ensemble.unflatten(-1, past.shape[-2:])
 
@@ -155,4 +172,5 @@ class EnsembleAnalysis(EnsembleUpdate):
             "perturbation": noise if self.scheme == "perturbed" else None,
             "rotation": noise if self.rotate else None,
             "taper": None if taper is None else (taper, self.observation_taper),
+            **({} if self.localisation is None else {"significance": self.threshold}),
         }
