@@ -128,6 +128,12 @@ def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, i
     )
 
 
+def believing(threshold, **kwargs):
+    """The same, which believes the covariances that are significant."""
+    analysis = EnsembleAnalysis("etkf", observation_key="observation", localisation="significance", threshold=threshold)
+    return linear_denkf(**kwargs).replace("analysis", analysis)
+
+
 def linear_with(modules, *, analysis=None, initial=None, **options):
     """The filter of :func:`linear_denkf` behind other modules, some of them in the place of its own of that name."""
     plain = linear_denkf()

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import InitTracker, TransformedEnv, check_env_specs
 from torchrl.modules import set_recurrent_mode
 
-from tests.filters.factories import NoisyLinear, assert_equal, linear_denkf, linear_kalman, linear_system
+from tests.filters.factories import NoisyLinear, assert_equal, believing, linear_denkf, linear_kalman, linear_system
 from tests.filters.gaussian_for_tests import linear_filter
 from tests.transforms.envs_for_tests import base_env
 from torch_denkf.filters import LSTMFilter, ParticleFilter
@@ -73,6 +73,7 @@ FILTERS = {
     "DEnKF etkf": linear_denkf,
     "DEnKF perturbed": lambda: linear_denkf("perturbed", noisy=True),
     "DEnKF sakov": lambda: linear_denkf("sakov", noisy=True),
+    "DEnKF significance": lambda: believing(torch.tensor([0.5, 1.0])),
     "Kalman": linear_kalman,
     "EKF": lambda: linear_filter("EKF"),
     "UKF": lambda: linear_filter("UKF"),
@@ -91,9 +92,17 @@ FILTERS = {
     "fused Kalman, late": lambda: fused("Kalman", late=True),
     "fused Kalman, late, joint": lambda: fused("Kalman", late=True, joint=True),
 }
-LAGGED = ("DEnKF etkf", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
+LAGGED = ("DEnKF etkf", "DEnKF significance", "DEnKF perturbed", "Kalman", "UKF", "particles, jitter")
 FILTERS |= {f"{name}, lag": partial(lambda inner: FixedLag(inner(), 3), FILTERS[name]) for name in LAGGED}
-FILTERS_WITHOUT_NOISE = {"DEnKF etkf", "Kalman", "EKF", "UKF", "Backprop KF", "LSTM"}  # of their own
+FILTERS_WITHOUT_NOISE = {
+    "DEnKF etkf",
+    "DEnKF significance",
+    "Kalman",
+    "EKF",
+    "UKF",
+    "Backprop KF",
+    "LSTM",
+}  # of their own
 FILTERS_WITHOUT_NOISE |= {"fused Kalman, late", "fused Kalman, late, joint"}
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)
@@ -200,7 +209,7 @@ def test_unobserved_doubt_grows_and_a_reading_shrinks_it(float64, name):
     spread = filter.sequence(frames)["belief", "var"].sum(-1).mean(0)
     if name == "LSTM":  # that it must learn
         return
-    if name.startswith("DEnKF etkf"):  # without process noise its members come together
+    if name.startswith(("DEnKF etkf", "DEnKF significance")):  # without process noise its members come together
         assert spread[5] < spread[4]
         return
     assert spread[2] < spread[3] < spread[4] > spread[5]
