@@ -1,0 +1,102 @@
+"""An analysis of a user's own is lagged, delayed, gated, rejected and left out like ours of the same formula."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from tests.filters.factories import NoisyLinear, linear_denkf, linear_system
+from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import EnsembleAnalysis, LinearObservation, SubModel
+from torch_denkf.monitoring import Gated
+from torch_denkf.smoothers import EnRTS, FixedLag
+
+
+class Own(SubModel):
+    def __init__(
+        self,
+        observation_key="observation",
+        *,
+        forecast_key=("forecast", "ensemble"),
+        predicted_key=("forecast", "observation"),
+        noise_variance_key=("sensor", "noise"),
+        observed_key="observed",
+        belief_prefix="belief",
+        angles=(),
+    ):
+        writes = [(belief_prefix, name) for name in ("ensemble", "mean", "var")]
+        writes += [("info", name) for name in ("innovation", "nis", "log_likelihood")]
+        reads = [forecast_key, predicted_key, observation_key, noise_variance_key]
+        super().__init__(nn.Identity(), reads, writes, optional_keys=[observed_key])
+        self.predicted_key, self.reading_keys = self.in_keys[1], self.in_keys[2:]
+        self.observed_key, self.info_prefix = observed_key, "info"
+
+    def compute(self, forecast, predicted, reading, variance, observed=None):
+        ensemble, *scores = analyse(forecast, predicted, reading, variance, scheme="etkf", observed=observed)
+        return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *scores
+
+
+def late(analysis):
+    F, _, H, R = linear_system()
+    return FusedFilter(
+        NoisyLinear(F, None, None),
+        {"observation": FusedSensor(LinearObservation(H), R.sqrt(), delay=2, analysis=analysis)},
+        initial=linear_denkf(ensemble_size=8).initial,
+        process_noise=[0.0, 0.0],
+    )
+
+
+def rejecting(filter):
+    return type(filter)(
+        *(filter[name] for name in ("transition",)),
+        None,
+        *(filter[name] for name in ("observation", "noise", "analysis")),
+        initial=filter.initial,
+        reject=True,
+    )
+
+
+WAYS = {
+    "as it is": lambda filter: filter.sequence,
+    "lagged": lambda filter: FixedLag(filter, 3).sequence,
+    "gated": lambda filter: Gated(filter, 2, response="reject", window=1, rate=0.3).sequence,
+    "gated and lagged": lambda filter: FixedLag(Gated(filter, 2, rate=0.3, adapt_noise=0.1), 2).sequence,
+    "rejected": lambda filter: rejecting(filter).sequence,
+    "smoothed": EnRTS,
+    "predicted": lambda filter: lambda data: filter.predict(filter.initialise(data[:, 0])),
+}
+
+
+@pytest.fixture
+def data(float64):
+    torch.manual_seed(3)
+    data = TensorDict({"observation": 3.0 * torch.randn(4, 9, 2)}, [4, 9])
+    return data.set("observed", torch.rand(4, 9, 1) < 0.7)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_it_gives_what_ours_gives(data, way):
+    if way == "rejected":
+        data["observation"][1, 4] = torch.nan
+    ours, own = (WAYS[way](linear_denkf(ensemble_size=8).replace("analysis", part)) for part in both())
+    expected, out = ours(data.clone()), own(data.clone())
+    keys = [key for key in expected.keys(True, True) if expected[key].is_floating_point()]
+    assert ("belief", "mean") in keys
+    assert set(keys) <= set(out.keys(True, True))
+    for key in keys:
+        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-10, equal_nan=True, msg=str(key))
+
+
+def test_behind_a_sensor_that_is_late(data):
+    data = TensorDict({"observation": data["observation"], "observation_observed": data["observed"]}, data.batch_size)
+    expected = late(partial(EnsembleAnalysis, "etkf")).sequence(data.clone())
+    out = late(Own).sequence(data.clone())
+    for key in (("belief", "ensemble"), ("smoothed", "mean")):
+        torch.testing.assert_close(out[key], expected[key], rtol=0, atol=1e-10)
+
+
+def both():
+    return EnsembleAnalysis("etkf", observation_key="observation"), Own()
