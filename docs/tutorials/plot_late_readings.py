@@ -61,10 +61,10 @@ drives = drive(40)
 # %%
 # One filter
 # ----------
-# Motion and readings are linear, so a mean and a covariance say all: the filter is a Kalman filter. With an ensemble as
-# its first belief, the same lines make an ensemble Kalman filter. ``delay`` says how old a reading is. The filter then
-# also carries its last states, and a late reading corrects the state that it belongs to. What it says of that state, it
-# says of the present one through their covariance.
+# Motion and readings are linear, so a mean and a covariance say all: the filter is a Kalman filter. An ensemble
+# (``GaussianPrior`` and a ``LearnedTransition``) goes into the same filter. ``delay`` says how old a reading is. The
+# filter then also carries its last states, and a late reading corrects the state that it belongs to. What it says of
+# that state, it says of the present one through their covariance.
 
 
 def fuse(delay: int = LATE, weights: torch.nn.Module | None = None) -> FusedFilter:

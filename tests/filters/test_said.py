@@ -99,8 +99,9 @@ def test_a_compiled_filter_that_cannot_draw_its_noise_says_so_once():
     assert "noise_variance_key" in said(record)[0]
 
 
-def test_predictions_of_a_compiled_filter_are_compiled_and_equal():
-    eager, filter = linear_kalman(), linear_kalman().compile(backend="eager")
+@pytest.mark.parametrize("make", [linear_kalman, linear_denkf])
+def test_predictions_of_a_compiled_filter_are_compiled_and_equal(make):
+    eager, filter = make(), make().compile(backend="eager")
     td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -108,7 +109,7 @@ def test_predictions_of_a_compiled_filter_are_compiled_and_equal():
     assert len(filter.compiled._functions) == 1
     expected = eager.predict(td.copy())["belief"]
     for belief in (predicted["belief"], left_out["belief"]):
-        for key in ("mean", "cov"):
+        for key in ("mean", "var"):
             torch.testing.assert_close(belief[key], expected[key], rtol=0, atol=1e-6)
 
 

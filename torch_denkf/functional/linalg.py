@@ -147,8 +147,9 @@ def inverse_square_root_difference(matrix: Tensor) -> Tensor:
 
 def _symmetric_function(matrix: Tensor, *, difference: bool) -> Tensor:
     # Torch looks up the arguments' names at each call of apply, which takes longer than a small matrix does.
-    run = _SymmetricFunction.apply if torch.is_grad_enabled() else _SymmetricFunction.forward
-    return run(matrix, difference)[0]
+    if torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return _SymmetricFunction.apply(matrix, difference)[0]
+    return _SymmetricFunction.forward(matrix, difference)[0]
 
 
 class _SymmetricFunction(torch.autograd.Function):
