@@ -104,7 +104,7 @@ def test_predictions_of_a_compiled_filter_are_compiled_and_equal(make):
     eager, filter = make(), make().compile(backend="eager")
     td = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", UserWarning)
         predicted, left_out = filter.predict(td.copy()), filter.step(td.copy(), without=["observation"])
     assert len(filter.compiled._functions) == 1
     expected = eager.predict(td.copy())["belief"]
