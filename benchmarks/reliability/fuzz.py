@@ -193,7 +193,8 @@ class Fuzz:
     sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and those that are drawn beside
     drawn: int = 3  # so many cases beside those with names, of each thing that may be damaged
     seed: int = 0  # of what is drawn
-    borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]  # where the inputs come in
+    borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]
+    """where the inputs come in"""
     processes: int = 2  # that take cases side by side
     match: str = ""  # only cases that have this in their names
     again: str = ""  # only the case of these letters, which a failure printed beside its ``--match``

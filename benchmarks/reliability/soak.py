@@ -24,6 +24,7 @@ class Soak:
     """Runs parts of the soak; goes on where an earlier run was left. Leaves soak.json and soak.md."""
 
     parts: some_of(PARTS) = PARTS  # type: ignore[valid-type]
+    """what to run"""
     steps: int = 1_000_000  # of each filter's packaged step
     kills: int = 8  # of each job
     frames: int = 100_000  # of each layout of environments
