@@ -107,7 +107,7 @@ FILTERS_WITHOUT_NOISE |= {"fused Kalman, late", "fused Kalman, late, joint"}
 FILTERS_WITHOUT_NOISE |= {f"{name}, lag" for name in FILTERS_WITHOUT_NOISE}
 every_filter = pytest.mark.parametrize("name", FILTERS)
 #: One of each belief. To trace a step takes dynamo up to half a minute; `make test-all` traces all.
-TRACED = {"DEnKF etkf, lag", "Backprop KF", "particles, soft"}
+TRACED = {"DEnKF significance, lag", "Backprop KF", "particles, soft"}
 some_filters = pytest.mark.parametrize(
     "name", [name if name in TRACED else pytest.param(name, marks=pytest.mark.slow) for name in FILTERS]
 )

@@ -14,7 +14,15 @@ from tests.filters.two_readings_for_tests import parts_of_reading
 from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleTransition
 from torch_denkf.applications.car.modules.pairs import with_history
 from torch_denkf.filters import Filter, KalmanFilter
-from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, KalmanAnalysis, Select
+from torch_denkf.modules import (
+    AroundState,
+    ConstantNoise,
+    EnsembleAnalysis,
+    KalmanAnalysis,
+    LinearTransition,
+    MomentPrior,
+    Select,
+)
 from torch_denkf.transforms import DEnKFTransform
 
 # ------------------------------------------------------------------------------------------------ resets that update
@@ -204,3 +212,22 @@ def test_modules_are_exchanged_by_the_filter_alone():
     filter.initial = copy.deepcopy(filter.initial)
     with pytest.raises(RuntimeError, match=r"filter.replace\("):
         filter.sequence(frames.copy())
+
+
+def test_a_new_module_that_would_lose_readings_is_named():
+    """One that reads another mask is said; one that passes an earlier update by, or is put in by index, is refused."""
+    one = torch.eye(2)
+    keys = {"observation_key": "observation", "noise_variance_key": ("sensor", "noise")}
+    masked = linear_with({}, analysis=EnsembleAnalysis("etkf", **keys, observed_key="seen"))
+    with pytest.warns(UserWarning, match="reads the mask 'seen', and EnsembleAnalysis reads 'observed'"):
+        masked.replace("analysis", EnsembleAnalysis("sakov", **keys))
+    with pytest.raises(TypeError, match=r"filter.replace\('analysis', module\)"):
+        masked["analysis"] = EnsembleAnalysis("sakov", **keys)
+    motion = LinearTransition(one, one)
+    wheels = KalmanAnalysis(one, one, observation_key="wheels", belief_prefix="after_wheels")
+    gps = KalmanAnalysis(one, one, observation_key="gps", forecast_prefix="after_wheels")
+    prior = MomentPrior(torch.zeros(2), one)
+    two = Filter({"transition": motion, "wheels": wheels, "gps": gps}, initial=prior)
+    with pytest.raises(ValueError, match=r"'wheels' \(KalmanAnalysis\) takes in .* the reading would be lost"):
+        two.replace("gps", KalmanAnalysis(one, one, observation_key="gps"))
+    assert two["gps"] is gps

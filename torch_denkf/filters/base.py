@@ -176,6 +176,9 @@ class Filter(Checked, TensorDictSequential):
     def replace(self, place: str, module: TensorDictModuleBase) -> Filter:
         """Puts a module in the place of another one, and sorts the modules anew.
 
+        Keys, angles and inflation are those of the new module: give it what the old one had. A mask that is read no
+        more is said.
+
         Args:
             place: name or number of the module; of one inside a sequence both names, ``"second.1"``; ``"initial"`` for
                 the initial belief.
@@ -206,6 +209,15 @@ class Filter(Checked, TensorDictSequential):
         except AttributeError:
             names = [name for name, _ in named_modules_of(self)]
             raise KeyError(f"{type(self).__name__} has no module at {place!r}; it has {names}.") from None
+        mask = declared(old).observed_key
+        other = declared(module).observed_key
+        if None not in (mask, other) and mask not in chain(*reads(module)):
+            self.messages.once(
+                f"mask of {place!r}",
+                f"{type(old).__name__} at {place!r} reads the mask {mask!r}, and {type(module).__name__} reads "
+                f"{other!r}: readings that the first hides will count. Give the new module observed_key={mask!r}, "
+                "unless that is meant.",
+            )
         setattr(where, name, module)
         try:
             self._sort()
@@ -259,6 +271,14 @@ class Filter(Checked, TensorDictSequential):
         """A shallow copy that holds the filter's own entries as they would be without a prefix."""
         out = tensordict.copy()
         return out if self.prefix is None else out.update(tensordict.get(self.prefix))
+
+    def __setitem__(self, index, module) -> None:
+        """Refuses: :meth:`replace` exchanges a module.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(f"{type(self).__name__} exchanges its modules itself: filter.replace({index!r}, module)")
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""

@@ -181,6 +181,7 @@ class Structure(NamedTuple):
         for key in step_keys:  # a summary that the analysis writes and the initial belief does not
             if key not in belief and key[-1] in _SUMMARIES and any(key[:-1] == other[:-1] for other in carry):
                 belief.append(key)
+        _refuse_unused(steps, [*carry, *belief])
         forecast_of = _forecasts(carry, writes(steps[0][1]), forecast_keys)
         return cls(
             frames=tuple(frames),
@@ -405,6 +406,21 @@ def _refuse_overwriting(modules: Sequence[Placed]) -> None:
                     f"({type(module).__name__}) wrote, before any module has read it. Give one of them other keys, "
                     "e.g. out_key=, or belief_prefix= of the first analysis and forecast_key= of the second."
                 )
+
+
+def _refuse_unused(steps: Sequence[Placed], belief: Sequence[NestedKey]) -> None:
+    """Raises where nobody uses what an analysis writes: its reading would be lost."""
+    used = set(belief)
+    for place, module in reversed(steps[1:]):
+        info = declared(module).info_prefix
+        made = [key for key in writes(module) if info is None or key[0] != info]
+        if made and takes_reading(module) and used.isdisjoint(made):
+            raise ValueError(
+                f"{place!r} ({type(module).__name__}) takes in {list(module.reading_keys)} and writes {made}, which no "
+                "module behind it reads and which is not the belief: the reading would be lost. The next analysis goes "
+                "on from there: give it forecast_key= or forecast_prefix= of that name."
+            )
+        used.update(chain(*reads(module)))
 
 
 def _refuse_nesting(read: Sequence[NestedKey], written: Sequence[NestedKey]) -> None:

@@ -10,6 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
+from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_mask, check_shape
 from torch_denkf._slices import starts_of
 from torch_denkf.filters.base import Filter
@@ -36,7 +37,7 @@ class RefilteringWindow(NamedTuple):
         return self.beliefs[-1]
 
 
-class Refiltering:
+class Refiltering(Checked):
     """Filters the last steps once more when a reading comes late, with any filter.
 
     The belief is that of the filter which gets each reading when it is taken, to rounding, also for ensembles with
