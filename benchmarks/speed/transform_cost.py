@@ -38,7 +38,7 @@ from torch_denkf.filters import DEnKF
 from torch_denkf.modules import VectorSensor
 from torch_denkf.transforms import DEnKFTransform
 
-TARGET_MS = 0.4
+TARGETS_MS = {"filter": 0.8, "packaged": 0.3}
 LAST = ("quietest", "target", "met")
 
 
@@ -141,7 +141,7 @@ def rows_of(name: str, timings: Timings) -> dict[str, Row]:
         kind: Row(
             f"DEnKFTransform ({kind}) on {name}, B=1: ms it adds to a step",
             cost_ms(timings, kind),
-            TARGET_MS,
+            TARGETS_MS[kind],
             ours_us=timings.micro(kind),
             theirs_us=timings.micro("without"),
             note=f"not a ratio; {rates['without']} steps a second without, {rates[kind]} with",
@@ -171,7 +171,7 @@ def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
         for kind, row in rows_of(name, timings).items():
             rates = [f"{1e6 / timings.micro(key):,.0f}" for key in ("without", kind)]
             least = 1e3 * (min(timings.rounds[kind]) - min(timings.rounds["without"]))
-            lines.append(line(name, kind, *rates, f"{row.ratio:.2f}", f"{least:.2f}", TARGET_MS, row.met_text))
+            lines.append(line(name, kind, *rates, f"{row.ratio:.2f}", f"{least:.2f}", TARGETS_MS[kind], row.met_text))
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[2]:.1f}"
     lines += [
         "",
