@@ -25,7 +25,7 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
         f"`{command}`: {seconds / 60:.0f} min on {machine['processor']}, one thread, torch {machine['torch']}, Python",
         f"{machine['python']}. Measured in the same run: matrix peak {machine['peak_gflops']:.0f} GFLOP/s (float32),",
         f"bandwidth {machine['bandwidth_gb_s']:.0f} GB/s. Ratios: ours over theirs, below 1 ours is faster; the median",
-        "over interleaved rounds in one process. Times: processor time of a step (S=5, O=2, E=32, Table I without the",
+        "over interleaved rounds in one process; with a range behind it, the median of separate runs. Times: processor time of a step (S=5, O=2, E=32, Table I without the",
         "image sensor) unless the row says otherwise. Pairs that this command leaves out were measured before. Plain:",
         "the ratio of a compiled filter without this package's passes for inductor, from `--plain`.",
         "",
@@ -33,6 +33,8 @@ def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> s
     ]
     for row in rows:
         ratio = number(row["ratio"]) or "not measured"
+        if row.get("range"):
+            ratio += " ({} to {})".format(*map(number, row["range"]))
         limits = [number(row.get("target")), number(row.get("aim"))]
         times = [number(row.get("ours_us"), 1), number(row.get("theirs_us"), 1)]
         plain = number(row.get("plain"))
