@@ -159,3 +159,23 @@ def test_info(capsys, monkeypatch, tmp_path):
     assert lines["OpenGL"].startswith(("yes", "no: "))
     assert lines["C++"].startswith("compiler")
     assert "CPU cores" in lines["devices"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ["odometry", "--fpss", "3"],
+            "error: unknown option --fpss; did you mean --fps?",
+        ),  # and frames are missing, too
+        (["demo", "--oot", "x"], "error: unknown option --oot; did you mean --"),
+        (["dmo"], "error: unknown command 'dmo'; did you mean demo?"),
+    ],
+)
+def test_a_misspelt_word_is_named_with_the_nearest_known(words, told, capsys):
+    assert main(words) == 2
+    assert capsys.readouterr().err.startswith(told)
+
+
+def test_options_are_read_with_either_dash_and_as_one_word(tmp_path, capsys):
+    assert main(["cache", "clear", "--older_than", "1", f"--folder={tmp_path}"]) == 0

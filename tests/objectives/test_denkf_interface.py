@@ -33,7 +33,7 @@ def test_set_keys(float64):
     out = loss(renamed)
     assert all(out[key].equal(expected[key]) for key in list(expected.keys()))
     assert ("truth", "x") in loss.in_keys
-    with pytest.raises(ValueError, match="not an accepted"):
+    with pytest.raises(ValueError, match="DEnKFLoss reads no 'reward'; set_keys takes state, "):
         loss.set_keys(reward="r")
 
 
@@ -84,3 +84,9 @@ def test_parameters_and_state_are_the_filters():
     assert {id(p) for p in loss.parameters()} == {id(p) for p in filter.parameters()}
     assert {name for name, _ in loss.named_parameters()} == {f"filter.{name}" for name, _ in filter.named_parameters()}
     assert "state_scale" in loss.state_dict()
+
+
+def test_a_misspelt_entry_is_named_beside_those_that_exist():
+    loss = DEnKFLoss(toy_denkf())
+    with pytest.raises(ValueError, match=r"^DEnKFLoss reads no 'sensr'; set_keys takes state, [a-z_, ]+$"):
+        loss.set_keys(sensr="x")

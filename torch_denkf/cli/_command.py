@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import difflib
 import inspect
 import io
 import re
@@ -16,7 +18,7 @@ from typing import ClassVar
 
 from torch_denkf._lock import locked
 
-__all__ = ["Command", "alone_in", "say"]
+__all__ = ["Command", "alone_in", "meant", "say"]
 
 _FRAME = re.compile("[\u2500-\u257f]")  # what tyro draws around a mistake
 
@@ -104,6 +106,7 @@ class Command:
         drawn = io.StringIO()
         try:
             _refuse_empty(words)
+            _refuse_unknown(cls, words)
             with contextlib.redirect_stderr(drawn):
                 return tyro.cli(
                     cls,
@@ -149,6 +152,27 @@ def _refuse_empty(words: Sequence[str]) -> None:
     for before, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             raise ValueError(f"argument {word.rstrip('=') or before}: must not be empty")
+
+
+def _refuse_unknown(command: type, words: Sequence[str]) -> None:
+    """An option that is misspelt is named by itself: a parser would first miss what it was to give."""
+    known = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(command)]
+    allowed = {"--help", *known, *(f"--no-{option[2:]}" for option in known)}
+    for word in words:
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--") and option not in allowed:
+            raise ValueError(f"unknown option {option}{meant(option, known)}")
+
+
+def meant(word: str, known: Sequence[str]) -> str:
+    """The end of a message about a word that is unknown: the nearest known one, or all.
+
+    Example:
+        >>> meant("dmo", ["demo", "info"]), meant("x", ["demo", "info"])
+        ('; did you mean demo?', '; there are demo, info')
+    """
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
 
 
 def _mistake(message: str) -> int:

@@ -53,7 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"denkf {torch_denkf.__version__}\n")
         return 0
     if words[0] not in known:
-        sys.stderr.write(f"error: unknown command {words[0]!r}; there are {', '.join(known)}\n")
+        from torch_denkf.cli._command import meant  # here: `denkf --help` does not need it
+
+        sys.stderr.write(f"error: unknown command {words[0]!r}{meant(words[0], list(known))}\n")
         return 2
     try:
         command = resolve_name(known[words[0]][0])

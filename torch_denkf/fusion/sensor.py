@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf._arguments import Checked
 from torch_denkf.fusion.parts import Renamed
 from torch_denkf.modules import ConstantNoise
 from torch_denkf.modules._running import in_sequences, marks_of, writes
@@ -17,7 +18,7 @@ __all__ = ["FusedSensor", "Wired", "wire"]
 
 
 @dataclass(frozen=True)
-class FusedSensor:
+class FusedSensor(Checked):
     """One sensor of a :class:`FusedFilter`.
 
     The keys of its modules need not be chosen: what they write is put under ``("sensor", NAME, ...)``.

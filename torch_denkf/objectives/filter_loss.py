@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, TypedDict
 
 import torch
@@ -255,7 +255,10 @@ class FilterLoss(Checked, LossModule):
             TypeError: for what is no key: a string, or a tuple of strings.
             ValueError: for entries that the loss does not read.
         """
+        known = [field.name for field in fields(self._AcceptedKeys)]
         for name, key in kwargs.items():
+            if name not in known:
+                raise ValueError(f"{type(self).__name__} reads no {name!r}; set_keys takes {', '.join(known)}")
             if key is not None:
                 check_key(name, key)
         super().set_keys(**kwargs)
