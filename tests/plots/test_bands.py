@@ -159,3 +159,37 @@ def test_errors_say_what_to_do():
         plot_bands(kalman_runs()[0], band="ensemble")
     with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):
         plot_bands(run, level=90)
+
+
+def spans(axes) -> list[tuple[float, float]]:
+    return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
+
+
+def slow_sensor(lost: int) -> TensorDict:
+    """Five seconds at 100 Hz of a sensor at 1 Hz, of whose readings at 0.5, 1.5, ... s one is lost."""
+    sequence = TensorDict({"belief": {"mean": torch.zeros(500, 1)}}, [500])
+    sequence["observed"] = (torch.arange(500) % 100 == 50).unsqueeze(-1)
+    sequence["observed"][50 + 100 * lost] = False
+    return sequence
+
+
+def test_a_slow_sensor_is_shaded_where_it_lost_a_reading_alone():
+    (axes,) = plot_bands(slow_sensor(lost=2), time=0.01)
+    assert spans(axes) == [pytest.approx((1.505, 3.495))]  # from behind the reading at 1.5 s to the one at 3.5 s
+
+
+@pytest.mark.parametrize(("gap", "count"), [(2.0, 0), (1.99, 1), (0.99, 3), (0.0, 5)])
+def test_gap_is_the_longest_time_between_two_readings_that_is_no_outage(gap, count):
+    (axes,) = plot_bands(slow_sensor(lost=2), time=0.01, gap=gap)
+    assert len(spans(axes)) == count  # 2 s once, twice 1 s, and half a second at both ends
+
+
+def test_without_any_reading_all_is_shaded():
+    sequence = TensorDict({"belief": {"mean": torch.zeros(4, 1)}, "observed": torch.zeros(4, 1, dtype=torch.bool)}, [4])
+    (axes,) = plot_bands(sequence)
+    assert spans(axes) == [(-0.5, 3.5)]
+
+
+def test_a_gap_below_zero_is_refused():
+    with pytest.raises(ValueError, match="gap is the longest time between two readings"):
+        plot_bands(slow_sensor(lost=2), gap=-1)

@@ -41,6 +41,7 @@ def plot_bands(
     factors: Sequence[float] | None = None,
     readings: Mapping[int, Tensor] | None = None,
     observed: Truth | Mapping[int, Truth] = None,
+    gap: float | None = None,
     time: float | Tensor | None = None,
     level: float = 0.9,
     band: Literal["auto", "ensemble", "variance"] = "auto",
@@ -59,8 +60,11 @@ def plot_bands(
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
         readings: by component, ``[T]`` in the state's units; NaN and what is not observed are left out.
         observed: ``[T]``, ``[T, 1]`` or ``[T, O]`` bool, or its key; by default ``"observed"`` of the roll-out where it
-            is there. Steps at which no reading was observed are shaded. With several sensors, one for each component:
+            is there. Stretches without a reading are shaded. With several sensors, one for each component:
             ``{0: "gps_observed", 1: encoder_mask}``; components without one are not shaded.
+        gap: the longest time from one reading to the next that is no outage, in s, or in steps where ``time`` is not
+            given; what is longer is shaded. By default one and a half times the median, so that a sensor at 1 Hz in a
+            filter at 100 Hz is shaded where it lost a reading, and not between two.
         time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
         level: probability of the band.
         band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
@@ -105,7 +109,7 @@ def plot_bands(
     for column, (axes, dim, label, scale) in enumerate(zip(panels, chosen, labels, scales, strict=True)):
         seen = masks.get(dim)
         if seen is not None:
-            _shade(axes, bounds, ~seen)
+            _shade(axes, bounds, _outages(seen, seconds, gap))
         if lower is not None and upper is not None:
             edges = (scale * lower[:, column].numpy(), scale * upper[:, column].numpy())
             style: dict[str, Any] = {
@@ -183,9 +187,24 @@ def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:
     return torch.where(turned, mean + wrap_angle(values - mean), values)
 
 
-def _shade(axes: Axes, bounds: np.ndarray, unseen: Tensor) -> None:
-    """Shades the runs of steps that were not observed, one span a run."""
-    change = np.diff(np.concatenate([[0], unseen.numpy().astype(int), [0]]))
-    for first, last in zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True):
+def _outages(seen: Tensor, seconds: np.ndarray, gap: float | None) -> np.ndarray:
+    """The first step of each outage, and the step after its last, ``[K, 2]``."""
+    change = np.diff(np.concatenate([[0], (~seen).numpy().astype(int), [0]]))
+    first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    # As if there had been a reading one step before the first step, and one step after the last.
+    around = np.concatenate([[seconds[0] - step], seconds, [seconds[-1] + step]])
+    if gap is None:
+        readings = seconds[seen.numpy()]
+        gap = 1.5 * float(np.median(np.diff(readings))) if len(readings) > 1 else 0.0
+    elif not gap >= 0:
+        raise ValueError(f"gap is the longest time between two readings that is no outage, at least 0; got {gap}")
+    longer = around[last + 1] - around[first] > gap
+    return np.stack([first[longer], last[longer]], -1)
+
+
+def _shade(axes: Axes, bounds: np.ndarray, outages: np.ndarray) -> None:
+    """Shades outages, one span each."""
+    for first, last in outages:
         label = None if axes.patches else "not observed"
         axes.axvspan(bounds[first], bounds[last], color=UNSEEN, linewidth=0, zorder=0.5, label=label)
