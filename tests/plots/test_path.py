@@ -135,3 +135,17 @@ def test_errors_say_what_to_do():
         plot_path(run, dims=[0, 3])
     with pytest.raises(ValueError, match="truth must be"):
         plot_path(run, run["state"][:5])
+
+
+@pytest.mark.parametrize("forward_up", [False, True])
+def test_readings_are_dots_where_they_were_read(forward_up):
+    readings = torch.tensor([[1.0, 2.0], [float("nan"), 3.0], [4.0, 5.0]])
+    axes = plot_path(torch.zeros(3, 4), readings=readings, dims=(2, 3), forward_up=forward_up)
+    (dots,) = [line for line in axes.get_lines() if line.get_label() == "readings"]
+    x, y = (dots.get_xdata().tolist(), dots.get_ydata().tolist())
+    assert (x, y) == (([-2.0, -5.0], [1.0, 4.0]) if forward_up else ([1.0, 4.0], [2.0, 5.0]))
+
+
+def test_readings_of_other_dimensions_are_refused():
+    with pytest.raises(ValueError, match=r"readings must be \[T, 2\], a column for each of dims; got \[3, 4\]"):
+        plot_path(torch.zeros(3, 4), readings=torch.zeros(3, 4))

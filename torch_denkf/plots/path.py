@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, TRUTH, axes_for, legend_above, new_figure
+from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, READING, TRUTH, axes_for, legend_above, new_figure
 from torch_denkf.plots._belief import Belief, Truth, covariance_at, dims_of, number, read_belief, with_truth
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def plot_path(
     truth: Truth = None,
     *,
     others: Mapping[str, Tensor] | None = None,
+    readings: Tensor | None = None,
     dims: Sequence[int] = (0, 1),
     forward_up: bool = False,
     spread: Literal["auto", "ensemble", "ellipses", "none"] = "auto",
@@ -42,6 +43,8 @@ def plot_path(
             ``[T, E, S]``; or means ``[T, S]``.
         truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
         others: further paths by name, states ``[T', S']`` such as dead reckoning.
+        readings: of the drawn dimensions ``[T', 2]``, in the state's units, as dots; rows that are not finite are left
+            out, so hide what was not observed with NaN.
         dims: of the state, the horizontal and the vertical axis; three of them draw in space.
         forward_up: draw a car's (x forward, y left) as a map that it drives up: ``-y`` to the right, ``x`` upwards.
         spread: ``"ensemble"`` draws the members' paths, ``"ellipses"`` draws ``level`` of a Gaussian at some steps;
@@ -75,9 +78,9 @@ def plot_path(
     kind = _kind(read, spread, len(chosen))
     axes = _axes(ax, len(chosen))
 
-    def place(states: Tensor) -> list[np.ndarray]:
+    def place(states: Tensor, dims: Sequence[int] = chosen) -> list[np.ndarray]:
         """Coordinates on the picture's axes, each ``[T, ...]``."""
-        parts = [states[..., dim].numpy() for dim in chosen]
+        parts = [states[..., dim].numpy() for dim in dims]
         return [-parts[1], parts[0]] if forward_up else parts
 
     if kind == "ensemble":
@@ -91,6 +94,12 @@ def plot_path(
     for index, (name, path) in enumerate((others or {}).items()):
         style: dict[str, Any] = {"color": OTHERS[index % len(OTHERS)], "linestyle": DASHES[index % len(DASHES)]}
         axes.plot(*place(number(path)), linewidth=1.4, label=name, zorder=2.2, **style)
+    if readings is not None:
+        dots = number(readings)
+        if dots.ndim != 2 or dots.shape[-1] != len(chosen):
+            raise ValueError(f"readings must be [T, {len(chosen)}], a column for each of dims; got {list(dots.shape)}")
+        shown = place(dots[dots.isfinite().all(-1)], range(len(chosen)))
+        axes.plot(*shown, ".", color=READING, markersize=3.5, label="readings", zorder=2.25)
     axes.plot(*place(read.mean), color=BELIEF, linewidth=1.4, label="belief", zorder=2.3)
     if kind == "ellipses":
         _draw_ellipses(axes, read, chosen, forward_up, level)
