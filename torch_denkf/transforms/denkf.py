@@ -325,8 +325,8 @@ class DEnKFTransform(Checked, Transform):
                     if key in read and mask not in read:
                         self.filter.messages.once(
                             f"{mask!r} of {key!r}",
-                            f"{type(transform).__name__} marks where {key!r} is missing in {mask!r}, which no module of "
-                            f"{type(self.filter).__name__} reads: a missing reading, zero, counts as observed. Give "
+                            f"{type(transform).__name__} marks where {key!r} is missing in {mask!r}, which no module "
+                            f"of {type(self.filter).__name__} reads: a missing reading, zero, counts as observed. Give "
                             f"observed_key={mask!r} to the filter or its analysis, and to the sensor if there is one; "
                             f"or leave observed_key= of {type(transform).__name__} at its default.",
                         )
