@@ -5,6 +5,7 @@
 The encoders of the arm are made noisy (0.05 rad); the velocities are hidden from the filter. The dynamics are
 learned, with the action, from a few rollouts; then one line appends the filter to the environment, and a policy could
 read ``("belief", "mean")``. Needs no rendering and no GL library.
+The true states are recorded here: docs/how_to/train_motion_first.md says how to train the motion from them first.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ from torchrl.modules import set_recurrent_mode
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
 from tests.filters.particle_for_tests import bootstrap
 from tests.filters.test_noise_sizes import SizeAtTheStep
-from torch_denkf.envs import LinearGaussianEnv
-from torch_denkf.filters import DEnKF, Filter
+from torch_denkf.envs import LinearGaussianEnv, MissingFrames
+from torch_denkf.filters import DEnKF, Filter, KalmanFilter
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.modules import ConstantNoise, LinearObservation, SubModel
 from torch_denkf.transforms import DEnKFTransform
@@ -289,3 +289,56 @@ def test_the_mask_of_a_filters_default_analysis_can_be_named(float64):
         assert outs[0].equal(outs[1])
     with pytest.raises(ValueError, match="observed_key are for the default analysis"):
         DEnKF(noise, None, noise, noise, linear_denkf()["analysis"], initial=initial, observed_key="gps_observed")
+
+
+class TestMasksThatNothingReads:
+    def test_misspelt_mask_is_named_once(self):
+        frames = readings(3, 5).set("obsrved", torch.zeros(3, 5, 1, dtype=torch.bool))
+        filter = linear_kalman()
+        with pytest.warns(UserWarning, match="reads the mask 'observed', which is not there, .*'obsrved'"):
+            filter.sequence(frames.clone())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            filter.sequence(frames.clone())
+
+    @pytest.mark.parametrize("name", ["seen", "observed", "obsrved_too_far", "unobserved_wheel"])
+    def test_other_names_are_left_alone(self, name):
+        frames = readings(3, 5).set(name, torch.zeros(3, 5, 1, dtype=torch.bool))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            linear_kalman().sequence(frames)
+
+    def test_mask_of_another_entry_is_left_alone(self):
+        mask = torch.zeros(3, 5, 1, dtype=torch.bool)
+        frames = readings(3, 5).update({"gps2": torch.zeros(3, 5, 1), "gps2_observed": mask})
+        matrices = {
+            "transition": torch.eye(2),
+            "observation": torch.eye(2),
+            "cov": torch.eye(2),
+            "mean": torch.zeros(2),
+        }
+        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0], observed_key="gps_observed")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            filter.sequence(frames)
+        frames = frames.exclude("gps2")
+        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0], observed_key="gps_observed")
+        with pytest.warns(UserWarning, match="'gps2_observed'"):
+            filter.sequence(frames)
+
+    @pytest.mark.parametrize(("mask", "warns"), [("seen", True), ("observed", False)])
+    def test_frames_that_go_missing_under_another_mask(self, mask, warns):
+        matrices = {
+            "transition": torch.eye(2),
+            "observation": torch.eye(2),
+            "cov": torch.eye(2),
+            "mean": torch.zeros(2),
+        }
+        filter = KalmanFilter(**matrices, process_noise=[1.0, 1.0], noise=[1.0, 1.0])
+        world = LinearGaussianEnv(torch.eye(2), torch.eye(2), transition_std=[1.0, 1.0], observation_std=[1.0, 1.0])
+        env = TransformedEnv(world, MissingFrames(0.5, in_keys=["observation"], observed_key=mask))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            env.append_transform(DEnKFTransform(filter))
+            env.rollout(3)
+        assert sum("MissingFrames marks where 'observation'" in str(one.message) for one in said) == warns

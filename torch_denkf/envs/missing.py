@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Binary, Composite
 
 from torch_denkf.envs._frames import FrameTransform
@@ -46,6 +46,11 @@ class MissingFrames(FrameTransform):
     ):
         super().__init__(p, in_keys=in_keys, generator=generator)
         self.observed_key = observed_key
+
+    @property
+    def hidden_by(self) -> dict[NestedKey, NestedKey]:
+        """The mask that this transform writes for each entry that it drops."""
+        return dict.fromkeys(map(unravel_key, self.in_keys), unravel_key(self.observed_key))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         kept = ~self._hit((*next_tensordict.batch_size, 1), next_tensordict.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from difflib import get_close_matches
 from weakref import ref
 
 import torch
@@ -42,6 +43,7 @@ class Messages:
     def __init__(self, name: str):
         self.name = name
         self.said: set[str] = set()
+        self._spelt: set[tuple] = set()
 
     def once(self, about: str, text: str) -> None:
         """Warns the first time that ``about`` comes up."""
@@ -80,6 +82,7 @@ class Messages:
             return
         if structure.unmasked:
             self._unread_mask(structure, tensordict)
+        self._misspelt_mask(structure, tensordict)
         for key in structure.readings:
             own = key + _OWN_MASK if isinstance(key, str) else (*key[:-1], key[-1] + _OWN_MASK)
             mask = tensordict.get(own, None)
@@ -106,6 +109,28 @@ class Messages:
                         f"The mask {key!r} hides readings, and {name} at place {place!r} reads no mask: it uses a "
                         f"hidden reading like any other. Name the mask in {name}, optional_keys=[{key!r}], and heed it "
                         "in compute(). Where its reading is never missing, there is nothing to do.",
+                    )
+
+    def _misspelt_mask(self, structure: Structure, tensordict: TensorDictBase) -> None:
+        """Of a boolean entry that nothing reads, named nearly like a mask that is read and is not there."""
+        present = tuple(tensordict.keys())
+        if present in self._spelt:
+            return
+        self._spelt.add(present)
+        read = {*structure.optional, *structure.needed}
+        # What is the mask of another entry that is there belongs to that entry.
+        others = {f"{key}{_OWN_MASK}" for key in present}
+        unread = [key for key in present if key not in read and key not in others]
+        for key in structure.optional:
+            if isinstance(key, str) and key.endswith(_MASK) and key not in present:
+                for other in get_close_matches(key, unread, n=1, cutoff=0.85):
+                    if not _is_mask(tensordict.get(other)):
+                        continue
+                    self.once(
+                        f"{key!r} as {other!r}",
+                        f"{self.name} reads the mask {key!r}, which is not there, and nothing reads {other!r}: each "
+                        f"reading counts as observed. If {other!r} is that mask, rename it, or pass "
+                        f"observed_key={other!r}.",
                     )
 
     def _held_reading(

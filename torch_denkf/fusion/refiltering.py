@@ -89,7 +89,14 @@ class Refiltering(Checked):
         self.late = {unravel_key(key): _read_with(key, keys, filter) for key, keys in late.items()}
 
     def start(self, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:
-        """The belief at the start of an episode, see :meth:`Filter.initialise`."""
+        """The window at the start of an episode: no steps yet, and the initial belief.
+
+        Args:
+            row: what :meth:`Filter.initialise` reads, ``[*B]``.
+
+        Returns:
+            The window, whose ``belief`` is the initial one.
+        """
         return RefilteringWindow((), (self.filter.initialise(self.filter.of_one_robot(row).copy()),))
 
     def step(self, window: RefilteringWindow, row: TensorDictBase | Mapping[str, Any]) -> RefilteringWindow:

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
 from torch_denkf._arguments import Checked
@@ -312,7 +312,25 @@ class DEnKFTransform(Checked, Transform):
                 f"The environment emits {taken[0]!r} already, as that of another filter: one would start from the "
                 'belief of the other. Give this filter a name of its own, prefix="imu" for example.'
             )
+        self._warn_of_unread_masks()
         return self._add_specs(observation_spec, keys, observation_spec)
+
+    def _warn_of_unread_masks(self) -> None:
+        """Warns where a transform in front drops what the filter reads, and marks that in a mask it does not read."""
+        env, read = self.parent, {*self.in_keys, *self._optional}
+        while isinstance(env, TransformedEnv):
+            transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+            for transform in transforms:
+                for key, mask in getattr(transform, "hidden_by", {}).items():
+                    if key in read and mask not in read:
+                        self.filter.messages.once(
+                            f"{mask!r} of {key!r}",
+                            f"{type(transform).__name__} marks where {key!r} is missing in {mask!r}, which no module "
+                            f"of {type(self.filter).__name__} reads: a missing reading, zero, counts as observed. Give "
+                            f"observed_key={mask!r} to the filter or its analysis, and to the sensor if there is one; "
+                            f"or leave observed_key= of {type(transform).__name__} at its default.",
+                        )
+            env = env.base_env
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Adds what the filter carries from step to step to the state spec."""
