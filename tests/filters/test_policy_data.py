@@ -135,6 +135,30 @@ def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_res
         torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
 
 
+@every_filter
+@pytest.mark.parametrize("update_at_reset", [False, True])
+def test_so_may_it_in_the_sequence_that_a_loss_filters(name, update_at_reset):
+    """Where an episode begins in a policy's data, and where a recording does; gradients are finite."""
+    filter = FILTERS[name](update_at_reset=update_at_reset)
+    data = policy_data(filter, anew=(0, 3))[0]
+    recording = data.select("observation").set("is_init", torch.arange(7).eq(3).expand(2, 7).unsqueeze(-1))
+    for given in (data, recording):
+        broken = given.copy().set("observation", given["observation"].clone())
+        broken["observation"][:, [0, 3]] = torch.nan
+        if update_at_reset:
+            with pytest.raises(ValueError, match=r"no mask hides it.*'observed'"):
+                filter.sequence(broken)
+            continue
+        broken["observation"].requires_grad_()
+        out = filter.sequence(broken.copy())
+        close(out, filter.sequence(given.copy()), filter.out_keys)
+        (gradient,) = torch.autograd.grad(out["belief", "mean"].square().sum(), broken["observation"])
+        assert gradient.isfinite().all()
+        broken["observation"].data[0, 4] = torch.nan
+        with pytest.raises(ValueError, match="no mask hides it"):
+            filter.sequence(broken)
+
+
 def test_policy_steps_under_vmap():
     filter = linear_kalman()
     row = policy_data(filter)[0][:, 0].select("observation", ("previous", "belief"))

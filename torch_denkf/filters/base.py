@@ -31,9 +31,9 @@ from torch_denkf._slices import as_rows, starts_of
 from torch_denkf.filters.compiled import CompiledSteps
 from torch_denkf.filters.finish import (
     own,
-    refuse_absurd_readings,
     refuse_far_belief,
     refuse_non_finite,
+    without_absurd_readings,
     write,
 )
 from torch_denkf.filters.gather import gather_rows
@@ -93,8 +93,8 @@ class Filter(Checked, TensorDictSequential):
         forecast_keys: the forecast of each carried entry, where it cannot be told by its name.
         variance_ceiling: the belief's variances are held at it, so that an unstable system that nobody observes stays
             finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether :meth:`step` raises where a reading or the new belief is not finite, or a reading is
-            larger than 1e18 in whatever unit. A sequence does not raise: NaN goes on to the end of it.
+        check_finite: whether a reading that is not finite, or larger than 1e18 in whatever unit, raises; and in a step
+            a belief that is not finite. In a sequence the NaN of a belief that diverges goes on to its end.
         reject: whether such readings count as not observed, in steps, sequences, compiled and packaged, and
             ``("info", "rejected")`` ``[*B, 1]`` counts them: each component of a vector that an update reads itself,
             and one for all that a sensor reads. What shares a mask is rejected together.
@@ -556,7 +556,7 @@ class Filter(Checked, TensorDictSequential):
         check_inputs(structure, type(self).__name__, entries, rows, carry=False)
         if self.check_finite and not self.reject and not torch.compiler.is_compiling():
             refuse_far_belief(entries, [name for key in structure.carry for name in (key, previous_key(key))])
-            refuse_absurd_readings(structure, entries)
+            entries = without_absurd_readings(structure, entries, self._unread(rows))
         self.messages.ignored_masks(structure, rows)
         entries = steps.guarded(entries, call)
         with set_recurrent_mode(True):  # for modules that are not this package's
@@ -598,6 +598,13 @@ class Filter(Checked, TensorDictSequential):
             return ~first
         known = tensordict.get(self.outer(KNOWN), None)  # a policy's data: what has a belief before it is a step
         return torch.ones_like(first) if known is None else known.reshape(size)
+
+    def _unread(self, rows: TensorDictBase) -> Tensor | None:
+        """Elements of a sequence whose readings nothing uses, ``[*B, T, 1]``: the belief there is the initial one."""
+        made_of = {*chain(*reads(self.initial))}
+        if self.update_at_reset or not made_of.isdisjoint((*self.structure.frame_keys, *self.structure.readings)):
+            return None
+        return ~self.stepped(rows).unsqueeze(-1)
 
     def like(self) -> Tensor | None:
         """A tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""

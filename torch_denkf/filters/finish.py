@@ -20,9 +20,9 @@ __all__ = [
     "is_finite",
     "masks_in",
     "own",
-    "refuse_absurd_readings",
     "refuse_far_belief",
     "refuse_non_finite",
+    "without_absurd_readings",
     "write",
 ]
 
@@ -64,8 +64,21 @@ def write(tensordict: TensorDictBase, written: Entries, outer: Callable[[NestedK
             tensordict.set(key, value)
 
 
+#: What to do about a reading that is not finite, behind the masks that could hide it.
+_OF_A_STEP = (
+    "The tensordict was left as it is. Hide what is broken or missing with a mask ({masks}), or leave it out with "
+    "step(..., without=[...]) or predict(...). A filter with reject=True counts such readings as missing; "
+    "check_finite=False switches this off."
+)
+
+
 def refuse_non_finite(
-    structure: Structure, entries: Entries, written: Entries, reject: bool, unread: Tensor | None = None
+    structure: Structure,
+    entries: Entries,
+    written: Entries,
+    reject: bool,
+    unread: Tensor | None = None,
+    cure: str = _OF_A_STEP,
 ) -> None:
     """Raises a ``ValueError`` where a reading or the new belief is not finite; the message names the input that is not.
 
@@ -75,15 +88,12 @@ def refuse_non_finite(
         written: what it wrote.
         reject: whether readings that are not finite were rejected, and are no mistake.
         unread: rows ``[*B]`` or ``[*B, 1]`` whose readings were not used.
+        cure: what the message says to do; ``{masks}`` in it are the masks.
     """
     sound = _is_sound(structure.carry, entries, written)
     if sound is None:
         return
-    absurd = (
-        []
-        if reject
-        else rejected_keys(structure.guards, entries if unread is None else _without_rows(structure, entries, unread))
-    )
+    absurd = [] if reject else rejected_keys(structure.guards, _without_rows(structure, entries, unread))
     if sound and not absurd:
         return
     refuse_far_belief(entries, structure.carry)
@@ -97,13 +107,17 @@ def refuse_non_finite(
         why = f"negative variances in {negative}"
     elif absurd and not set(absurd) & set(bad):
         why = f"a reading of more than {LARGEST_READING:g} in {absurd}"
+    elif bad:
+        why = f"NaN or infinity in {bad}"
     else:
-        why = f"NaN or infinity in {bad}" if bad else "a divergence: all inputs are finite"
+        why = "its motion: all inputs are finite, and the filter diverged"
+        cure = (
+            "Look at the transition's weights and at the noise floor; normalise the state; clip gradients in training. "
+            "check_finite=False switches this off."
+        )
     state = "to be trusted" if finite else "finite"
     raise ValueError(
-        f"The new belief is not {state}, because of {why}. The tensordict was left as it is. Hide what is broken or "
-        f"missing with a mask ({masks_in(structure.optional)}), or leave it out with step(..., without=[...]) or "
-        "predict(...). A filter with reject=True counts such readings as missing; check_finite=False switches this off."
+        f"The new belief is not {state}, because of {why}. {cure.format(masks=masks_in(structure.optional))}"
     )
 
 
@@ -124,8 +138,10 @@ def _is_sound(carry: Sequence[NestedKey], *beliefs: Entries) -> bool | None:
     return True if sound is None else flag_value(sound)
 
 
-def _without_rows(structure: Structure, entries: Entries, rows: Tensor) -> Entries:
-    """The entries, with zeros in place of the readings of some rows."""
+def _without_rows(structure: Structure, entries: Entries, rows: Tensor | None) -> Entries:
+    """The entries, with zeros in place of the readings of some rows; ``None`` for none."""
+    if rows is None:
+        return entries
     keys = {key for guard in structure.guards for key in (*guard.whole, *guard.components) if key in entries}
     return {**entries, **{key: where_rows(rows, torch.zeros_like(entries[key]), entries[key]) for key in keys}}
 
@@ -160,15 +176,28 @@ def is_finite(key: NestedKey, value: Tensor) -> bool:
     return bool((value < torch.inf).all()) if key[-1] == "log_weight" else bool(value.isfinite().all())
 
 
-def refuse_absurd_readings(structure: Structure, entries: Entries) -> None:
-    """Raises :class:`AbsurdReading` where readings of a sequence are not finite, or absurdly large, and not masked."""
+def without_absurd_readings(structure: Structure, entries: Entries, unread: Tensor | None) -> Entries:
+    """The entries of a sequence; with zeros for readings that nothing uses, where these are not finite.
+
+    Args:
+        structure: the filter's.
+        entries: of the sequence ``[*B, T]``.
+        unread: elements ``[*B, T, 1]`` whose readings are not used; ``None`` for none.
+
+    Raises:
+        AbsurdReading: if readings are not finite, or absurdly large, and not masked.
+    """
     looked_at = [key for guard in structure.guards for key in (guard.mask, *guard.whole, *guard.components)]
     if not all(has_values(entries[key]) for key in looked_at if key in entries):
-        return
+        return entries
     absurd = rejected_keys(structure.guards, entries)
+    if absurd and unread is not None:
+        entries = _without_rows(structure, entries, unread)
+        absurd = rejected_keys(structure.guards, entries)
     if absurd:
         raise AbsurdReading(
             f"There is NaN, infinity or more than {LARGEST_READING:g} in {absurd}, and no mask hides it. Give one "
-            f"({list(structure.optional)}), or pass reject=True to the filter, which counts such readings as missing; "
-            "check_finite=False switches this off."
+            f"({masks_in(structure.optional)}), or pass reject=True to the filter, which counts such readings as "
+            "missing; check_finite=False switches this off."
         )
+    return entries

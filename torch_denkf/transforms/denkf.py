@@ -16,15 +16,22 @@ from torchrl.modules import set_recurrent_mode
 from torch_denkf._arguments import Checked
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
-from torch_denkf.filters.finish import is_finite, masks_in, own, refuse_far_belief
+from torch_denkf.filters.finish import own, refuse_non_finite
 from torch_denkf.filters.messages import mark_up_to_date
 from torch_denkf.filters.primer import refuse_resets_of_groups
 from torch_denkf.filters.refusals import refuse_unguarded
-from torch_denkf.filters.rejection import LARGEST_READING, REJECTED, rejected_keys
+from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.filters.scan import where_rows
+from torch_denkf.modules._call import Entries
 from torch_denkf.transforms._packaged import PackagedRun, Step
 
 __all__ = ["DEnKFTransform"]
+
+#: What to do where an environment emits a reading that is not finite.
+_CURE = (
+    "Where a frame is missing or broken, set {masks} to False for it (it is then not read), or repair it in a "
+    "transform before DEnKFTransform. With check_finite=False such readings count as missing."
+)
 
 
 class DEnKFTransform(Checked, Transform):
@@ -158,7 +165,7 @@ class DEnKFTransform(Checked, Transform):
             kept = self._packaged(tensordict, next_tensordict)
             if kept is not None:  # otherwise what follows says what is missing
                 if self.check_finite:
-                    self._assert_finite({**_present(next_tensordict, (*self.in_keys, *self._optional)), **kept})
+                    self._assert_finite(_present(next_tensordict, (*self.in_keys, *self._optional)), kept)
                 return self._emit(kept, next_tensordict)
         entries = {}
         for key in self.filter.structure.carry:
@@ -180,7 +187,7 @@ class DEnKFTransform(Checked, Transform):
         with self._grad_mode(), set_recurrent_mode(False):
             written = self.filter.take_step(entries, next_tensordict.batch_size, reject=self._reject)
         if self.check_finite:
-            self._assert_finite({**entries, **written})
+            self._assert_finite(entries, written)
         return self._emit(written, next_tensordict, entries.values())
 
     def _emit(
@@ -212,7 +219,8 @@ class DEnKFTransform(Checked, Transform):
             start = self.filter.summarise(start.exclude(*(key for key in self.filter.belief_keys if key not in given)))
         if self.check_finite:
             entries = self.filter.entries_of(start, one_step=True)
-            self._assert_finite(entries, used=self.filter.update_at_reset)
+            given = {key: value for key, value in entries.items() if key not in self.filter.structure.carry}
+            self._assert_finite(given, entries, used=self.filter.update_at_reset)
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(self.filter.outer(key)))
         return tensordict_reset
@@ -250,29 +258,9 @@ class DEnKFTransform(Checked, Transform):
             else:
                 target.set(key, value)
 
-    def _assert_finite(self, entries: Mapping[NestedKey, torch.Tensor], *, used: bool = True) -> None:
+    def _assert_finite(self, entries: Entries, written: Entries, *, used: bool = True) -> None:
         """Raises where the belief is not finite, or a reading that was ``used`` is not."""
-        finite = all(is_finite(key, entries[key]) for key in self.filter.structure.carry)
-        absurd = [] if self._reject or not used else rejected_keys(self.filter.structure.guards, entries)
-        if not absurd:  # otherwise it is the reading that took the belief there
-            refuse_far_belief(entries, self.filter.structure.carry)
-        if finite and not absurd:
-            return
-        given = {key: entries[key] for key in self.in_keys if key in entries}
-        inputs = [key for key, value in given.items() if not torch.isfinite(value).all()]
-        if inputs or absurd:
-            what = (
-                f"NaN or infinity in {inputs}" if inputs else f"a reading of more than {LARGEST_READING:g} in {absurd}"
-            )
-            raise ValueError(
-                f"The new belief is not {'to be trusted' if finite else 'finite'}, because of {what}. Where a frame is "
-                f"missing or broken, set {masks_in(self._optional)} to False for it (it is then not read), or repair "
-                "it in a transform before DEnKFTransform. With check_finite=False such readings count as missing."
-            )
-        raise ValueError(
-            f"The new belief is not finite although all of {self.in_keys} are finite: the filter diverged. Look at "
-            "the transition's weights and at the noise floor; normalise the state; clip gradients in training."
-        )
+        refuse_non_finite(self.filter.structure, entries, written, self._reject or not used, cure=_CURE)
 
     # ------------------------------------------------------------------------------------------------- the specs
 
