@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from torch_denkf.functional import analyse
+from torch_denkf.functional import analyse, letkf
 from torch_denkf.functional.analysis import significant
+from torch_denkf.functional.localisation import Neighbours
 
 SCHEMES = ("sensor", "perturbed", "etkf", "sakov")
 
@@ -40,16 +41,29 @@ def test_the_factors_are_those_of_the_correlations(cases, threshold):
     torch.testing.assert_close(scaled, factors, rtol=0, atol=1e-12)  # units do not matter
 
 
-@pytest.mark.parametrize("scheme", ["perturbed", "sakov"])
-def test_the_gain_is_multiplied_by_the_factors(cases, scheme):
-    """As a taper of the same factors, which other tests hold."""
+@pytest.mark.parametrize("scheme", ["sensor", "perturbed", "sakov"])
+@pytest.mark.parametrize("tapered", [False, True])
+def test_readings_are_taken_in_one_after_the_other_with_smaller_gains(cases, scheme, tapered):
+    """As updates by one reading each, tapered by the same factors; what the members predict is moved like the state."""
     forecast, predicted, reading, noise = cases
+    if scheme == "sensor":
+        reading = reading.unsqueeze(-2) + 0.5 * torch.randn_like(predicted)
     draws = torch.randn_like(predicted) if scheme == "perturbed" else None
-    taper = by_hand(forecast, predicted, 1.5).mT, torch.ones(2, 2)
-    expected = analyse(forecast, predicted, reading, noise, scheme=scheme, perturbation=draws, taper=taper)
-    result = analyse(forecast, predicted, reading, noise, scheme=scheme, perturbation=draws, significance=1.5)
-    for one, other in zip(result, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-10)
+    taper = (torch.rand(5, 2), torch.tensor([[1.0, 0.3], [0.3, 1.0]])) if tapered else None
+    moved, scores = torch.cat([forecast, predicted], -1), 0.0
+    for j in range(2):
+        seen = moved[..., 5 + j : 6 + j]
+        factors = by_hand(moved, seen, 1.5).mT
+        if taper is not None:
+            factors = factors * torch.cat([taper[0][:, j], taper[1][:, j]]).unsqueeze(-1)
+        noises = None if draws is None else draws[..., j : j + 1]
+        given = {"scheme": scheme, "perturbation": noises, "taper": (factors, torch.ones(1, 1))}
+        result = analyse(moved, seen, reading[..., j : j + 1], noise[..., j : j + 1], **given)
+        moved, scores = result.ensemble, scores + torch.cat([result.nis, result.log_likelihood], -1)
+    options = {"scheme": scheme, "perturbation": draws, "taper": taper, "significance": 1.5}
+    result = analyse(forecast, predicted, reading, noise, **options)
+    torch.testing.assert_close(result.ensemble, moved[..., :5], rtol=0, atol=1e-10)
+    torch.testing.assert_close(torch.cat([result.nis, result.log_likelihood], -1), scores, rtol=0, atol=1e-10)
 
 
 def test_a_square_root_update_by_one_reading_is_the_serial_one_with_a_smaller_gain(cases):
@@ -118,6 +132,45 @@ def test_the_threshold_has_the_gradient_of_finite_differences(cases):
 
     assert torch.autograd.gradcheck(means, threshold)
     assert math.isfinite(float(torch.autograd.grad(means(threshold).sum(), threshold)[0].sum()))
+
+
+def test_more_precise_readings_than_members_can_tell_apart_stay_positive_definite(float64):
+    """Twelve readings that are nearly exact, of eight members: products of factors with their matrix are indefinite."""
+    torch.manual_seed(3)
+    forecast = torch.randn(50, 8, 12)
+    noise = torch.full((50, 12), 1e-8)
+    result = analyse(forecast, forecast, torch.zeros(50, 12), noise, scheme="etkf", significance=1.0)
+    seen = (forecast - forecast.mean(-2, keepdim=True)) / (7 * noise).sqrt().unsqueeze(-2)
+    gram = seen.mT @ seen
+    factors = significant(gram, seen, seen, 1.0)
+    assert torch.linalg.eigvalsh(torch.eye(12) + gram * factors)[..., 0].min() < -1
+    assert (result.nis > 0).all()
+    assert result.ensemble.isfinite().all()
+    assert (result.ensemble.var(-2) < forecast.var(-2)).all()
+
+
+def test_a_local_analysis_weighs_by_the_factors(cases):
+    """As its taper times the same factors; and finite differences, where some weights are 0."""
+    forecast, predicted, reading, noise = cases
+    near = Neighbours(torch.arange(2).expand(5, 2), torch.tensor([[1.0, 0.4]]).expand(5, 2))
+    found = letkf(forecast, predicted, reading, noise, near, significance=1.5, tile=2)
+    factors = by_hand(forecast, predicted, 1.5)
+    assert (factors == 0).any()
+    for b in range(3):
+        weighed = Neighbours(near.index, near.taper * factors[b].mT)
+        expected = letkf(forecast[b], predicted[b], reading[b], noise[b], weighed)
+        torch.testing.assert_close(found[b], expected, rtol=0, atol=1e-10)
+
+    def moved(forecast, threshold):
+        return letkf(forecast, predicted[0], reading[0], noise[0], near, significance=threshold)
+
+    assert torch.autograd.gradcheck(moved, (forecast[0].requires_grad_(), torch.tensor(1.5, requires_grad=True)))
+
+
+def test_members_that_cannot_show_a_significant_correlation_are_refused(cases):
+    forecast, predicted, reading, noise = cases
+    with pytest.raises(ValueError, match=r"With 24 members no correlation is 5 standard.*is 4.8.*more than 26"):
+        analyse(forecast, predicted, reading, noise, scheme="etkf", significance=5.0)
 
 
 def test_ensemble_space_cannot(cases):

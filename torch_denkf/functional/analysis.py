@@ -10,6 +10,7 @@ Hunt et al. 2007 ("etkf"); Sakov & Oke 2008, Tellus A 60 ("sakov").
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Literal, NamedTuple, get_args
 
@@ -89,8 +90,9 @@ def analyse(
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
         significance: localisation by what the members themselves say, see :func:`significant`: how many standard
-            deviations a sample correlation must be away from zero to be believed, such as 3. ``None`` believes all.
-            Needs observation space.
+            deviations a sample correlation must be away from zero to be believed, such as 3. ``None`` believes all. The
+            components of the reading are then taken in one after the other, each with the correlations that the one
+            before left (Whitaker & Hamill 2002; Anderson 2003). Needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
             ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one. Without
             gradients, ensemble space takes large states in tiles: memory is the result's and a few tiles.
@@ -128,9 +130,12 @@ def analyse(
     anomalies = forecast - mean  # A, eq. 10
     acted_on = shift(scheme, reading, observed, perturbation)
     # Both spaces solve with S, eq. 9, in units of the noise; the increment is K, eq. 11, times what it acts on.
-    observation_space = partial(_observation_space, taper=taper, significance=significance)
-    solve = observation_space if in_observation_space else _ensemble_space
-    increment, root, square, log_det = solve(reading, anomalies, acted_on, square_root=scheme == "etkf")
+    if significance is not None:
+        believed = partial(_one_after_the_other, scheme=scheme, taper=taper, significance=significance)
+        increment, root, square, log_det = believed(reading, anomalies, acted_on)
+    else:
+        solve = partial(_observation_space, taper=taper) if in_observation_space else _ensemble_space
+        increment, root, square, log_det = solve(reading, anomalies, acted_on, square_root=scheme == "etkf")
     if root is not None and rotation is not None:
         root = rotation @ root
     ensemble = forecast + increment if root is None else mean + increment + root  # eq. 12
@@ -189,6 +194,7 @@ def check_analysis_arguments(
                 raise ValueError(f"the {name}'s taper must be [*B, {rows}, {dim}], got {list(value.shape)}")
     if significance is not None and space == "ensemble":
         raise ValueError("significance needs observation space; leave space out")
+    check_significance(significance, size)
     if rotation is not None:
         if scheme != "etkf":
             raise ValueError(f"rotation is for scheme 'etkf', not {scheme!r}; leave it out")
@@ -202,7 +208,6 @@ def _observation_space(
     *,
     square_root: bool,
     taper: tuple[Tensor, Tensor] | None = None,
-    significance: float | Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
     """Solve with I + YᵀY, O x O.
 
@@ -214,8 +219,6 @@ def _observation_space(
     gram, cross = normalised.mT @ normalised, normalised.mT @ anomalies
     if taper is not None:
         gram, cross = gram * taper[1], cross * taper[0].mT
-    if significance is not None:
-        cross = cross * significant(cross, normalised, anomalies, significance)
     transformed = None
     if square_root:
         transformed = anomalies + normalised @ (inverse_square_root_difference(gram) @ cross)
@@ -227,6 +230,59 @@ def _observation_space(
     whitened = torch.linalg.solve_triangular(factor, mean_shift.mT, upper=False)
     increment = acted_on @ torch.cholesky_solve(cross, factor)  # by the gain K, eq. 11
     return increment, transformed, whitened.square().sum(-2), log_det
+
+
+def _one_after_the_other(
+    reading: Whitened,
+    anomalies: Tensor,
+    acted_on: Tensor,
+    *,
+    scheme: Scheme,
+    taper: tuple[Tensor, Tensor] | None,
+    significance: float | Tensor,
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Take in the components of the reading in their order, each as far as correlations with it are significant.
+
+    A component by itself needs no matrix, and no product of factors with a matrix, which might not be positive
+    definite. What the members predict of the components behind it is moved like the state.
+
+    Returns:
+        As :func:`_observation_space`. Members' anomalies are those of all schemes but the stochastic ones.
+    """
+    dim, threshold = anomalies.shape[-1], significance
+    if isinstance(threshold, Tensor) and threshold.ndim:  # [S]: a reading is as strict as they are on average
+        threshold = torch.cat([threshold, threshold.mean().expand(reading.normalised.shape[-1])])
+    deterministic = scheme in ("etkf", "sakov")
+    acted_on = reading.mean_shift if deterministic else acted_on
+    whole = torch.cat([anomalies, reading.normalised], -1)  # the state, and the reading that is predicted of it
+    moved = torch.zeros_like(acted_on[..., :1])
+    square = log_det = torch.zeros_like(reading.mean_shift[..., 0])
+    for number in range(reading.normalised.shape[-1]):
+        place = slice(dim + number, dim + number + 1)
+        seen = whole[..., place]  # in units of the noise: R is 1
+        cross, total = seen.mT @ whole, 1 + seen.square().sum(-2, keepdim=True)
+        gain = cross * significant(cross, seen, whole, threshold) / total
+        if taper is not None:
+            gain = gain * torch.cat([taper[0][..., number], taper[1][..., number]], -1).unsqueeze(-2)
+        shift = acted_on[..., number : number + 1] - (moved[..., place] if number else moved)
+        mean_shift = shift.mean(-2, keepdim=True)
+        square = square + (mean_shift.square() / total).squeeze(-1)
+        log_det = log_det + total.log().squeeze(-1)
+        moved = moved + shift * gain
+        if deterministic:  # the square root's share of the gain, and its approximation for small gains
+            whole = whole - seen * gain * (1 / (1 + total.rsqrt()) if scheme == "etkf" else 0.5)
+        else:
+            whole = whole + (shift - mean_shift) * gain
+    return moved[..., :dim], whole[..., :dim] if deterministic else None, square, log_det
+
+
+def check_significance(threshold: float | Tensor | None, size: int) -> None:
+    """Raises a ``ValueError`` where no correlation that E members can show is significant."""
+    if isinstance(threshold, (int, float)) and threshold**2 >= size - 1:
+        raise ValueError(
+            f"With {size} members no correlation is {threshold:g} standard deviations away from chance: the largest is "
+            f"{math.sqrt(size - 1):.1f}. Take a smaller threshold, or more than {math.floor(threshold**2) + 1} members."
+        )
 
 
 def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: float | Tensor) -> Tensor:
@@ -245,7 +301,7 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
         cross: products of the anomalies, ``[*B, O, S]``.
         predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
         state: anomalies of the state, ``[*B, E, S]``.
-        threshold: :math:`z_0`, positive, one number or ``[S]``.
+        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is believed.
 
     Returns:
         Factors in [0, 1), ``[*B, O, S]``.

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_mask, check_one_dtype, check_shape
+from torch_denkf.functional.analysis import check_significance, significant
 from torch_denkf.functional.linalg import cholesky, inverse_square_root
 
 
@@ -160,6 +161,7 @@ def letkf(
     near: Neighbours,
     *,
     observed: Tensor | None = None,
+    significance: float | Tensor | None = None,
     tile: int = 4096,
 ) -> Tensor:
     r"""Local ensemble transform: an analysis for each component of the state, from the observations near it.
@@ -175,6 +177,8 @@ def letkf(
         noise: variances R, ``[*B, O]``, positive.
         near: which observations count where, see :func:`neighbours`.
         observed: boolean, ``[*B, 1]`` or ``[*B, O]``; what is False counts nowhere, and may be NaN.
+        significance: also weigh each observation by how far its correlation with the component is to be believed, see
+            :func:`~torch_denkf.functional.analysis.significant`: one number, such as 1.5. ``None`` for no such weights.
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
 
     Returns:
@@ -197,6 +201,7 @@ def letkf(
     check_ensemble("forecast", forecast, min_size=2)
     check_one_dtype(forecast=forecast, predicted=predicted, observation=observation, noise=noise)
     check_mask("observed", observed)
+    check_significance(significance, forecast.shape[-2])
     batch, (size, dim), count = forecast.shape[:-2], forecast.shape[-2:], predicted.shape[-1]
     check_shape("predicted", predicted, (*batch, size, count), "[*B, E, O]")
     check_shape("observation", observation, (*batch, count), "[*B, O]")
@@ -216,7 +221,13 @@ def letkf(
         near.index.split(tile), near.taper.split(tile), anomalies.split(tile, dim=-1), strict=True
     ):
         root = taper.to(forecast.dtype).sqrt().unsqueeze(-2)
-        local = normalised[..., index].movedim(-3, -2) * root  # [*B, tile, E, L]
+        local = normalised[..., index].movedim(-3, -2)  # [*B, tile, E, L]
+        if significance is not None:
+            own = part.mT.unsqueeze(-1)  # [*B, tile, E, 1]
+            weight = significant(local.mT @ own, local, own, significance).mT  # [*B, tile, 1, L]
+            # The root's slope at 0 is infinite, and would be NaN times 0 in a gradient.
+            root = root * torch.where(weight > 0, torch.where(weight > 0, weight, 1).sqrt(), 0)
+        local = local * root
         gram = local @ local.mT
         local_shift = shift[..., index].movedim(-3, -2) * root  # [*B, tile, 1, L]
         weights = torch.cholesky_solve(local @ local_shift.mT, cholesky(gram + eye))

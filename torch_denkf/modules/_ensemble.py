@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypedDict
+from typing import Literal, TypedDict
 
+import torch
 from tensordict import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 
-from torch_denkf._checks import check_number
+from torch_denkf._checks import check_number, check_values
 from torch_denkf.functional.angles import align_angles
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
@@ -52,10 +53,13 @@ class EnsembleUpdate(SubModel):
         rotate: random mean-preserving rotation of the anomalies.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
+        localisation: ``"significance"`` or ``None``.
+        threshold: of ``"significance"``, in standard deviations.
         **keys: see :class:`EnsembleAnalysisKeys`.
 
     Raises:
-        ValueError: if ``inflation`` is not positive, or ``relaxation`` is outside [0, 1].
+        ValueError: if ``inflation`` or ``threshold`` is not positive, ``relaxation`` is outside [0, 1], or
+            ``localisation`` is not known.
     """
 
     reads_components = True
@@ -68,6 +72,8 @@ class EnsembleUpdate(SubModel):
         rotate: bool,
         angles: Sequence[int],
         covariance: bool = False,
+        localisation: Literal["significance"] | None = None,
+        threshold: float | Tensor = 3.0,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),
@@ -89,8 +95,22 @@ class EnsembleUpdate(SubModel):
         check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.angles, self.info_prefix = list(angles), info_prefix
+        if localisation not in (None, "significance"):
+            raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
+        if localisation is not None:
+            check_values("threshold", torch.as_tensor(threshold), above=0)
+        self.localisation = localisation
+        if isinstance(threshold, Tensor) and not isinstance(threshold, nn.Parameter):
+            self.register_buffer("threshold", threshold)
+        else:
+            self.threshold = threshold
         self.predicted_key, self.reading_keys = self.in_keys[1], self.in_keys[2:]
         self.observed_key = unravel_key(observed_key)
+
+    @property
+    def significance(self) -> float | Tensor | None:
+        """The threshold of the localisation by significance; ``None`` without one."""
+        return None if self.localisation is None else self.threshold
 
     def on_entries(self, entries, call):
         """The belief and the diagnostics."""

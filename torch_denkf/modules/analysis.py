@@ -73,8 +73,6 @@ class EnsembleAnalysis(EnsembleUpdate):
         covariance: bool = False,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
-        if localisation not in (None, "significance"):
-            raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
         pair = isinstance(taper, tuple) and len(taper) == 2 and all(isinstance(part, torch.Tensor) for part in taper)
         if taper is not None and not pair:
             raise TypeError(f"taper is two tensors, [S, O] and [O, O], or None; got {type(taper).__name__}")
@@ -83,16 +81,17 @@ class EnsembleAnalysis(EnsembleUpdate):
         if rotate and scheme != "etkf":
             raise ValueError(f'rotate=True belongs to scheme="etkf"; got {scheme!r}.')
         super().__init__(
-            inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, covariance=covariance, **keys
+            inflation=inflation,
+            relaxation=relaxation,
+            rotate=rotate,
+            angles=angles,
+            covariance=covariance,
+            localisation=localisation,
+            threshold=threshold,
+            **keys,
         )
         check_dims("inflated", inflated or [])
         self.inflated = None if inflated is None else list(inflated)
-        self.localisation, self.threshold = localisation, threshold
-        if localisation is not None:
-            check_values("threshold", torch.as_tensor(threshold), above=0)
-        if isinstance(threshold, torch.Tensor) and not isinstance(threshold, torch.nn.Parameter):
-            del self.threshold
-            self.register_buffer("threshold", threshold)
         self.scheme, self.covariance, self.noise_variance_key = scheme, covariance, unravel_key(self.in_keys[3])
         for name, factors in zip(("state_taper", "observation_taper"), taper or (None, None), strict=True):
             if factors is not None:
@@ -154,8 +153,9 @@ class EnsembleAnalysis(EnsembleUpdate):
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
         options = self._options(noise, taper)
-        if isinstance(self.threshold, torch.Tensor) and self.threshold.numel() > 1 and self.localisation is not None:
-            options["significance"] = self.threshold.repeat(lag)
+        threshold = self.significance
+        if isinstance(threshold, torch.Tensor) and threshold.numel() > 1:
+            options["significance"] = threshold.repeat(lag)
         moved = self._formula(past.flatten(-2), predicted, observation, variance, observed=observed, **options)
         return moved.ensemble.unflatten(-1, past.shape[-2:])
 
@@ -172,5 +172,5 @@ class EnsembleAnalysis(EnsembleUpdate):
             "perturbation": noise if self.scheme == "perturbed" else None,
             "rotation": noise if self.rotate else None,
             "taper": None if taper is None else (taper, self.observation_taper),
-            **({} if self.localisation is None else {"significance": self.threshold}),
+            **({} if self.localisation is None else {"significance": self.significance}),
         }

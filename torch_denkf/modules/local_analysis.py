@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Unpack
+from typing import Any, Literal, Unpack
 
 import torch
 
@@ -41,6 +41,9 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             is observed are not rotated.
         tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch, with L
             neighbours.
+        localisation: ``"significance"`` also weighs each observation near a component by how far E members can tell
+            their correlation from chance, see :class:`EnsembleAnalysis`.
+        threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         **keys: see :class:`EnsembleAnalysisKeys`. Of learned observations the mean is taken. What is not observed may
             be NaN, readings and variances alike.
@@ -72,6 +75,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         relaxation: float = 0.0,
         rotate: bool = False,
         tile: int = 4096,
+        localisation: Literal["significance"] | None = None,
+        threshold: float | torch.nn.Parameter = 3.0,
         angles: Sequence[int] = (),
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
@@ -80,7 +85,17 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             raise ValueError(f"near is Neighbours, or a taper; a taper must be [S, O], got {list(near.shape)}")
         if not isinstance(near, (Neighbours, torch.Tensor)):
             raise TypeError(f"near is Neighbours, or a taper [S, O]; got {near!r}")
-        super().__init__(inflation=inflation, relaxation=relaxation, rotate=rotate, angles=angles, **keys)
+        super().__init__(
+            inflation=inflation,
+            relaxation=relaxation,
+            rotate=rotate,
+            angles=angles,
+            localisation=localisation,
+            threshold=threshold,
+            **keys,
+        )
+        if isinstance(threshold, torch.Tensor) and threshold.numel() > 1:
+            raise ValueError(f"threshold is one number for all components; got {list(threshold.shape)}")
         if isinstance(near, torch.Tensor):
             near = neighbours_of_taper(near, tile=tile)
         check_values("near's taper", near.taper, least=0)
@@ -164,7 +179,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         if copies > 1:
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
         near = Neighbours(index, taper)
-        ensemble = letkf(ensemble, predicted, observation, variance, near, observed=observed, tile=self.tile)
+        options: dict[str, Any] = {"observed": observed, "significance": self.significance, "tile": self.tile}
+        ensemble = letkf(ensemble, predicted, observation, variance, near, **options)
         if noise is None:
             return ensemble
         mean = ensemble.mean(-2, keepdim=True)
