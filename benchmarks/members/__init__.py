@@ -1,0 +1,1 @@
+"""How many members does an ensemble need?"""

@@ -1,0 +1,160 @@
+"""The study: its options, its rows, its table and picture."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.plots import plt, save
+from benchmarks.common.tables import Columns, head, line, pick, write_page
+from benchmarks.members import tasks
+from benchmarks.members.tasks import Score, Task
+
+PLAIN, BELIEVED = "plain", "significance"
+COLUMNS = Columns(
+    names=("task", "filter", "members", "threshold", "error", "held", "seconds"),
+    text=("task", "filter"),
+    whole=("members",),
+    order=lambda row: (row["task"], row["filter"], row.get("members", 0)),
+)
+DEFAULT = 3.0  # threshold where no validation data choose one
+
+
+@dataclass(frozen=True)
+class Study:
+    """How many members does an ensemble need, with and without localisation by significance?"""
+
+    out: Path | None = None  # folder for members.csv, members.md and members.png; rows that are there stay
+    kitti: Path | None = None  # KITTI's folder, for the task of the car
+    demos: Path = Path("runs/members/ur5")  # of the UR5, collected where they are missing
+    members: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
+    thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # of which validation data choose one
+    tasks: tuple[str, ...] = ("walks", "reacher", "lorenz96", "wheels", "ur5", "car")
+    smoke: bool = False  # two small tasks: do they run?
+
+
+def made(study: Study, name: str) -> Task:
+    """A task with its data."""
+    if name == "walks":
+        return tasks.walks(*((2, 20) if study.smoke else ()))
+    if name == "lorenz96":
+        return tasks.lorenz96(*((1, 5) if study.smoke else ()))
+    if name == "ur5":
+        return tasks.ur5(study.demos)
+    if name == "car":
+        if study.kitti is None:
+            raise SystemExit("--kitti is missing: KITTI's folder, for the task of the car; or leave it out of --tasks")
+        return tasks.car(study.kitti)
+    return {"wheels": tasks.wheels, "reacher": tasks.reacher}[name]()
+
+
+def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
+    """Rows of a task that are not there yet."""
+    if task.reference is not None:
+        name, score = task.reference
+        if not pick(there, task=task.name, filter=name):
+            yield {"task": task.name, "filter": name, "error": score.error, "held": score.held}
+    for members in study.members:
+        for kind in (PLAIN, BELIEVED):
+            if pick([row for row in there if "members" in row], task=task.name, filter=kind, members=members):
+                continue
+            began, threshold = time.process_time(), None
+            if kind == BELIEVED:
+                threshold = chosen(task, study, members)
+                if threshold is None:
+                    continue
+            score = task.score(members, threshold)
+            row = {"task": task.name, "filter": kind, "members": members, "error": score.error, "held": score.held}
+            yield row | {"threshold": threshold or 0.0, "seconds": time.process_time() - began}
+
+
+def chosen(task: Task, study: Study, members: int) -> float | None:
+    """The threshold with the least error on validation data; ``None`` where members are too few for any."""
+    able = [threshold for threshold in study.thresholds if threshold**2 < members - 1]
+    if task.validate is None:
+        return DEFAULT if DEFAULT in able else None
+    scores: dict[float, Score] = {threshold: task.validate(members, threshold) for threshold in able}
+    return min(scores, key=lambda threshold: scores[threshold].error) if scores else None
+
+
+def page(rows: list[dict], study: Study, errors: dict[str, str]) -> str:
+    """The table."""
+    lines = [
+        "# How many members?",
+        "",
+        'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
+        "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation. For `ur5` and `car`",
+        "it is the default.",
+        "",
+        *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
+    ]
+    for name in study.tasks:
+        own = pick(rows, task=name)
+        for row in own:
+            if row["filter"] not in (PLAIN, BELIEVED):
+                lines.append(line(name, errors[name], row["filter"], *cells(row), "", "", ""))
+        for members in study.members:
+            sized = [row for row in own if row.get("members") == members]
+            without, believed = ((pick(sized, filter=kind) or [{}])[0] for kind in (PLAIN, BELIEVED))
+            if sized:
+                threshold = f"{believed['threshold']:g}" if believed else ""
+                lines.append(line(name, errors[name], members, *cells(without), *cells(believed), threshold))
+    lines += ["", *made_by("members")]
+    return "\n".join(lines) + "\n"
+
+
+def cells(row: dict) -> tuple[str, str]:
+    """Error and coverage; empty where there is no row."""
+    return (f"{row['error']:.3g}", f"{row['held']:.0%}") if row else ("", "")
+
+
+def draw(rows: list[dict], study: Study, errors: dict[str, str], file: Path) -> None:
+    """Errors above, coverage below, against the members; a column a task."""
+    names = [name for name in study.tasks if pick(rows, task=name)]
+    figure, axes = plt.subplots(
+        2, len(names), figsize=(2.7 * len(names), 5), sharex=True, squeeze=False, layout="constrained"
+    )
+    for name, (above, below) in zip(names, axes.T, strict=True):
+        own = pick(rows, task=name)
+        for kind, style, label in ((PLAIN, "o--", "without"), (BELIEVED, "o-", "significance")):
+            points = sorted((row for row in own if row["filter"] == kind), key=lambda row: row["members"])
+            count = [row["members"] for row in points]
+            above.plot(count, [row["error"] for row in points], style, markersize=3, label=label)
+            below.plot(count, [100 * row["held"] for row in points], style, markersize=3)
+        for row in own:
+            if row["filter"] not in (PLAIN, BELIEVED):
+                above.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
+        below.axhline(90, color="gray", linewidth=1, linestyle=":")
+        above.set(title=name, ylabel=errors[name], xscale="log", yscale="log")
+        below.set(xlabel="members", ylim=(0, 102), ylabel="% in 90 % intervals")
+        above.legend(fontsize=7)
+        below.set_xticks([8, 32, 128, 512], ["8", "32", "128", "512"])
+        below.minorticks_off()
+    save(figure, file)
+
+
+def main() -> None:
+    """Runs the study."""
+    study = parse(Study)
+    if study.smoke:
+        study = replace(study, members=(8,), thresholds=(1.0,), tasks=("walks", "lorenz96"))
+        study = replace(study, out=Path(tempfile.mkdtemp(prefix="members-")))
+    file = None if study.out is None else study.out / "members.csv"
+    rows = COLUMNS.read(file) if file is not None and file.exists() else []
+    errors = {}
+    for name in study.tasks:
+        task = made(study, name)
+        errors[name] = task.error
+        for row in rows_of(task, study, rows):
+            rows.append(row)
+            print(row, flush=True)
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                COLUMNS.write(rows, file)
+    write_page(page(rows, study, errors), None if study.out is None else study.out / "members.md")
+    if study.out is not None:
+        draw(rows, study, errors, study.out / "members.png")

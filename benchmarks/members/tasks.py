@@ -1,0 +1,232 @@
+"""The tasks: each makes data once, and gives the error and the coverage of a filter with any number of members."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from benchmarks.common.lorenz96 import lorenz96_step
+from benchmarks.wheels.task import ensemble_filter, gaussian_filter, recordings
+from torch_denkf import DEnKF, Filter, KalmanFilter, from_pretrained
+from torch_denkf.applications.car.kitti.episodes import find_drives
+from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
+from torch_denkf.applications.reacher import reacher_env
+from torch_denkf.applications.ur5.train import evaluate_ur5_table, whole_demos
+from torch_denkf.functional import analyse
+from torch_denkf.functional.inflation import inflate
+from torch_denkf.metrics import interval_coverage
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
+
+__all__ = ["Score", "Task", "car", "lorenz96", "reacher", "ur5", "walks", "wheels"]
+
+LEVEL = 0.9  # of the intervals
+WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
+
+
+@dataclass(frozen=True)
+class Score:
+    """How good a filter is: its error in the task's unit, and the share of the truth in its 90 % intervals."""
+
+    error: float
+    held: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task.
+
+    Attributes:
+        name: of the task.
+        error: what its error is of, with the unit.
+        score: of a filter with so many members, and the threshold of the significance or ``None``.
+        validate: the same on other data, by which the threshold is chosen; ``None`` where it is the default.
+        reference: name and score of a filter without members; ``None`` for none.
+    """
+
+    name: str
+    error: str
+    score: Callable[[int, float | None], Score]
+    validate: Callable[[int, float | None], Score] | None = None
+    reference: tuple[str, Score] | None = None
+
+
+def localised(threshold: float | None) -> dict[str, Any]:
+    """The options of an analysis."""
+    return {} if threshold is None else {"localisation": "significance", "threshold": threshold}
+
+
+def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) -> Score:
+    """Root mean square error of some components, coverage of all, over ``[*B, S]``."""
+    parts = [value.flatten(0, -2) for value in (mean, var, truth)]
+    error = (parts[0] - parts[2])[:, dims].square().mean().sqrt()
+    return Score(float(error), float(interval_coverage(*parts, level=LEVEL).mean()))
+
+
+@torch.no_grad()
+def filtered(filter: Filter, data: TensorDict, skip: int, dims: slice = slice(None)) -> Score:
+    """The score on sequences ``[B, T]`` behind their first steps."""
+    torch.manual_seed(0)
+    out = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"][:, skip:]
+    return scored(out["mean"], out["var"], data["state"][:, skip:], dims)
+
+
+def wheels(runs: int = 8, steps: int = 6000) -> Task:
+    """The robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
+    test, other = recordings(runs, steps, 0), recordings(runs, steps, 1)
+    skip, place = min(500, steps // 2), slice(0, 2)
+
+    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+        return filtered(ensemble_filter(members, **localised(threshold)), data, skip, place)
+
+    kalman = filtered(gaussian_filter(), test, skip, place)
+    return Task("wheels", "place, m", partial(score, test), partial(score, other), ("EKF", kalman))
+
+
+def _walks(runs: int, steps: int, seed: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+    draw = partial(torch.randn, runs, steps, WALKS, generator=generator)
+    state = (WALK_STD * draw()).cumsum(1)
+    read = torch.arange(steps).unsqueeze(-1) % WALKS == torch.arange(WALKS)
+    observed = read.expand(runs, -1, -1).contiguous()
+    return TensorDict({"state": state, "reading": state + READING_STD * draw(), "observed": observed}, [runs, steps])
+
+
+def walks(runs: int = 16, steps: int = 1000) -> Task:
+    """Ten random walks that have nothing to do with each other, one of which is read at each step."""
+    test, other = _walks(runs, steps, 0), _walks(runs, steps, 1)
+    skip, eye = min(100, steps // 2), torch.eye(WALKS)
+
+    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+        still = torch.nn.Linear(WALKS, WALKS, bias=False)
+        still.weight.data = torch.eye(WALKS)
+        filter = DEnKF(
+            LearnedTransition(still, residual=False),
+            None,
+            Select(range(WALKS)),
+            ConstantNoise([READING_STD] * WALKS, in_key="reading"),
+            EnsembleAnalysis("etkf", observation_key="reading", **localised(threshold)),
+            process_noise=[WALK_STD] * WALKS,
+            initial=GaussianPrior([0.0] * WALKS, [WALK_STD] * WALKS, ensemble_size=members),
+        )
+        return filtered(filter, data, skip)
+
+    noises = {"process_noise": [WALK_STD] * WALKS, "noise": [READING_STD] * WALKS}
+    exact = KalmanFilter(eye, eye, **noises, mean=torch.zeros(WALKS), cov=WALK_STD**2 * eye, observation_key="reading")
+    best = ("Kalman filter", filtered(exact, test, skip))
+    return Task("walks", "ten walks", partial(score, test), partial(score, other), best)
+
+
+def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
+    """True states and readings of Lorenz-96, ``[cycles + 1, seeds, 40]``."""
+    generator = torch.Generator().manual_seed(first)
+    draw = partial(torch.randn, seeds, 40, generator=generator, dtype=torch.float64)
+    state = 8 + draw()
+    for _ in range(1000):
+        state = lorenz96_step(state)
+    truth = [state]
+    for _ in range(cycles):
+        truth.append(lorenz96_step(truth[-1]))
+    return torch.stack(truth), torch.stack([state + draw() for state in truth])
+
+
+def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = (1.0, 1.02, 1.05, 1.1)) -> Task:
+    """Forty variables, all read in each cycle, R = 1, no localisation by places; the inflation is chosen, too."""
+    data = {"validation": _weather(seeds, cycles, 1), "test": _weather(seeds, cycles, 0)}
+    chosen: dict[tuple[int, float | None], int] = {}
+
+    def run(name: str, members: int, threshold: float | None) -> list[Score]:
+        truth, readings = data[name]
+        factor = torch.tensor(inflations, dtype=torch.float64).repeat_interleave(seeds)[:, None, None]
+        generator = torch.Generator().manual_seed(2)
+        start = torch.randn(seeds, members, 40, generator=generator, dtype=torch.float64)
+        ensemble = (truth[0].unsqueeze(1) + start).repeat(len(inflations), 1, 1)
+        noise, found = torch.ones_like(ensemble[:, 0]), []
+        for reading in readings[1:]:
+            ensemble = lorenz96_step(ensemble).clamp(-50, 50)  # one that diverged is to stay finite
+            reading = reading.repeat(len(inflations), 1)
+            options: dict[str, Any] = {"scheme": "etkf", "significance": threshold}
+            ensemble = inflate(analyse(ensemble, ensemble, reading, noise, **options).ensemble, factor)
+            found.append(torch.stack([ensemble.mean(1), ensemble.var(1)]).unflatten(1, (len(inflations), seeds)))
+        means, variances = torch.stack(found, 3)[:, :, :, min(100, cycles // 2) :].unbind()  # [factor, seed, cycle, 40]
+        true = truth[1:].movedim(0, 1)[:, min(100, cycles // 2) :]
+        scores = []
+        for mean, var in zip(means, variances, strict=True):
+            error = (mean - true).square().mean(-1).sqrt().mean()  # the mean of the cycles' errors, as published
+            scores.append(replace(scored(mean, var, true), error=float(error)))
+        return scores
+
+    def validate(members: int, threshold: float | None) -> Score:
+        scores = run("validation", members, threshold)
+        best = min(range(len(scores)), key=lambda place: scores[place].error)
+        chosen[members, threshold] = best
+        return scores[best]
+
+    def score(members: int, threshold: float | None) -> Score:
+        if (members, threshold) not in chosen:
+            validate(members, threshold)
+        return run("test", members, threshold)[chosen[members, threshold]]
+
+    return Task("lorenz96", "analysis", score, validate)
+
+
+def resized(filter: Any, members: int, threshold: float | None) -> Any:
+    """A filter that comes with the library, with so many members; their noise models stay those of its training."""
+    new = type(filter)(replace(filter.settings, ensemble_size=members))
+    new.load_state_dict(filter.state_dict())
+    new.eval()
+    analyses = [module for module in new.modules() if isinstance(module, EnsembleAnalysis)]
+    for analysis in analyses:
+        analysis.localisation, analysis.threshold = (None, 3.0) if threshold is None else ("significance", threshold)
+    return new
+
+
+def _episodes(episodes: int, steps: int, seed: int) -> TensorDict:
+    torch.manual_seed(seed)
+    env = reacher_env(seed)
+    return TensorDict.stack([env.rollout(steps).select("state", "encoder", "action") for _ in range(episodes)])
+
+
+def reacher(episodes: int = 10, steps: int = 400) -> Task:
+    """Joint velocities of the reacher by the filter that comes with the library."""
+    test, other, shipped = (
+        _episodes(episodes, steps, 1000),
+        _episodes(episodes, steps, 2000),
+        from_pretrained("reacher"),
+    )
+
+    def score(data: TensorDict, members: int, threshold: float | None) -> Score:
+        return filtered(resized(shipped, members, threshold), data, 1, slice(2, 4))
+
+    return Task("reacher", "joint velocities, rad/s", partial(score, test), partial(score, other))
+
+
+def ur5(folder: Path, demos: int = 30) -> Task:
+    """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
+    data, shipped = whole_demos(folder, demos, progress=False), from_pretrained("ur5-table")
+
+    def score(members: int, threshold: float | None) -> Score:
+        found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)
+        return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
+
+    return Task("ur5", "joints, degrees (mean absolute)", score)
+
+
+def car(root: Path, draws: int = 4) -> Task:
+    """Path of a car by the filter that comes with the library, on real drives that it has not seen."""
+    drives, shipped = find_drives(root, None), from_pretrained("car-odometry")
+
+    def score(members: int, threshold: float | None) -> Score:
+        rows, _ = evaluate_car_filter(resized(shipped, members, threshold), root, drives, draws=draws, progress=False)
+        own = [row for row in rows if row["method"] == "filter"]
+        held = fmean(fmean((row["coverage90_v"], row["coverage90_theta_dot"])) for row in own)
+        return Score(100 * fmean(row["translation_m_per_m"] for row in own), held)
+
+    return Task("car", "end of 100 steps, % of the way", score)
