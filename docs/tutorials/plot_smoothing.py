@@ -26,6 +26,7 @@ from tensordict import TensorDict
 from torch_denkf import DEnKF, EnKS, EnRTS, FixedLag
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, SubModel
+from torch_denkf.plots import plot_path
 
 torch.manual_seed(0)
 DT, EVERY, STEPS, MEMBERS = 0.1, 40, 241, 200  # s; steps between two markers; steps of a drive; members
@@ -132,14 +133,10 @@ assert 0.8 < inside[:2].mean() < 0.98
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained", width_ratios=[1.3, 1])
 one = out[3]
-for path, style, name in (
-    (drives["state"][3], {"color": "black", "linewidth": 1}, "truth"),
-    (one["belief", "mean"], {"color": "tab:orange"}, "filter: jumps at each marker"),
-    (one["smoothed", "mean"], {"color": "tab:blue"}, "smoother"),
-):
-    left.plot(path[:, 0], path[:, 1], label=name, **style)
-left.plot(*drives["marker"][3].unbind(-1), "k^", label="markers")
-left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="One drive")
+filtered = {"filter: jumps at each marker": one["belief", "mean"]}
+plot_path(one, belief="smoothed", others=filtered, spread="ellipses", legend=False, ax=left)
+left.plot(*one["marker"].unbind(-1), "k^", label="markers")
+left.set(title="One drive")
 left.legend(fontsize=8)
 steps = torch.arange(EVERY)
 rows = steps.reshape(1, -1) + EVERY * torch.arange(1, STEPS // EVERY - 1).reshape(-1, 1)

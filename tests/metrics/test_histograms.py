@@ -8,6 +8,7 @@ import torch
 from scipy import stats
 
 from tests.functional.checks import assert_refused
+from torch_denkf.functional import wrap_angle
 from torch_denkf.metrics import pit, spread_skill_ratio
 from torch_denkf.metrics.calibration import ensemble_interval, histogram_band, rank_histogram, spread_error
 
@@ -64,6 +65,40 @@ def test_ranks_of_angles_on_both_sides_of_the_cut():
     members = torch.tensor([[[3.0], [-3.0], [3.1]]])  # around 3.12
     assert rank_histogram(members, torch.tensor([[-3.1]]), angles=(0,)).tolist() == [[0, 0, 1, 0]]
     assert rank_histogram(members, torch.tensor([[-3.1]])).tolist() == [[1, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("angles", [(), (0,)])
+def test_a_particle_counts_as_often_as_its_weight_says(angles):
+    draw = rng()
+    members, truth = (torch.randn(500, *shape, generator=draw, dtype=torch.float64) for shape in ((6, 2), (2,)))
+    members[:100, 3], members[100:150, 0] = truth[:100], truth[100:150]  # ties
+    often = torch.tensor([3, 1, 0, 2, 0, 0])
+    repeated = members.repeat_interleave(often, 1)
+    weights = (often / 6).log().expand(500, 6)
+    if angles:
+        for part in (members, repeated, truth):
+            part[..., 0] = wrap_angle(part[..., 0] + 3)
+    counts = rank_histogram(members, truth, log_weight=weights, angles=angles)
+    torch.testing.assert_close(counts, rank_histogram(repeated, truth, angles=angles))
+    torch.testing.assert_close(counts, rank_histogram(members, truth, log_weight=weights + 7, angles=angles))
+    # Equal weights are none.
+    equal = rank_histogram(members, truth, log_weight=torch.zeros(500, 6), angles=angles)
+    torch.testing.assert_close(equal, rank_histogram(members, truth, angles=angles))
+
+
+def test_a_truth_between_two_ranks_counts_in_both():
+    members = torch.tensor([[[0.0], [1.0], [2.0]]])
+    weight = torch.tensor([[0.5, 0.3, 0.2]]).log()
+    counts = rank_histogram(members, torch.tensor([[0.5]]), log_weight=weight)  # 1.5 of three members lie below
+    torch.testing.assert_close(counts, torch.tensor([[0.0, 0.5, 0.5, 0.0]], dtype=torch.float64))
+    assert_refused(
+        ValueError,
+        r"log_weight must be \[\*B, E\], \[1, 3\]",
+        rank_histogram,
+        members,
+        torch.ones(1, 1),
+        log_weight=weight[0],
+    )
 
 
 @pytest.mark.parametrize(("samples", "bins"), [(30, 5), (1000, 20), (5000, 33), (200_000, 10)])

@@ -7,13 +7,14 @@ from tensordict import TensorDict
 
 from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import KalmanFilter
+from torch_denkf.smoothers import FixedLag
 
 DT = 0.1
 
 
 @cache
-def kalman_runs(batch=60, steps=80):
-    """Sequences [batch, steps] of state [x, y, vx, vy], a third of the readings missing."""
+def kalman_runs(batch=60, steps=80, lag=0):
+    """Sequences [batch, steps] of state [x, y, vx, vy], a third of the readings missing; smoothed, with a lag."""
     F = torch.eye(4)
     F[0, 2] = F[1, 3] = DT
     H = torch.eye(2, 4)
@@ -21,7 +22,7 @@ def kalman_runs(batch=60, steps=80):
     Q = torch.diag(torch.tensor([1e-4, 1e-4, 0.01, 0.01]))
     kf = KalmanFilter(F, H, process_noise_cov=Q, noise_cov=0.16 * torch.eye(2), mean=torch.zeros(4), cov=torch.eye(4))
     with torch.no_grad():
-        return kf.sequence(env.rollout(steps)["next"])
+        return (FixedLag(kf, lag) if lag else kf).sequence(env.rollout(steps)["next"])
 
 
 def ensemble_run(steps=40, members=19, seed=0):

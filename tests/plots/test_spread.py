@@ -34,6 +34,7 @@ def test_points_by_hand():
     belief = TensorDict({"mean": 0 * std, "var": std**2}, [2, 2])
     axes = plot_spread_error(belief, truth, factors=[10], bins=2)
     np.testing.assert_allclose(data(axes)["state 0"], [[10, 30], [10, 20]])
+    assert axes.get_xlabel() == "predicted spread"
     low, high = axes.get_xlim()
     assert low < 10
     assert high > 30
@@ -46,6 +47,11 @@ def test_few_members_are_expected_to_err_more_than_they_spread():
     spread, error = data(axes)["state 0"]
     assert error[0] == pytest.approx(1.25**0.5, abs=0.02)
     assert spread[0] == pytest.approx(error[0], abs=0.02)
+
+
+def test_the_axes_say_each_unit():
+    axes = plot_spread_error(kalman_runs(), names=["x, m", "y, m", "vx, m/s", "vy, m/s"])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted spread, m or m/s", "RMS error, m or m/s")
 
 
 def test_angles_are_wrapped():

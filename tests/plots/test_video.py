@@ -170,6 +170,23 @@ def vermilion(frame):
     return (np.abs(frame.astype(int) - (213, 94, 0)).max(-1) <= 60).sum()
 
 
+@pytest.mark.parametrize("bands", [None, {"dims": [0]}])
+def test_the_belief_lies_on_the_picture(tmp_path, bands):
+    at = torch.stack([4.0 + 2 * torch.arange(12), 3 + torch.arange(12)], -1)  # columns and rows, in pixels
+    pixels = torch.zeros(12, 3, 20, 32)
+    pixels[:, 1] = 0.6
+    settings = {"bands": bands, "path": {"spread": "none"}, "size": (8, 4)}
+    got, _ = decoded(belief_video(tmp_path / "a.gif", at, pixels, on_picture=True, **settings))
+    places = np.argwhere((np.abs(got[0].astype(int) - (0, 153, 0)) < 12).all(-1))
+    (top, left), (bottom, right) = places.min(0), places.max(0) + 1
+    assert (right - left) / (bottom - top) == pytest.approx(32 / 20, rel=0.02)  # pixels are squares
+    for frame, (column, row) in zip(got, at.tolist(), strict=True):
+        marked = np.argwhere(blue(frame[top:bottom, left:right]))
+        down, across = marked.max(0)  # the dot is the last mark to the right, and the lowest
+        assert across - 3.5 == pytest.approx((column + 0.5) / 32 * (right - left), abs=2)
+        assert down - 3.5 == pytest.approx((row + 0.5) / 20 * (bottom - top), abs=2)
+
+
 def test_parts_may_be_left_out(tmp_path):
     run = ensemble_run(steps=4)
     for name, given in {
@@ -195,6 +212,9 @@ def test_errors_say_what_to_do(tmp_path):
             write_video(tmp_path / f"a.{ending}", [np.zeros((8, 8)), np.zeros((8, 9))], 10)
     with pytest.raises(ValueError, match="nothing to draw"):
         belief_video(tmp_path / "a.gif", run)
+    for given in ({}, {"pixels": torch.zeros(4, 3, 8, 8), "path": {"forward_up": True}}):
+        with pytest.raises(ValueError, match="on_picture needs pixels, and a path of two dims without forward_up"):
+            belief_video(tmp_path / "a.gif", run, on_picture=True, **given)
     with pytest.raises(KeyError, match="no 'image' among"):
         belief_video(tmp_path / "a.gif", run, "image")
     with pytest.raises(ValueError, match="a picture a step, 4; got 3"):

@@ -214,15 +214,19 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] 
     return torch.special.ndtr(torch.where((error == 0) & (variance == 0), 0.0, score))
 
 
-def rank_histogram(ensemble: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+def rank_histogram(
+    ensemble: Tensor, truth: Tensor, *, log_weight: Tensor | None = None, angles: Sequence[int] = ()
+) -> Tensor:
     """How often the truth falls into each of the E+1 gaps between and beyond the sorted members.
 
     The histogram is flat, up to chance, for a calibrated ensemble, Gaussian or not. It is high at both ends for an
     overconfident one. A truth that equals some members counts in equal parts in all the gaps that they separate.
 
     Args:
-        ensemble: ``[*B, E, S]``, members of equal weight.
+        ensemble: ``[*B, E, S]``.
         truth: ``[*B, S]``, in the same units.
+        log_weight: of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and a truth
+            between two ranks in both. Without it, all members weigh the same.
         angles: dimensions that are angles in rad; members are taken around their mean direction.
 
     Returns:
@@ -240,17 +244,24 @@ def rank_histogram(ensemble: Tensor, truth: Tensor, *, angles: Sequence[int] = (
         >>> rank_histogram(members, torch.tensor([[0.0], [2.5], [2.6], [2.0]]))
         tensor([[1.0000, 0.5000, 2.5000, 0.0000]], dtype=torch.float64)
     """
-    members, offset = _around_mean(ensemble, truth, angles)
+    count = torch.ones_like(ensemble[..., :1], dtype=torch.float64)
+    if log_weight is not None:
+        if log_weight.shape != ensemble.shape[:-1]:
+            raise ValueError(f"log_weight must be [*B, E], {list(ensemble.shape[:-1])}; got {list(log_weight.shape)}")
+        count = log_weight.shape[-1] * log_weight.double().softmax(-1).unsqueeze(-1)
+    members, offset = _around_mean(ensemble, truth, angles, count)
     if not bool(members.isfinite().all() and offset.isfinite().all()):
         raise ValueError("ensemble and truth must be finite; leave out the rows that are not")
-    offset = offset.unsqueeze(-2)
-    below = (members < offset).sum(-2).flatten(0, -2)  # [N, S]
-    ties = (members == offset).sum(-2).flatten(0, -2)
-    part = 1.0 / (ties + 1).double()
-    steps = torch.zeros(members.shape[-1], members.shape[-2] + 2, dtype=torch.float64, device=members.device)
-    steps.scatter_add_(1, below.T, part.T)
-    steps.scatter_add_(1, (below + ties + 1).T, -part.T)
-    return steps.cumsum(1)[:, :-1]
+    offset, size = offset.unsqueeze(-2), members.shape[-2]
+    below = count.where(members < offset, 0.0).sum(-2).flatten(0, -2).T  # [S, N]
+    above = below + count.where(members == offset, 0.0).sum(-2).flatten(0, -2).T + 1
+    part = 1.0 / (above - below)
+    steps = torch.zeros(members.shape[-1], size + 3, dtype=torch.float64, device=members.device)
+    for edge, height in ((below, part), (above, -part)):  # each truth lies evenly on the ranks between its edges
+        whole = edge.floor().clamp(max=size + 1)
+        steps.scatter_add_(1, whole.long(), (1 - edge + whole) * height)
+        steps.scatter_add_(1, whole.long() + 1, (edge - whole) * height)
+    return steps.cumsum(1)[:, : size + 1]
 
 
 def histogram_band(samples: int, bins: int, *, level: float = 0.99) -> tuple[int, int]:
@@ -337,15 +348,18 @@ def spread_error(
     return SpreadError(*map(torch.stack, columns))
 
 
-def _around_mean(ensemble: Tensor, truth: Tensor, angles: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _around_mean(
+    ensemble: Tensor, truth: Tensor, angles: Sequence[int], count: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor]:
     """Members and truth relative to the members' mean, in which angles are wrapped: ``[*B, E, S]`` and ``[*B, S]``."""
     if ensemble.ndim != truth.ndim + 1 or (*ensemble.shape[:-2], ensemble.shape[-1]) != truth.shape:
         raise ValueError(
             f"ensemble must be [*B, E, S] and truth [*B, S]; got {list(ensemble.shape)} and {list(truth.shape)}."
         )
-    centre = ensemble.mean(-2)
+    centre = (count * ensemble).mean(-2)
     for dim in angles:
-        centre[..., dim] = torch.atan2(ensemble[..., dim].sin().mean(-1), ensemble[..., dim].cos().mean(-1))
+        sine, cosine = ((count * part).mean(-2) for part in (ensemble.sin(), ensemble.cos()))
+        centre[..., dim] = torch.atan2(sine[..., dim], cosine[..., dim])
     offset = state_difference(truth, centre, angles=angles)
     members = ensemble - centre.unsqueeze(-2)
     for dim in angles:

@@ -95,6 +95,14 @@ def legend_above(axes: Axes, *others: Axes) -> None:
         handle.set_alpha(max(handle.get_alpha() or 1.0, 0.6))
 
 
+def label_below(panels: Sequence[Axes], label: str) -> None:
+    """Labels the horizontal axis of the lowest Axes: the last of a column, all of a row."""
+    bottoms = [axes.get_position().y0 for axes in panels]
+    for axes, bottom in zip(panels, bottoms, strict=True):
+        if bottom < min(bottoms) + 1e-6:
+            axes.set_xlabel(label)
+
+
 def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
     """One value a drawn component.
 

@@ -28,6 +28,8 @@ class Belief(NamedTuple):
         log_weight: of particles, ``[*B, E]``.
         truth: ``[*B, S']``; S' may be smaller than S.
         observed: ``[*B, O]`` bool.
+        known: ``[*B]`` bool, False where a smoother with a lag says nothing of the state; all else is NaN there.
+        name: in legends.
     """
 
     mean: Tensor
@@ -37,6 +39,8 @@ class Belief(NamedTuple):
     log_weight: Tensor | None = None
     truth: Tensor | None = None
     observed: Tensor | None = None
+    known: Tensor = torch.tensor(True)
+    name: str = "belief"
 
     @property
     def ensemble_size(self) -> int | None:
@@ -45,37 +49,51 @@ class Belief(NamedTuple):
 
 
 def read_belief(
-    belief: TensorDictBase | Tensor, truth: Truth = None, observed: Truth = None, *, one_sequence: bool = False
+    run: TensorDictBase | Tensor,
+    truth: Truth = None,
+    observed: Truth = None,
+    *,
+    belief: NestedKey = "belief",
+    one_sequence: bool = False,
 ) -> Belief:
     """Reads ``("belief", ...)``, the truth and the observed mask.
 
     Args:
-        belief: a roll-out with ``("belief", "mean")`` or ``("belief", "ensemble")``; or the belief itself, with
+        run: a roll-out with ``("belief", "mean")`` or ``("belief", "ensemble")``; or the belief itself, with
             ``"mean"`` or ``"ensemble"``, such as ``rollout["forecast"]``; or means ``[*B, S]``.
         truth: a tensor ``[*B, S']``, a key of the roll-out, or ``None`` for ``"state"`` where it is there.
         observed: a tensor ``[*B, O]`` or ``[*B]`` bool, a key, or ``None`` for ``"observed"`` where it is there.
+        belief: which belief of the roll-out, such as ``"smoothed"``. One of the state ``"age"`` steps ago, as
+            :class:`~torch_denkf.smoothers.FixedLag` writes it, is moved to the row of that state.
         one_sequence: whether ``*B`` has to be ``T``.
 
     Raises:
         KeyError: if the roll-out has no belief, or not the key that was named.
         ValueError: if the shapes do not fit.
     """
-    if isinstance(belief, Tensor):
-        parts: dict[str, Tensor] = {"mean": number(belief)}
+    age, last = None, belief if isinstance(belief, str) else belief[-1]
+    if isinstance(run, Tensor):
+        parts: dict[str, Tensor] = {"mean": number(run)}
     else:
-        root = belief.get("belief", None)
-        root = belief if root is None else root
+        root = run.get(belief, run if belief == "belief" else {})
         names = ("mean", "var", "cov", "ensemble", "log_weight")
         parts = {name: number(root[name]) for name in names if name in set(root.keys())}
         if not {"mean", "ensemble"} & parts.keys():
             raise KeyError(
-                f'no ("belief", "mean") and no ("belief", "ensemble") among {list(belief.keys(True, True))}; pass what '
+                f'no ("{last}", "mean") and no ("{last}", "ensemble") among {list(run.keys(True, True))}; pass what '
                 'a filter\'s sequence or a roll-out of an environment with DEnKFTransform gives, or its "next"'
             )
+        age = root.get("age", None)
+        if age is not None and (weight := run.get(("belief", "log_weight"), None)) is not None:
+            parts.setdefault("log_weight", number(weight))  # particles of long ago weigh what they weigh now
     parts = _summarise(parts)
-    optional = {"truth": entry_of(belief, truth, "state"), "observed": entry_of(belief, observed, "observed")}
-    read = Belief(**parts, **{name: number(value) for name, value in optional.items() if value is not None})
-    batch = read.mean.shape[:-1]
+    batch = parts["mean"].shape[:-1]
+    known = torch.ones(batch, dtype=torch.bool)
+    if age is not None:
+        parts, known = _to_rows_of_states(parts, age.detach().cpu().long().reshape(batch))
+    optional = {"truth": entry_of(run, truth, "state"), "observed": entry_of(run, observed, "observed")}
+    given = {name: number(value) for name, value in optional.items() if value is not None}
+    read = Belief(**parts, **given, known=known, name="belief" if last == "belief" else f"{last} belief")
     if one_sequence and len(batch) != 1:
         raise ValueError(f"one sequence [T, S] is drawn at a time, got means {list(read.mean.shape)}; index the batch")
     if read.observed is not None:
@@ -158,6 +176,23 @@ def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
     if found is None and value is not None:
         raise KeyError(f"no {value!r} among {list(source.keys(True, True))}")
     return found
+
+
+def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    """Moves what row t says of the state of t - age to that state's row, from the latest row that says something of it.
+
+    Returns:
+        The parts, NaN where no row says anything, and where any does, ``[*B]``.
+    """
+    time = age.ndim - 1
+    rows = torch.arange(age.shape[-1]).expand_as(age)
+    state = rows - age
+    latest = torch.full_like(age, -1).scatter_reduce(-1, state.clamp(min=0), rows.where(state >= 0, -1), "amax")
+    moved = {}
+    for name, value in parts.items():
+        row = latest.reshape(*age.shape, *[1] * (value.ndim - age.ndim))
+        moved[name] = torch.take_along_dim(value, row.clamp(min=0), time).where(row >= 0, torch.nan)
+    return moved, latest >= 0
 
 
 def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -27,13 +27,14 @@ class Scene:
         pictures: Tensor | np.ndarray | None,
         path: bool,
         bands: int,
+        on_picture: bool = False,
     ):
         figure = new_figure(size)
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         figure.set_dpi(dpi)
         self.canvas, self.figure, self.pictures = FigureCanvasAgg(figure), figure, pictures
-        left = (pictures is not None) + path
+        left = (pictures is not None) + (path and not on_picture)
         columns = figure.add_gridspec(1, 2 if left and bands else 1, width_ratios=[1, 1.25] if left and bands else None)
         self.camera = self.path = None
         if left:
@@ -42,7 +43,9 @@ class Scene:
                 self.camera = figure.add_subplot(rows[0])
                 self.image = self.camera.imshow(as_picture(pictures[0]), interpolation="nearest")
                 self.camera.set(xticks=[], yticks=[])
-            if path:
+            if on_picture:
+                self.path = self.camera
+            elif path:
                 self.path = figure.add_subplot(rows[-1])
         self.bands: list[Axes] = []
         if bands:
@@ -56,6 +59,10 @@ class Scene:
     def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
         """Fixes layout and limits, and draws once what stands still, with the bands and without."""
         self.seen, self.bounds = seen, step_bounds(seconds)
+        if self.camera is not None:  # a path that is drawn on it stretches nothing
+            height, width = self.image.get_size()
+            self.camera.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="", ylabel="")
+            self.camera.set_aspect("equal", adjustable="box")
         self._shrink_labels()
         self.figure.draw_without_rendering()
         self.figure.set_layout_engine("none")
@@ -70,7 +77,10 @@ class Scene:
             )
             self.moving += [(self.camera, part) for part in (self.image, *self.camera.spines.values(), self.note)]
         if self.path is not None:
-            self.path.set_aspect("auto")  # the limits are those of equal scales
+            if self.path is self.camera:
+                self._outline_lines()
+            else:
+                self.path.set_aspect("auto")  # the limits are those of equal scales
             self.lines = [(line, np.asarray(line.get_data())) for line in self.path.get_lines()]
             self.lines = [(line, data) for line, data in self.lines if data.shape[1] == len(seconds)]
             self.here = self.path.plot([], [], "o", color=BELIEF, markersize=5, zorder=3)[0]
@@ -84,6 +94,14 @@ class Scene:
                 artist.set_visible(False)
         self._picture()
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def _outline_lines(self) -> None:
+        """Makes the lines on the picture seen where it is dark."""
+        from matplotlib.patheffects import withStroke
+
+        for line in self.camera.get_lines() if self.camera is not None else ():
+            if line.get_alpha() is None:
+                line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1, foreground="white")])
 
     def _shrink_labels(self) -> None:
         """Makes the bands' names fit beside their Axes, all of one size."""
@@ -113,7 +131,7 @@ class Scene:
                 spine.set(color=READING if unseen else "black", linewidth=3 if unseen else 0.8)
         for line, data in self.lines:
             line.set_data(data[:, : step + 1])
-            if line.get_label() == "belief":
+            if line.get_gid() == "belief":
                 self.here.set_data(data[:, step : step + 1])
         if self.path is not None:
             for patch in self.path.patches:

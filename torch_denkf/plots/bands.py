@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.functional import wrap_angle
@@ -18,6 +18,7 @@ from torch_denkf.plots._axes import (
     TRUTH,
     UNSEEN,
     axes_for,
+    label_below,
     labels_for,
     legend_above,
     one_each,
@@ -33,9 +34,10 @@ __all__ = ["plot_bands"]
 
 
 def plot_bands(
-    belief: TensorDictBase | Tensor,
+    run: TensorDictBase | Tensor,
     truth: Truth = None,
     *,
+    belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
@@ -52,9 +54,10 @@ def plot_bands(
     """Draws components over time: the belief's mean and band, the truth, readings, and where none was observed.
 
     Args:
-        belief: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` and ``("belief", "var")`` or
+        run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` and ``("belief", "var")`` or
             ``("belief", "ensemble")`` ``[T, E, S]``; or means ``[T, S]``, which have no band.
         truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
+        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote: each state's in the state's step.
         dims: components to draw, an Axes each; all by default.
         names: a label with its unit for each of them, such as ``"v, m/s"``.
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
@@ -90,9 +93,10 @@ def plot_bands(
         >>> [round(float(edge), 2) for edge in axes.collections[0].get_datalim(axes.transData).intervaly]
         [-3.29, 3.29]
     """
-    read = read_belief(belief, truth, None if isinstance(observed, Mapping) else observed, one_sequence=True)
+    seen = None if isinstance(observed, Mapping) else observed
+    read = read_belief(run, truth, seen, belief=belief, one_sequence=True)
     chosen = dims_of(read, dims)
-    masks = _masks(belief, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
+    masks = _masks(run, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
     labels, scales = labels_for(names, chosen), one_each("factors", factors, [1.0] * len(chosen))
     seconds = times_of(time, len(read.mean))
@@ -105,19 +109,14 @@ def plot_bands(
         stray = sorted(set(given) - set(chosen))
         if stray:
             raise ValueError(f"{what} of {stray} belong to no drawn component; dims are {chosen}")
-    within = f"{100 * level:g} % of the belief"
+    within = f"{100 * level:g} % of the {read.name}"
     for column, (axes, dim, label, scale) in enumerate(zip(panels, chosen, labels, scales, strict=True)):
         seen = masks.get(dim)
         if seen is not None:
             _shade(axes, bounds, _outages(seen, seconds, gap))
         if lower is not None and upper is not None:
             edges = (scale * lower[:, column].numpy(), scale * upper[:, column].numpy())
-            style: dict[str, Any] = {
-                "color": BELIEF,
-                "alpha": 0.3,
-                "linewidth": 0,
-                "label": within,
-            }
+            style: dict[str, Any] = {"color": BELIEF, "alpha": 0.3, "linewidth": 0, "label": within}
             axes.fill_between(seconds, *edges, **style)
         if readings is not None and dim in readings:
             values = number(readings[dim]).reshape(-1, 1)
@@ -131,10 +130,10 @@ def plot_bands(
             axes.plot(seconds[shown.numpy()], dots, ".", color=READING, markersize=3.5, label="readings")
         if true is not None:
             axes.plot(seconds, scale * true[:, column].numpy(), color=TRUTH, linewidth=1.2, label="truth")
-        axes.plot(seconds, scale * mean[:, column].numpy(), color=BELIEF, linewidth=1.4, label="belief")
+        axes.plot(seconds, scale * mean[:, column].numpy(), color=BELIEF, linewidth=1.4, label=read.name)
         axes.set_ylabel(label)
         axes.set_xlim(bounds[0], bounds[-1])
-    panels[-1].set_xlabel("step" if time is None else "time, s")
+    label_below(panels, "step" if time is None else "time, s")
     if legend:
         legend_above(*panels)
     return panels
@@ -145,9 +144,9 @@ def _seen(read: Belief) -> Tensor | None:
     return None if read.observed is None else read.observed.any(-1)
 
 
-def _masks(belief: TensorDictBase | Tensor, observed: Mapping[int, Truth]) -> dict[int, Tensor | None]:
+def _masks(run: TensorDictBase | Tensor, observed: Mapping[int, Truth]) -> dict[int, Tensor | None]:
     """The steps at which each component's sensor observed, ``[T]``."""
-    return {dim: _seen(read_belief(belief, None, mask, one_sequence=True)) for dim, mask in observed.items()}
+    return {dim: _seen(read_belief(run, None, mask, one_sequence=True)) for dim, mask in observed.items()}
 
 
 def _edges(
@@ -178,7 +177,9 @@ def _edges(
 
 
 def _unwrap(angle: Tensor) -> Tensor:
-    return torch.cat([angle[:1], angle[0] + wrap_angle(angle.diff()).cumsum(0)])
+    out, known = angle.clone(), angle[angle.isfinite()]
+    out[angle.isfinite()] = torch.cat([known[:1], known[:1] + wrap_angle(known.diff()).cumsum(0)])
+    return out
 
 
 def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.metrics import pit
 from torch_denkf.metrics.calibration import histogram_band, rank_histogram
-from torch_denkf.plots._axes import FILL, TRUTH, axes_for, labels_for, legend_above
+from torch_denkf.plots._axes import FILL, TRUTH, axes_for, label_below, labels_for, legend_above
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
 
 if TYPE_CHECKING:
@@ -22,9 +22,10 @@ __all__ = ["plot_calibration"]
 
 
 def plot_calibration(
-    belief: TensorDictBase,
+    run: TensorDictBase,
     truth: Truth = None,
     *,
+    belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     kind: Literal["auto", "pit", "rank"] = "auto",
@@ -41,13 +42,15 @@ def plot_calibration(
     The bars of a calibrated filter all end in the grey band with probability ``level``, if the states are independent.
 
     Args:
-        belief: roll-outs or sequences ``[*B]``, time last, with ``("belief", "mean")`` ``[*B, S]`` and
+        run: roll-outs or sequences ``[*B]``, time last, with ``("belief", "mean")`` ``[*B, S]`` and
             ``("belief", "var")``, or ``("belief", "ensemble")`` ``[*B, E, S]``.
         truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
+        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
         dims: components to draw, an Axes each; all by default.
         names: a label for each of them.
-        kind: ``"rank"`` or ``"pit"``; ``"auto"`` takes ranks where there is an ensemble whose members have equal
-            weights. Particles are taken as a Gaussian of their mean and variance.
+        kind: ``"rank"`` or ``"pit"``; ``"auto"`` takes ranks where there is an ensemble. Particles count with their
+            weights, ``("belief", "log_weight")`` ``[*B, E]``; where a few have nearly all the weight, the outer bars
+            are a little higher.
         bins: of the histogram. An ensemble's E+1 ranks are laid on them in equal parts.
         every: use every n-th step of time. Errors of successive steps are alike, which moves bars out of the band.
         level: probability of the band, for all bars of an Axes together.
@@ -73,43 +76,41 @@ def plot_calibration(
         >>> [round(float(bar.get_height()), 1) for bar in axes.containers[0]]
         [10.2, 10.2, 10.8, 9.7, 10.2, 10.2, 11.4, 9.2, 8.8, 9.3]
     """
-    read = read_belief(belief, truth)
+    read = read_belief(run, truth, belief=belief)
     chosen = dims_of(read, dims)
     if every < 1 or bins < 2:
         raise ValueError(f"every must be at least 1 and bins at least 2; got {every} and {bins}")
-    ranks = kind == "rank" or (kind == "auto" and read.ensemble_size is not None)
+    ranks = kind == "rank" or (kind == "auto" and read.ensemble is not None)
     if kind not in ("auto", "pit", "rank"):
         raise ValueError(f'kind must be "auto", "pit" or "rank"; got {kind!r}')
-    if ranks and read.ensemble_size is None:
-        raise ValueError('kind="rank" needs ("belief", "ensemble") of equal weights; pass kind="pit"')
-    true = with_truth(read, chosen)
+    if ranks and read.ensemble is None:
+        raise ValueError('kind="rank" needs ("belief", "ensemble"); pass kind="pit"')
     turns = turns_of(read, chosen, angles)
-    time = slice(None, None, every)
-    true = true[..., time, :]
+    rows = torch.zeros_like(read.known)
+    rows[..., ::every] = read.known[..., ::every]
+    true = with_truth(read, chosen)[rows]
     if ranks:
         assert read.ensemble is not None
-        counts = _rebin(rank_histogram(read.ensemble[..., time, :, chosen], true, angles=turns), bins)
+        weight = None if read.log_weight is None else read.log_weight[rows]
+        counts = _rebin(rank_histogram(read.ensemble[rows][..., chosen], true, log_weight=weight, angles=turns), bins)
     elif read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
     else:
         if bool(true.isnan().any()):
             raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
-        values = pit(read.mean[..., time, chosen], read.var[..., time, chosen], true, angles=turns).flatten(0, -2)
+        values = pit(read.mean[rows][:, chosen], read.var[rows][:, chosen], true, angles=turns)
         counts = torch.stack([torch.histc(column, bins, 0, 1) for column in values.unbind(-1)])
-    samples = true[..., 0].numel()
+    samples = len(true)
     low, high = (100 * count / samples for count in histogram_band(samples, bins, level=level))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2.4 * len(chosen)), share=True)
     for axes, label, heights in zip(panels, labels_for(names, chosen), counts, strict=True):
         shares, what = 100 * heights.numpy() / samples, "ranks" if ranks else "PIT values"
         axes.bar(np.arange(bins) / bins, shares, 1 / bins, align="edge", color=FILL, edgecolor="white", label=what)
         axes.axhline(100 / bins, color=TRUTH, linewidth=1, linestyle=":", label="uniform")
-        band = f"a calibrated filter's bars end here ({100 * level:g} %)"
+        band = f"calibrated bars end here ({100 * level:g} %)"
         axes.axhspan(low, high, facecolor=(0, 0, 0, 0.12), edgecolor="0.3", linewidth=1, label=band, gid="band")
         axes.set(ylabel=f"{label}\nshare of steps, %", xlim=(0, 1), ylim=(0, 1.1 * max(shares.max(), high)))
-    where = (
-        "rank of the truth among the members, 0 to 1" if ranks else "probability that the belief puts below the truth"
-    )
-    panels[-1].set_xlabel(where)
+    label_below(panels, "rank of the truth, 0 to 1" if ranks else "probability below the truth")
     if legend:
         legend_above(*panels)
     return panels

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.plots._axes import BELIEF, DASHES, OTHERS, READING, TRUTH, axes_for, legend_above, new_figure
@@ -23,9 +23,10 @@ MEMBERS, ELLIPSES = 32, 12  # that are drawn: the first ones; evenly over time
 
 
 def plot_path(
-    belief: TensorDictBase | Tensor,
+    run: TensorDictBase | Tensor,
     truth: Truth = None,
     *,
+    belief: NestedKey = "belief",
     others: Mapping[str, Tensor] | None = None,
     readings: Tensor | None = None,
     dims: Sequence[int] = (0, 1),
@@ -39,9 +40,10 @@ def plot_path(
     """Draws the believed path with its spread, the true one and others, with one scale for both axes.
 
     Args:
-        belief: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` or ``("belief", "ensemble")``
+        run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` or ``("belief", "ensemble")``
             ``[T, E, S]``; or means ``[T, S]``.
         truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
+        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
         others: further paths by name, states ``[T', S']`` such as dead reckoning.
         readings: of the drawn dimensions ``[T', 2]``, in the state's units, as dots; rows that are not finite are left
             out, so hide what was not observed with NaN.
@@ -71,7 +73,7 @@ def plot_path(
         >>> [line.get_label() for line in axes.get_lines()]
         ['truth', 'belief']
     """
-    read = read_belief(belief, truth, one_sequence=True)
+    read = read_belief(run, truth, belief=belief, one_sequence=True)
     chosen = dims_of(read, dims)
     if len(chosen) not in (2, 3) or (forward_up and len(chosen) == 3):
         raise ValueError(f"dims must name two dimensions, or three in space without forward_up; got {list(dims)}")
@@ -100,7 +102,7 @@ def plot_path(
             raise ValueError(f"readings must be [T, {len(chosen)}], a column for each of dims; got {list(dots.shape)}")
         shown = place(dots[dots.isfinite().all(-1)], range(len(chosen)))
         axes.plot(*shown, ".", color=READING, markersize=3.5, label="readings", zorder=2.25)
-    axes.plot(*place(read.mean), color=BELIEF, linewidth=1.4, label="belief", zorder=2.3)
+    axes.plot(*place(read.mean), color=BELIEF, linewidth=1.4, label=read.name, gid="belief", zorder=2.3)
     if kind == "ellipses":
         _draw_ellipses(axes, read, chosen, forward_up, level)
     names = ["right", "forward"] if forward_up else [_name(dim) for dim in chosen]
@@ -153,14 +155,16 @@ def _draw_ellipses(axes: Axes, read: Belief, dims: list[int], forward_up: bool, 
     turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]] if forward_up else [[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
     mean = read.mean[:, dims] @ turn.T
     reach = math.sqrt(-2 * math.log1p(-level))
-    for first, step in enumerate(np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).round().astype(int)).tolist()):
+    steps = read.known.nonzero().flatten().numpy()
+    evenly = np.unique(np.linspace(0, len(steps) - 1, ELLIPSES).round().astype(int))
+    for first, step in enumerate(steps[evenly].tolist()):
         squares, directions = np.linalg.eigh((turn @ covariance_at(read, step, dims) @ turn.T).numpy())
         small, large = 2 * reach * np.sqrt(squares.clip(0))
         angle = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
         style: dict[str, Any] = {"facecolor": BELIEF, "edgecolor": BELIEF, "alpha": 0.3, "zorder": 1.5}
         centre = (float(mean[step, 0]), float(mean[step, 1]))
         patch = Ellipse(centre, large, small, angle=angle, gid=f"step {step}", **style)
-        patch.set_label(None if first else f"{100 * level:g} % of the belief")
+        patch.set_label(None if first else f"{100 * level:g} % of the {read.name}")
         axes.add_patch(patch)
 
 

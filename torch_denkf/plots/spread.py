@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 
 from torch_denkf.metrics.calibration import spread_error
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
@@ -18,9 +18,10 @@ __all__ = ["plot_spread_error"]
 
 
 def plot_spread_error(
-    belief: TensorDictBase,
+    run: TensorDictBase,
     truth: Truth = None,
     *,
+    belief: NestedKey = "belief",
     dims: Sequence[int] | None = None,
     names: Sequence[str] | None = None,
     factors: Sequence[float] | None = None,
@@ -34,9 +35,10 @@ def plot_spread_error(
     On the diagonal the filter knows how wrong it is; above it, it trusts itself too much.
 
     Args:
-        belief: roll-outs or sequences ``[*B]`` with ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "var")`` or
+        run: roll-outs or sequences ``[*B]`` with ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "var")`` or
             ``("belief", "ensemble")`` ``[*B, E, S]``. The spread of E members is scaled with sqrt((E+1)/E).
         truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
+        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
         dims: components to draw, a line each; all by default. They should have a similar size.
         names: a label with its unit for each of them, such as ``"v, m/s"``.
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
@@ -63,15 +65,15 @@ def plot_spread_error(
         >>> [line.get_label() for line in axes.get_lines()]
         ['x, m', 'spread = error']
     """
-    read = read_belief(belief, truth)
+    read = read_belief(run, truth, belief=belief)
     chosen = dims_of(read, dims)
     if read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
     turns = turns_of(read, chosen, angles)
     points = spread_error(
-        read.mean[..., chosen],
-        read.var[..., chosen],
-        with_truth(read, chosen),
+        read.mean[read.known][:, chosen],
+        read.var[read.known][:, chosen],
+        with_truth(read, chosen)[read.known],
         bins=bins,
         ensemble_size=read.ensemble_size,
         angles=turns,
@@ -86,8 +88,8 @@ def plot_spread_error(
         highest = max(highest, spread.max(), error.max())
     limits = (0.0, highest * 1.05)
     axes.plot(limits, limits, ":", color=TRUTH, label="spread = error")
-    units = {label.rpartition(", ")[2] for label in labels if ", " in label}
-    unit = f", {units.pop()}" if len(units) == 1 else ""
+    units = dict.fromkeys(label.rpartition(", ")[2] for label in labels if ", " in label)
+    unit = f", {' or '.join(units)}" if units else ""
     axes.set(xlabel=f"predicted spread{unit}", ylabel=f"RMS error{unit}", xlim=limits, ylim=limits)
     axes.set_aspect("equal", adjustable="box")
     if legend:

@@ -59,13 +59,15 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
 
 def belief_video(
     file: str | Path,
-    belief: TensorDictBase | Tensor,
+    run: TensorDictBase | Tensor,
     pixels: Tensor | np.ndarray | NestedKey | None = None,
     *,
+    belief: NestedKey = "belief",
     truth: Truth = None,
     observed: Truth = None,
     time: float | Tensor | None = None,
     path: Mapping[str, Any] | None = None,
+    on_picture: bool = False,
     bands: Mapping[str, Any] | None = None,
     title: str | None = None,
     fps: float | None = None,
@@ -79,14 +81,17 @@ def belief_video(
 
     Args:
         file: ``.mp4`` or ``.gif``, see :func:`write_video`.
-        belief: a roll-out or sequence of T steps, see :func:`plot_path` and :func:`plot_bands`.
+        run: a roll-out or sequence of T steps, see :func:`plot_path` and :func:`plot_bands`.
         pixels: pictures ``[T, C, H, W]`` or ``[T, H, W, C]``, or their key; by default ``"pixels"`` of the roll-out
             where it is there. One channel is grey, three are colours. Of more, as of a frame with its difference to the
             one before, the first three are drawn, of two the first.
+        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
         truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
         observed: ``[T, 1]`` bool, or its key; by default ``"observed"`` of the roll-out where it is there.
         time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
         path: keywords of :func:`plot_path` for two dims, such as ``{"forward_up": True}``; ``None`` leaves it out.
+        on_picture: whether to draw the path on the camera's picture; ``path`` may be left out. Its dims are then in
+            pixels from the middle of the upper left one: the column to the right, then the row downwards.
         bands: keywords of :func:`plot_bands`, such as ``{"dims": [3, 4]}``; ``None`` leaves them out.
         title: headline.
         fps: frames a second; by default those of the sequence's own speed, 10 where ``time`` is not given.
@@ -106,21 +111,28 @@ def belief_video(
         >>> import tempfile
         >>> walk = torch.randn(4, 2).cumsum(0)
         >>> file = belief_video(f"{tempfile.mkdtemp()}/walk.gif", walk, path={}, bands={}, size=(3, 2))
+        >>> pixels = torch.zeros(4, 3, 8, 8)
+        >>> file = belief_video(f"{tempfile.mkdtemp()}/seen.gif", walk + 4, pixels, on_picture=True, size=(3, 3))
     """
-    read = read_belief(belief, truth, observed, one_sequence=True)
-    pictures = entry_of(belief, pixels, "pixels")
+    read = read_belief(run, truth, observed, belief=belief, one_sequence=True)
+    pictures = entry_of(run, pixels, "pixels")
     if pictures is not None and len(pictures) != len(read.mean):
         raise ValueError(f"pixels must have a picture a step, {len(read.mean)}; got {len(pictures)}")
     if every < 1:
         raise ValueError(f"every counts steps and must be at least 1; got {every}")
+    if on_picture:
+        path = path or {}
+        if pictures is None or path.get("forward_up") or len(path.get("dims", (0, 1))) != 2:
+            raise ValueError("on_picture needs pixels, and a path of two dims without forward_up")
     if pictures is None and path is None and bands is None:
         raise ValueError("nothing to draw: pass pixels, path={} or bands={}")
-    scene = Scene(size, dpi, title, pictures, path is not None, _panel_count(bands, read.mean.shape[-1]))
+    panels = _panel_count(bands, read.mean.shape[-1])
+    scene = Scene(size, dpi, title, pictures, path is not None, panels, on_picture=on_picture)
     if path is not None:
-        plot_path(belief, truth, ax=scene.path, **path)
+        plot_path(run, truth, belief=belief, ax=scene.path, **path)
     if bands is not None:
         given = {"observed": observed, "time": time, "ax": scene.bands, **bands}
-        plot_bands(belief, truth, **given)
+        plot_bands(run, truth, belief=belief, **given)
     scene.freeze(None if read.observed is None else read.observed.any(-1), times_of(time, len(read.mean)))
     frames = (scene.frame(step) for step in range(0, len(read.mean), every))
     return write_video(file, frames, _own_speed(time, every) if fps is None else fps)
