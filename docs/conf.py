@@ -24,7 +24,7 @@ extensions = [
 ]
 exclude_patterns = ["_build", "_ext", "tutorials", "gallery/*.ipynb", "gallery/*.py*", "gallery/*.zip"]
 
-myst_enable_extensions = ["amsmath", "dollarmath", "colon_fence"]
+myst_enable_extensions = ["amsmath", "dollarmath", "colon_fence", "html_image"]
 myst_heading_anchors = 3
 
 autodoc_inherit_docstrings = False  # torchrl's docstrings are torchrl's to show
