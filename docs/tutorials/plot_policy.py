@@ -188,8 +188,8 @@ plt.show()
 # From here
 # ---------
 # * Policies that draw their actions, as those of SAC and PPO do, are
-#   ``ProbabilisticTensorDictSequential(filter, *actor)``. What torchrl's losses then need, and a program with SAC:
-#   :doc:`/start/three_ways`.
+#   ``ProbabilisticTensorDictSequential(filter, *actor)``. What torchrl's losses then need, and programs with PPO, SAC
+#   and DDPG: :doc:`/how_to/policies`.
 # * Put a filter that is trained already into the environment. Put it into the policy where it is to learn from the
 #   reward. The same filter belongs into one of both places.
 # * The true motion, learned from recordings: :doc:`plot_training`.
