@@ -138,13 +138,15 @@ def export_step(
     in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)
-    signature = {
-        "inputs": [
-            (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)
-        ],
-        "outputs": [_name(key) for key in out_keys],
-        "carry": [_name(key) for key in structure.carry],
-    }
+    inputs, outputs = [_name(key) for key in in_keys], [_name(key) for key in out_keys]
+    kinds = [(list(value.shape), str(value.dtype)) for value in values]
+    signature = json.dumps(
+        {
+            "inputs": [(name, *kind) for name, kind in zip(inputs, kinds, strict=True)],
+            "outputs": outputs,
+            "carry": [_name(key) for key in structure.carry],
+        }
+    )
     was_training = filter.training
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
     package = io.BytesIO()  # torch's own writer ends the process where the disk is full
@@ -152,11 +154,10 @@ def export_step(
         with torch.no_grad():
             program = trace_below_autograd(step, values)
             if format == "onnx":
-                inputs = [name for name, *_ in signature["inputs"]]
-                package.write(onnx_model(program, inputs, signature["outputs"], json.dumps(signature)))
+                package.write(onnx_model(program, inputs, outputs, signature))
                 run, what, maker, instead = run_onnx(package.getvalue())[0], "ONNX model", _ONNX, 'format="pt2"'
             else:
-                _write(program, package, json.dumps(signature), compiled)
+                _write(program, package, signature, compiled)
                 run, what, maker = _run(package, compiled), "compiled package", "torch's compiler"
                 instead = "the graph, compiled=False, which is slower" if compiled else ""
             refuse_other_numbers(

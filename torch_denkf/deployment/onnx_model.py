@@ -73,10 +73,12 @@ def onnx_model(
         raise RuntimeError(_refusal(error)) from error
     assert written is not None  # where dynamo=True
     model = written.model
-    # Names of files and lines, six times as large as all else.
     graph = model.graph
-    for part in (graph, *graph.all_nodes(), *graph.inputs, *graph.outputs, *graph.initializers.values()):
-        part.metadata_props.clear()
+    graph.metadata_props.clear()
+    for node in graph.all_nodes():  # names of files and lines, six times as large as all else
+        node.metadata_props.clear()
+    for value in (*graph.inputs, *graph.outputs, *graph.initializers.values()):
+        value.metadata_props.clear()
     model.metadata_props[SIGNATURE] = signature
     return written.model_proto.SerializeToString()
 
