@@ -56,6 +56,8 @@ setup(
         # torch_denkf.plots, and the GIF files of its videos.
         "plots": ["matplotlib", "pillow"],
         "examples": ["matplotlib", "tensorboard"],
+        # Steps as ONNX models, export_step(format="onnx"): 150 MB. Their user needs onnxruntime and numpy alone.
+        "onnx": ["onnx>=1.23", "onnxscript>=0.7.2", "onnxruntime>=1.32"],
         # Collection over machines, torchrl's RayCollector, in examples/many_machines.py alone: 75 MB.
         "ray": ["ray>=2.40"],
         # The peers of `make bench`, in the versions that benchmarks/speed/results/speed.md was made with.
@@ -80,6 +82,9 @@ setup(
             "evo",
             "pyarrow>=15",
             "av>=14",
+            "onnx>=1.23",
+            "onnxscript>=0.7.2",
+            "onnxruntime>=1.32",
             "hypothesis",
             "pytest",
             "pytest-xdist",

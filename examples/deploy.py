@@ -1,6 +1,7 @@
 """A filter's step on a robot: exported into one file, loaded without the training code, run at 1 kHz and timed.
 
     python examples/deploy.py
+    python examples/deploy.py --onnx    # an ONNX model, which onnxruntime runs, from C++ as well
 
 The filter tells the angles and the speeds of two joints from their encoders (12 bits a turn, and noise); differences of
 such encoders over a millisecond are useless. First this process exports the step. Then another process, which imports
@@ -28,24 +29,35 @@ TRUTH = (1.2, 2.0), (1.1, 0.6), (0.0, 1.0)  # amplitude in rad, frequency in Hz,
 
 
 class Coasting(nn.Module):
-    """Changes of [angle, speed, acceleration] of two joints in a millisecond, whose accelerations walk at random."""
+    """Changes of [angle, speed, acceleration] of two joints in a millisecond."""
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """From and to ``[*, E, 6]``: angles, speeds, accelerations."""
         speed, acceleration = state[..., 2:4], state[..., 4:]
-        walk = JERK * math.sqrt(DT) * 0.03 * torch.randn_like(acceleration)
-        return torch.cat([DT * speed + DT**2 / 2 * acceleration, DT * acceleration, walk], -1)
+        still = torch.zeros_like(acceleration)
+        return torch.cat([DT * speed + DT**2 / 2 * acceleration, DT * acceleration, still], -1)
 
 
 def export(path: Path, compiled: bool) -> float:
-    """Writes the package; returns the milliseconds that the same step takes here, eagerly."""
+    """Writes the file; returns the milliseconds that the same step takes here, eagerly."""
     from tensordict import TensorDict
 
     from torch_denkf import DEnKF, export_step
-    from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, LearnedTransition, Select
+    from torch_denkf.modules import (
+        AroundState,
+        ConstantNoise,
+        EnsembleAnalysis,
+        LearnedTransition,
+        NoisyTransition,
+        Select,
+    )
 
+    # The accelerations walk at random.
+    walk = ConstantNoise(
+        [0.03 * JERK * math.sqrt(DT)] * 2, in_key=("belief", "ensemble"), out_key=("forecast", "noise")
+    )
     filter = DEnKF(
-        LearnedTransition(Coasting()),
+        NoisyTransition(LearnedTransition(Coasting()), walk, dims=[4, 5]),
         None,
         Select([0, 1]),
         ConstantNoise([math.hypot(NOISE, COUNT / math.sqrt(12))] * 2, in_key="encoder"),
@@ -53,7 +65,7 @@ def export(path: Path, compiled: bool) -> float:
         initial=AroundState([0.01, 0.01, 5.0, 5.0, 50.0, 50.0], ensemble_size=MEMBERS),
     )
     example = filter.initialise(TensorDict({"encoder": torch.zeros(2), "state": torch.zeros(6)}))
-    export_step(filter, example, path, compiled=compiled)
+    export_step(filter, example, path, compiled=compiled, format="onnx" if path.suffix == ".onnx" else "pt2")
     seconds = []
     with torch.no_grad():
         for _ in range(300):
@@ -71,6 +83,11 @@ def joints(now: float) -> tuple[torch.Tensor, torch.Tensor]:
     return amplitude * angle.sin(), amplitude * rate * angle.cos()
 
 
+def draw(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+    """Standard normal numbers."""
+    return {name: torch.randn(shape) for name, shape in shapes.items()}
+
+
 def run(path: Path, seconds: float) -> None:
     """What runs on the robot: a step every millisecond, as far as this computer keeps time."""
     torch.set_num_threads(1)
@@ -80,15 +97,17 @@ def run(path: Path, seconds: float) -> None:
     readings = [((angle + NOISE * torch.randn(2)) / COUNT).round() * COUNT for angle, _ in frames]
     spread = torch.tensor([0.01, 0.01, 5.0, 5.0, 50.0, 50.0])
     state = {"belief.ensemble": torch.cat([readings[0], torch.zeros(4)]) + spread * torch.randn(MEMBERS, 6)}
+    # An ONNX model draws nothing itself.
+    noises = {name: shape for name, (shape, _) in step.inputs.items() if name.startswith("noise.")}
     means, latencies, late = [], [], 0
     with torch.inference_mode():
         for _ in range(50):  # the first calls fill caches
-            step({**state, "encoder": readings[0]})
+            step({**state, **draw(noises), "encoder": readings[0]})
         tick = time.perf_counter()
         for reading in readings:
             while (begun := time.perf_counter()) < tick:
                 pass
-            out = step({**state, "encoder": reading})
+            out = step({**state, **draw(noises), "encoder": reading})
             state = {name: out[name] for name in step.carry}
             means.append(out["belief.mean"])
             done = time.perf_counter()
@@ -118,10 +137,11 @@ def run(path: Path, seconds: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="where to leave the package (.pt2); a temporary folder by default")
+    parser.add_argument("--out", type=Path, help="where to leave the file; a temporary folder by default")
+    parser.add_argument("--onnx", action="store_true", help="write an ONNX model; needs torch_denkf[onnx]")
     parser.add_argument("--seconds", type=float, default=5.0, help="to run at 1 kHz")
     parser.add_argument("--not-compiled", action="store_true", help="write the graph alone: needs no C++ compiler")
-    parser.add_argument("--run", type=Path, metavar="PACKAGE", help="only run a package that was exported before")
+    parser.add_argument("--run", type=Path, metavar="FILE", help="only run a file that was exported before")
     parser.add_argument("--smoke", action="store_true", help="a short run of everything, not compiled")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -129,9 +149,10 @@ def main() -> None:
         run(args.run, args.seconds)
         return
     with tempfile.TemporaryDirectory() as folder:
-        path, begun = args.out or Path(folder) / "step.pt2", time.perf_counter()
+        path = args.out or Path(folder) / ("step.onnx" if args.onnx else "step.pt2")
+        begun = time.perf_counter()
         eager = export(path, compiled=not (args.smoke or args.not_compiled))
-        print(f"exported {path.name} in {time.perf_counter() - begun:.0f} s, {path.stat().st_size / 1e6:.1f} MB")
+        print(f"exported {path.name} in {time.perf_counter() - begun:.0f} s, {path.stat().st_size / 1e3:.0f} kB")
         print(f"the same step, eager, in this process: p50 {eager:.3f} ms")
         seconds = 0.2 if args.smoke else args.seconds
         subprocess.run([sys.executable, __file__, "--run", str(path), "--seconds", str(seconds)], check=True)

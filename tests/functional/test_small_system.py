@@ -7,6 +7,7 @@ from torch_denkf.functional import kalman_update
 from torch_denkf.functional._small_system import (
     LARGEST,
     LARGEST_FACTOR,
+    cholesky_solve_written_out,
     cholesky_written_out,
     gain_written_out,
     solve_written_out,
@@ -56,6 +57,15 @@ def test_the_factor_and_its_gradient_are_those_of_linalg(float64, size):
     seed = torch.randn_like(ours).tril()
     gradients = [torch.autograd.grad(value, matrix, seed)[0] for value in (ours, theirs)]
     torch.testing.assert_close(*(x + x.mT for x in gradients), rtol=1e-10, atol=1e-10)  # see above
+
+
+@pytest.mark.parametrize("size", range(1, LARGEST_FACTOR + 1))
+def test_the_solution_by_a_factor_is_that_of_linalg(float64, size):
+    gram, right, *_ = systems(size)
+    matrix = gram + torch.eye(size)
+    expected = torch.linalg.solve(matrix, right)
+    torch.testing.assert_close(cholesky_solve_written_out(matrix, right), expected, rtol=1e-11, atol=1e-11)
+    assert cholesky_solve_written_out(-matrix, right).isnan().all()
 
 
 @pytest.mark.parametrize("place", range(3))

@@ -1,4 +1,4 @@
-"""Writing a filter's step into a file: torch.export, then, by default, compiled ahead of time."""
+"""Writing a filter's step into a file: a package of torch, by default compiled ahead of time, or an ONNX model."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal, get_args
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from torch_denkf._files import write_bytes
-from torch_denkf.deployment.package import SIGNATURE
+from torch_denkf.deployment.onnx_model import need_onnx, onnx_model
+from torch_denkf.deployment.package import SIGNATURE, run_onnx
 from torch_denkf.filters import Filter
 from torch_denkf.filters.rejection import REJECTED
 from torch_denkf.inductor import (
@@ -23,6 +25,9 @@ from torch_denkf.inductor import (
     trace_below_autograd,
 )
 from torch_denkf.modules._call import Entries
+
+Format = Literal["pt2", "onnx"]
+_ONNX = "onnxruntime, or of what writes its models"
 
 
 class _FlatStep(nn.Module):
@@ -45,14 +50,21 @@ def export_step(
     *,
     out_keys: Sequence[NestedKey] = (),
     compiled: bool = True,
+    format: Format = "pt2",
 ) -> Path:
-    """Writes one step of a filter as a package with static shapes that loads without torch_denkf's training code.
+    """Writes one step of a filter as a file with static shapes that runs without torch_denkf's training code.
 
-    A package holds native code, or a graph that torch unpickles: who loads it runs it. Hand it on, and take it, as you
-    would a program.
+    The file is a package of torch, or an `ONNX <https://onnx.ai>`_ model. onnxruntime runs such a model without torch,
+    from Python, C++, C# or Java. A package holds native code, or a graph that torch unpickles: who loads it runs it.
+    Hand it on, and take it, as you would a program. An ONNX model is data.
 
-    Everything random is drawn inside, from torch's generator, unless ``example`` holds the noise (see
-    :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs.
+    A package draws everything random inside, from torch's generator, unless ``example`` holds the noise (see
+    :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs. In
+    an ONNX model noise is always an input. Its names begin with ``noise.``. Real numbers are standard normal, but for
+    ``uniform`` of a particle filter, which lies between 0 and 1; bytes are uniform, and booleans are fair coins.
+
+    ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
+    6 x 6. What remains is refused by the name of its operator.
 
     A package cannot raise. That of a filter with ``reject=True`` counts readings that are not finite as missing, and
     returns their number, ``"info.rejected"``; that of another one has a belief of NaN from then on.
@@ -65,18 +77,22 @@ def export_step(
         filter: trained; its device is the package's.
         example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
             ``[*B]`` with the shapes and dtypes of the real ones. Where the belief is missing, it is initialised.
-        path: ends in ``.pt2``.
+        path: ends in ``.pt2``, or, for an ONNX model, in ``.onnx``.
         out_keys: what to return beside the belief, e.g. ``("info", "nis")``.
         compiled: compile ahead of time (AOTInductor; needs a C++ compiler here and the same kind of processor there).
-            Otherwise the graph is written, which torch runs on any machine, slower.
+            Otherwise the graph is written, which torch runs on any machine, slower. An ONNX model is such a graph.
+        format: ``"pt2"`` for a package, ``"onnx"`` for an ONNX model.
 
     Returns:
         ``path``; :func:`torch_denkf.deployment.load_step` reads it.
 
     Raises:
         KeyError: if an entry that the step reads is missing.
-        ValueError: if the path does not end in ``.pt2``, or the filter does not write one of ``out_keys``.
-        RuntimeError: if there is no C++ compiler, this torch cannot trace the step, or the package is wrong.
+        ValueError: if there is no such format, the path does not end in it, or the filter does not write one of
+            ``out_keys``.
+        ImportError: for an ONNX model without onnx, onnxscript or onnxruntime; names the extra.
+        RuntimeError: if there is no C++ compiler, this torch cannot trace the step, ONNX lacks one of its operators, or
+            the file is wrong.
         OSError: if it cannot be written, as on a full disk; names the file and the free space.
 
     Example:
@@ -99,9 +115,13 @@ def export_step(
     if not isinstance(example, TensorDictBase):
         raise TypeError(f"example must be a tensordict of one step; got {type(example).__name__}")
     path = Path(path)
-    if path.suffix != ".pt2":
-        raise ValueError(f"a package ends in .pt2, got {path}")
-    if compiled:
+    if format not in get_args(Format):
+        raise ValueError(f'format is "pt2" or "onnx"; got {format!r}')
+    if path.suffix != f".{format}":
+        raise ValueError(f"the path of a step in the format {format!r} ends in .{format}, got {path}")
+    if format == "onnx":
+        need_onnx()
+    elif compiled:
         need_compiler()
     if any(example.get(key, None) is None for key in filter.carry_keys):
         example = filter.initialise(example.copy())
@@ -113,33 +133,44 @@ def export_step(
     if unknown:
         raise ValueError(f"the filter does not write {unknown}; it writes {list(inner)}")
     entries = filter.entries_of(example, one_step=True)
+    if format == "onnx":
+        entries |= filter.missing_noise(entries, example.batch_size, structure.modules)[0]
     in_keys = _inputs(filter, entries, example)
     # Not parts of one another, whose strides the graph would hold.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)
-    signature = {
-        "inputs": [
-            (_name(key), list(value.shape), str(value.dtype)) for key, value in zip(in_keys, values, strict=True)
-        ],
-        "outputs": [_name(key) for key in out_keys],
-        "carry": [_name(key) for key in structure.carry],
-    }
+    inputs, outputs = [_name(key) for key in in_keys], [_name(key) for key in out_keys]
+    kinds = [(list(value.shape), str(value.dtype)) for value in values]
+    signature = json.dumps(
+        {
+            "inputs": [(name, *kind) for name, kind in zip(inputs, kinds, strict=True)],
+            "outputs": outputs,
+            "carry": [_name(key) for key in structure.carry],
+        }
+    )
     was_training = filter.training
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
     package = io.BytesIO()  # torch's own writer ends the process where the disk is full
     try:
         with torch.no_grad():
             program = trace_below_autograd(step, values)
-            _write(program, package, json.dumps(signature), compiled)
+            if format == "onnx":
+                package.write(onnx_model(program, inputs, outputs, signature))
+                run, what, maker, instead = run_onnx(package.getvalue())[0], "ONNX model", _ONNX, 'format="pt2"'
+            else:
+                _write(program, package, signature, compiled)
+                run, what, maker = _run(package, compiled), "compiled package", "torch's compiler"
+                instead = "the graph, compiled=False, which is slower" if compiled else ""
             refuse_other_numbers(
-                _run(package, compiled),
+                run,
                 step,
                 values,
                 names=in_keys,
                 outputs=out_keys,
                 frames=[key for key in in_keys if key not in filter.belief_keys and key[0] != "noise"],
-                what="package",
+                what=what,
+                maker=maker,
                 cure="No file is written. "
-                + ("Write the graph, compiled=False, which is slower; and p" if compiled else "P")
+                + (f"Write {instead}; and p" if instead else "P")
                 + "lease report the filter.",
             )
     finally:

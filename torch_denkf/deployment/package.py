@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 SIGNATURE = "torch_denkf"  # name of the description inside a package
+NEEDS_ONNX = 'ONNX models need the extra "onnx": pip install "torch_denkf[onnx]"'
 _MOST_UNPACKED = 50  # times its size, that a package may be; torch does not compress, and text shrinks to a tenth
 
 
@@ -75,20 +76,29 @@ def load_step(path: str | Path) -> PackagedStep:
     is not compiled may hold pickles, which run code, too. Load packages alone that you would also execute; nothing in
     the file is checked against malice. Weights that are data only: :func:`torch_denkf.pretrained.save_pretrained`.
 
+    An ONNX model (``.onnx``) holds neither. onnxruntime runs it, on the processor, with as many threads as torch has
+    when the model is loaded.
+
     Args:
-        path: the ``.pt2`` file.
+        path: the ``.pt2`` or ``.onnx`` file.
 
     Raises:
         FileNotFoundError: if there is none.
+        ImportError: for an ONNX model without onnxruntime; names the extra.
         ValueError: if it is not a packaged step, or one that is damaged.
         OSError: if there is no space to unpack it; names the folder and its free space.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file; export_step(filter, example, path) writes it")
-    compiled = _is_compiled(path)
     run: Callable[..., tuple[Tensor, ...]]
-    if compiled:
+    counts = None
+    if path.suffix == ".onnx":
+        try:
+            run, signature = run_onnx(path.read_bytes())
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"{path} is no ONNX model, or it is damaged ({error}); export it again") from error
+    elif _is_compiled(path):
         try:
             run = torch._inductor.aoti_load_package(str(path))
         except RuntimeError as error:
@@ -104,7 +114,6 @@ def load_step(path: str | Path) -> PackagedStep:
                 "some space, or set TMPDIR to another folder"
             ) from error
         signature = run.get_metadata().get(SIGNATURE, "")
-        counts = None
     else:
         files = {SIGNATURE: ""}
         try:
@@ -116,8 +125,35 @@ def load_step(path: str | Path) -> PackagedStep:
         run, signature = program.module(check_guards=False), files[SIGNATURE]
         counts = len(program.graph_signature.user_inputs), len(program.graph_signature.user_outputs)
     if not signature:
-        raise ValueError(f"{path} is a torch package, but not one of export_step: it lacks the entry {SIGNATURE!r}")
+        raise ValueError(f"{path} holds a model, but not one of export_step: it lacks the entry {SIGNATURE!r}")
     return PackagedStep(run, _described(path, signature, counts))
+
+
+def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
+    """What runs an ONNX model, tensors in, tensors out; and its description, empty where it has none.
+
+    Raises:
+        ImportError: without onnxruntime; names the extra.
+        RuntimeError: if it is no such model.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError(NEEDS_ONNX) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 3  # errors
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # a dozen kinds, of no common class
+        raise RuntimeError(" ".join(str(error).split())) from error
+    names = [each.name for each in session.get_inputs()]
+
+    def run(*values: Tensor) -> tuple[Tensor, ...]:
+        arrays = (value.detach().cpu().numpy() for value in values)
+        return tuple(map(torch.as_tensor, session.run(None, dict(zip(names, arrays, strict=True)))))
+
+    return run, session.get_modelmeta().custom_metadata_map.get(SIGNATURE, "")
 
 
 def _is_compiled(path: Path) -> bool:

@@ -123,7 +123,7 @@ class CompiledSteps:
                 # Who records gradients of single steps seldom wants them; a backward pass takes as long to compile.
                 parameters=None if kind[0] == "step" else _parameters(steps),
                 state=[value for _, module in steps.structure.modules for value in module.buffers()],
-                what=kind[0] if kind[0] == "step" else "sequence",
+                what="compiled step" if kind[0] == "step" else "compiled sequence",
                 cure='Use filter.compile(backend="aot_eager"), which leaves the compiler of kernels out, or none, '
                 "filter.compile(chunk=0); and please report the filter.",
             )

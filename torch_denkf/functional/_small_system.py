@@ -81,6 +81,23 @@ def cholesky_written_out(matrix: Tensor) -> Tensor:
     return torch.where((last > 0).unsqueeze(-1), factor, torch.nan)
 
 
+def cholesky_solve_written_out(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve M X = Y with a symmetric M, N x N with N of 1 to 6; NaN where M is not positive definite.
+
+    Args:
+        matrix: M, ``[*B, N, N]``; its lower triangle is read.
+        right: Y, ``[*B, N, K]``.
+
+    Returns:
+        X, ``[*B, N, K]``.
+
+    Examples:
+        >>> cholesky_solve_written_out(torch.tensor([[2.0, 0.0], [1.0, 1.0]]), torch.tensor([[1.0], [0.0]])).mT
+        tensor([[ 1., -1.]])
+    """
+    return torch.stack(_solve(_factor(matrix), _rows(right)), -2)
+
+
 def _rows(matrix: Tensor) -> Sequence[Tensor]:
     return matrix.unbind(-2)
 

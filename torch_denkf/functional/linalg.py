@@ -6,7 +6,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torch_denkf.functional._small_system import LARGEST_FACTOR, cholesky_written_out
+from torch_denkf.functional._small_system import (
+    LARGEST_FACTOR,
+    cholesky_solve_written_out,
+    cholesky_written_out,
+)
 
 
 def cholesky(matrix: Tensor) -> Tensor:
@@ -78,7 +82,10 @@ def semidefinite_solve(cov: Tensor, right: Tensor) -> Tensor:
                 [0.0000]])
     """
     correlation, _, inverse = _correlation(cov)
-    return inverse.unsqueeze(-1) * torch.cholesky_solve(inverse.unsqueeze(-1) * right, cholesky(correlation))
+    scaled = inverse.unsqueeze(-1) * right
+    if torch.compiler.is_compiling() and 0 < cov.shape[-1] <= LARGEST_FACTOR:
+        return inverse.unsqueeze(-1) * cholesky_solve_written_out(correlation, scaled)
+    return inverse.unsqueeze(-1) * torch.cholesky_solve(scaled, cholesky(correlation))
 
 
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:

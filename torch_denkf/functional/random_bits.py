@@ -98,7 +98,7 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
     # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
     # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here
-    return line.mul_(1024).add_(2 * kept - 1024 * round(256 * rate)).clamp_(0, kept).to(dtype)
+    return line.mul_(1024).add_(2 * kept - 1024 * round(256 * rate)).clamp_(0.0, kept).to(dtype)
 
 
 def random_keep_mask(

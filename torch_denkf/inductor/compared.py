@@ -30,6 +30,7 @@ def refuse_other_numbers(
     state: Iterable[Tensor] = (),
     what: str,
     cure: str,
+    maker: str = "torch's compiler",
 ) -> None:
     """Raises unless a compiled function returns what it returns eagerly, up to rounding.
 
@@ -53,8 +54,9 @@ def refuse_other_numbers(
         parameters: by name; if given, the gradient of the outputs, in one direction, by these and by the frames is
             compared, too. Where there is no backward pass yet, one is compiled.
         state: buffers that the function may change, such as running means; they are as they were after each run.
-        what: was compiled, for the message.
+        what: what is compared with the eager code, for the message.
         cure: what to do, for the message.
+        maker: whose error a difference is, for the message.
 
     Raises:
         RuntimeError: if they are farther apart; names the output that is farthest, and by how much.
@@ -96,9 +98,9 @@ def refuse_other_numbers(
             times = [float((far / most.clamp(min=1e-300)).nan_to_num(nan=0.0).max()) for far, most in pairs]
             worst = times.index(max(times))
             raise RuntimeError(
-                f"The compiled {what} is wrong: {labels[worst]} is up to {float(off[worst].max()):.3g} off what the "
+                f"The {what} is wrong: {labels[worst]} is up to {float(off[worst].max()):.3g} off what the "
                 f"same code gives eagerly, up to {float(theirs[worst].double().abs().max()):.3g}; rounding explains "
-                f"{float(allowed[worst].max()):.1g}. That is an error of torch's compiler (torch {torch.__version__}), "
+                f"{float(allowed[worst].max()):.1g}. That is an error of {maker} (torch {torch.__version__}), "
                 f"and nothing is returned. {cure}"
             )
 

@@ -1,0 +1,144 @@
+"""An ONNX model of a step gives the eager step's numbers, with masks, actions and noise, and without torch."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.deployment.test_equals_eager import bend, members, parts
+from tests.deployment.test_export import Wrong
+from tests.filters.factories import linear_kalman, toy_denkf, toy_frames
+from tests.filters.gaussian_for_tests import CONTROL, learned_filter, learned_frames, linear_frames
+from tests.filters.test_contract import fused, readings
+from torch_denkf.deployment import export, export_step, load_step, onnx_model
+from torch_denkf.filters import DEnKF, KalmanFilter
+from torch_denkf.inductor import trace_below_autograd
+from torch_denkf.modules import EnsembleAnalysis, LearnedTransition
+
+pytest.importorskip("onnxruntime")
+
+
+def one_number(**options):
+    """A number that walks at random with variance 1, read with variance 1."""
+    one = torch.eye(1)
+    return KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one, **options)
+
+
+def perturbed(*, reject=False):
+    analysis = EnsembleAnalysis("perturbed", observation_key="reading")
+    return DEnKF(**parts(bend), analysis=analysis, initial=members(), process_noise=[0.1] * 3, reject=reject)
+
+
+def of_readings(*batch):
+    frames = readings(*batch, width=2)
+    return frames.update({"reading": frames["observation"]})
+
+
+FILTERS = {
+    "Kalman filter": (lambda: linear_kalman(control=torch.tensor(CONTROL)), linear_frames),
+    "EKF": (lambda: learned_filter("EKF"), learned_frames),
+    "DEnKF of four networks": (toy_denkf, toy_frames),
+    "DEnKF with flipout": (lambda: toy_denkf(layer="flipout", sensor_layer="flipout"), toy_frames),
+    "DEnKF with perturbed readings": (perturbed, of_readings),
+    "Kalman filter of two sensors, one of them late": (lambda: fused("Kalman", late=True), of_readings),
+}
+
+
+def dotted(tensordict):
+    return dict(tensordict.flatten_keys(".").items())
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "flipout" in name else name for name in FILTERS]
+)
+def test_steps_are_the_filters(name, tmp_path):
+    make, frames = FILTERS[name]
+    filter = make()
+    data = frames((8,)) if frames is toy_frames else frames(8)
+    data = data.exclude("is_init")
+    step = load_step(export_step(filter, data[0], tmp_path / "step.onnx", format="onnx", out_keys=[("info", "nis")]))
+    row, missing = filter.initialise(data[0].copy()), 0
+    with torch.no_grad():
+        for frame in data:
+            row = filter.draw_noise(row.select(*filter.carry_keys).update(frame))
+            found, given = step(dotted(row)), row
+            row = filter.step(row.copy())
+            missing += not given["observed"].all()
+            for key, value in found.items():
+                expected = row[tuple(key.split("."))]
+                torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5, msg=lambda m, k=key: f"{k}: {m}")
+    assert missing
+    assert "DEnKF" not in name or any(key.startswith("noise.transition") for key in step.inputs)
+
+
+def test_a_step_by_hand_without_torch(tmp_path):
+    """The forecast's variance is 2, so the gain 2/3; a reading that is hidden leaves the forecast; NaN is rejected."""
+    filter = one_number(reject=True)
+    example = TensorDict({"observation": torch.zeros(1), "observed": torch.ones(1, dtype=torch.bool)})
+    path = export_step(filter, example, tmp_path / "step.onnx", format="onnx")
+    program = f"""
+import json, sys
+import numpy as np
+import onnxruntime
+
+session = onnxruntime.InferenceSession({str(path)!r})
+names = json.loads(session.get_modelmeta().custom_metadata_map["torch_denkf"])
+belief = {{"belief.mean": np.zeros(1, np.float32), "belief.cov": np.ones((1, 1), np.float32)}}
+for value, seen in ((1, True), (7, False), (np.nan, True)):
+    frame = {{"observation": np.array([value], np.float32), "observed": np.array([seen])}}
+    out = dict(zip(names["outputs"], session.run(None, belief | frame)))
+    belief = {{name: out[name] for name in names["carry"]}}
+    print(*(float(out[name].squeeze()) for name in ("belief.mean", "belief.cov", "info.rejected")))
+assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    found = np.array([line.split() for line in done.stdout.splitlines()], float)
+    np.testing.assert_allclose(found, [[2 / 3, 2 / 3, 0], [2 / 3, 5 / 3, 0], [2 / 3, 8 / 3, 1]], rtol=1e-6)
+
+
+def test_what_onnx_lacks_is_named(tmp_path):
+    path, frame = tmp_path / "step.onnx", TensorDict({"reading": torch.zeros(2)})
+    etkf = DEnKF(**parts(bend), analysis=EnsembleAnalysis("etkf", observation_key="reading"), initial=members())
+    with pytest.raises(RuntimeError, match=r'aten\._linalg_eigh.* choose "perturbed".*format="pt2"'):
+        export_step(etkf, frame, path, format="onnx")
+    eye = torch.eye(5)
+    wide = KalmanFilter(eye, eye, process_noise_cov=eye, noise_cov=eye, mean=torch.zeros(5), cov=eye)
+    with pytest.raises(RuntimeError, match=r"aten\.cholesky_solve.* up to 4 .*FusedSensor"):
+        export_step(wide, TensorDict({"observation": torch.zeros(5)}), path, format="onnx")
+    restless = DEnKF(
+        **{**parts(bend), "transition": LearnedTransition(lambda x: x + torch.randn_like(x))},
+        initial=members(),
+        analysis=perturbed().module["analysis"],
+    )
+    with pytest.raises(RuntimeError, match=r"aten\.randn_like.*process_noise"):
+        export_step(restless, frame, path, format="onnx")
+    assert not path.exists()
+
+
+def test_a_model_that_is_wrong_is_not_written(tmp_path, monkeypatch):
+    path, filter = tmp_path / "step.onnx", perturbed()
+    frame = TensorDict({"reading": torch.zeros(2)})
+    monkeypatch.setattr(export, "trace_below_autograd", lambda step, values: trace_below_autograd(Wrong(step), values))
+    with pytest.raises(RuntimeError, match=r'ONNX model is wrong: .*No file is written. Write format="pt2"'):
+        export_step(filter, frame, path, format="onnx")
+    assert not path.exists()
+
+
+def test_other_errors(tmp_path, monkeypatch):
+    frame, path = TensorDict({"observation": torch.zeros(1)}), tmp_path / "step.onnx"
+    with pytest.raises(ValueError, match=r"ends in \.onnx"):
+        export_step(one_number(), frame, tmp_path / "step.pt2", format="onnx")
+    with pytest.raises(ValueError, match='format is "pt2" or "onnx"'):
+        export_step(one_number(), frame, path, format="tflite")
+    path.write_bytes(b"no model")
+    with pytest.raises(ValueError, match=r"step\.onnx is no ONNX model, or it is damaged"):
+        load_step(path)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ImportError, match=r"torch_denkf\[onnx\]"):
+        load_step(path)
+    monkeypatch.setattr(onnx_model, "find_spec", lambda name: None if name == "onnxscript" else 1)
+    with pytest.raises(ImportError, match=r"onnxscript.*torch_denkf\[onnx\]"):
+        export_step(one_number(), frame, path, format="onnx")
