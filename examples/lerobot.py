@@ -11,7 +11,8 @@ page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"
 Without --root it takes a minute of one core. Unseen episodes, no pictures in one second of four, mean absolute error of
 two joints: 0.024 rad for the filter, 0.096 for the last reading, 0.047 for the filter without a camera, 0.47 for the
 mean pose; the 90 % intervals hold 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
-0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %.
+0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %. A drawn crane of two joints, 20 episodes at 15 Hz
+with pictures two rows late, takes 1.5 minutes: 0.86 degrees, 2.92, 1.86, 27.6; 90 %.
 """
 
 from __future__ import annotations

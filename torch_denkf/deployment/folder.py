@@ -132,7 +132,8 @@ def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> di
         raise ValueError(f"{file} does not describe a filter (format {FORMAT!r}); pass a folder of `denkf train`")
     if not isinstance(config.get("builder"), str) or config["builder"] not in builders:
         raise ValueError(
-            f"{file} is of a filter that {config.get('builder')!r} builds; expected {', '.join(map(repr, builders))}"
+            f"{file} is of a filter that {config.get('builder')!r} builds; expected {', '.join(map(repr, builders))}. "
+            "Pass a function of your own by builders={NAME: function}"
         )
     return config
 

@@ -116,6 +116,17 @@ class Filter(Checked, TensorDictSequential):
         >>> drives = TensorDict({"observation": torch.ones(4, 10, 1)}, [4, 10])
         >>> kf.sequence(drives)["belief", "mean"].shape
         torch.Size([4, 10, 1])
+
+        torch's hooks look into each step, also of a sequence, in an environment or a policy. A compiled filter calls no
+        hook that is registered later; ``filter.compile(chunk=0)`` makes it eager again:
+
+        >>> innovations = []
+        >>> look = lambda module, read, out: innovations.append(out["info", "innovation"])
+        >>> hook = kf["analysis"].register_forward_hook(look)
+        >>> _ = kf.sequence(drives)
+        >>> hook.remove()
+        >>> len(innovations), innovations[0].shape
+        (10, torch.Size([4, 1]))
     """
 
     def __init__(

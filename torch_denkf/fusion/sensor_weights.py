@@ -36,6 +36,12 @@ class SensorAttention(nn.Module):
     So a sensor is judged by how well it agrees with the forecast, and by what the others say at the same time. The
     filter divides R by the weight: a reading of weight 0.01 counts as one with ten times the standard deviation.
 
+    It learns only what its recordings show. Put the failures that you fear into them. In some windows leave a sensor
+    out, so that the others learn to do without it. A window must hold several readings of the slowest sensor: of
+    a GPS at 1 Hz one second shows nothing. The belief that a window starts from must be as wrong as it says. A filter
+    that starts far off learns to believe whatever pulls it back. Good features are in the sensor's standard deviations,
+    such as by how much its last readings differ, and how many of them are exactly the same.
+
     Args:
         observations: O of each sensor, by name, in the order of the filter's sensors.
         features: number of features of each sensor that has any.

@@ -3,7 +3,7 @@
 from torch_denkf.monitoring.black import BlackIsMissing
 from torch_denkf.monitoring.chi_square import detectable_bias
 from torch_denkf.monitoring.filters import Gated, Monitored
-from torch_denkf.monitoring.gate import GatedAnalysis
+from torch_denkf.monitoring.gate import GatedAnalysis, GateOptions
 from torch_denkf.monitoring.innovation_tests import observe
 from torch_denkf.monitoring.monitor import InnovationMonitor, MonitoredSensor
 from torch_denkf.monitoring.signs import SignGate
@@ -11,6 +11,7 @@ from torch_denkf.monitoring.signs import SignGate
 __all__ = [
     "BlackIsMissing",
     "Gated",
+    "GateOptions",
     "GatedAnalysis",
     "InnovationMonitor",
     "Monitored",

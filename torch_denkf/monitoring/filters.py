@@ -103,7 +103,7 @@ class Gated(Filter):
             analysis where there are several.
         places: of the analyses that get a gate; all by default. With other options for others, put one ``Gated`` around
             another.
-        **options: of all gates, see :class:`~torch_denkf.monitoring.gate.GateOptions`. Of several the ``gate_prefix``
+        **options: of all gates, see :class:`~torch_denkf.monitoring.GateOptions`. Of several the ``gate_prefix``
             is followed by the analysis' place, ``"gate_camera"``, and by a number where a sequence in one place has
             several.
 

@@ -36,7 +36,9 @@ def from_pretrained(
 
     Args:
         name_or_folder: one of :func:`available`, or a folder that :func:`save_pretrained` or ``denkf train`` left.
-        builders: functions of your own by name, for folders that name them; see :func:`save_pretrained`.
+        builders: functions of your own by the name that ``config.json`` gives as ``"builder"``. A filter that
+            :func:`save_pretrained` wrote with ``builder=still`` needs ``builders={"still": still}`` here, because the
+            folder holds the function's name and not its code.
 
     Returns:
         The filter, on the CPU, in evaluation mode; ``filter.settings`` are its numbers.

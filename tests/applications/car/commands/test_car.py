@@ -166,6 +166,31 @@ def test_a_video_of_uneven_frames_is_the_folder_with_its_times(kitti, checkpoint
     assert "earlier or later" not in said["even"] + said["folder"]
 
 
+def test_a_cut_video_says_how_many_frames_are_left_out(kitti, checkpoint, tmp_path, capsys):
+    """The file loses its last third. Frames before the cut, which goes through a frame, give the whole file's path."""
+    file = tmp_path / "drive.avi"
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"MJPG"), 10, SIZE[::-1])
+    for image in read_frames(kitti / "sequences/b/image_2"):
+        video.write(image)
+    video.release()
+    common = ["--calibration", str(kitti / "sequences/b/calib.txt"), "--checkpoint", str(checkpoint), "--no-pictures"]
+    assert main(["odometry", str(file), *common, "--out", str(tmp_path / "whole")]) == 0
+    assert "left out" not in capsys.readouterr().err
+    data = file.read_bytes()
+    file.write_bytes(data[: 2 * len(data) // 3])
+    assert main(["odometry", str(file), *common, "--out", str(tmp_path / "cut")]) == 0
+    said = capsys.readouterr()
+    whole, cut = (read_path(tmp_path / name / "path.csv") for name in ("whole", "cut"))
+    left = len(cut)
+    assert len(whole) == 12
+    assert 4 < left < 9
+    torch.testing.assert_close(cut["belief", "mean"][:-1], whole["belief", "mean"][: left - 1])
+    assert f"says that it has 12 frames; only the first {left} can be read" in said.err
+    assert f"leaves {12 - left} out" in said.err
+    assert said.err.count("Is the file cut?") == 1
+    assert f"{left} steps, 0 without a reading" in said.out
+
+
 def test_missing_numbers_are_missing_frames(kitti, checkpoint, tmp_path, capsys):
     shutil.copytree(kitti / "sequences/b", tmp_path / "b")
     (tmp_path / "b/image_2/000000.png").unlink()

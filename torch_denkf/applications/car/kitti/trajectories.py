@@ -14,6 +14,10 @@ from torch_denkf.applications.car.vision.poses import state_to_poses
 
 __all__ = ["write_trajectory"]
 
+#: First line of a TUM file. Poses of a caller's own have the caller's axes.
+_COLUMNS = "time_s x_m y_m z_m qx qy qz qw"
+_AXES = "; axes of KITTI's camera: x to the right, y down, z forward"
+
 
 def write_trajectory(
     file: str | Path,
@@ -32,7 +36,8 @@ def write_trajectory(
     layout    a row of the file
     ========= =============================================================================================
     ``kitti`` the 3x4 matrix [R | t], row by row; no time
-    ``tum``   time in s, t as x y z, and R as the unit quaternion qx qy qz qw with qw >= 0
+    ``tum``   time in s, t as x y z, and R as the unit quaternion qx qy qz qw with qw >= 0; the first line is a
+              comment, which names columns, axes and units
     ========= =============================================================================================
 
     ``evo_ape kitti truth.txt filter.txt --plot --plot_mode xz`` compares two of them.
@@ -55,12 +60,13 @@ def write_trajectory(
         >>> import tempfile, torch
         >>> state = torch.tensor([[0.0, 0.0, 0.0], [10.0, 1.0, 0.0]])
         >>> file = write_trajectory(f"{tempfile.mkdtemp()}/path.txt", state, torch.tensor([0.0, 0.5]), layout="tum")
-        >>> print(file.read_text().splitlines()[1])
+        >>> print(file.read_text().splitlines()[-1])
         0.500000000 -1.000000000 0.000000000 10.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
     if layout not in ("kitti", "tum"):
         raise ValueError(f'layout must be "kitti" or "tum"; got {layout!r}')
-    poses = _poses(_array(trajectory))
+    array = _array(trajectory)
+    poses, header = _poses(array), _COLUMNS + (_AXES if array.ndim == 2 else "")
     if not np.isfinite(poses).all():
         row = int(np.flatnonzero(~np.isfinite(poses).all((1, 2)))[0])
         raise ValueError(f"row {row} of the trajectory is not finite; leave such rows out")
@@ -74,7 +80,8 @@ def write_trajectory(
     if len(seconds) != len(poses) or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
         raise ValueError(f"times must be {len(poses)} increasing seconds, one a pose; got {len(seconds)}")
     with replacing(file) as beside:
-        np.savetxt(beside, np.column_stack([seconds, poses[:, :, 3], _quaternions(poses[:, :, :3])]) + 0.0, fmt="%.9f")
+        rows = np.column_stack([seconds, poses[:, :, 3], _quaternions(poses[:, :, :3])]) + 0.0
+        np.savetxt(beside, rows, fmt="%.9f", header=header)
     return file
 
 

@@ -165,6 +165,13 @@ class FrameSource:
                     yield from repeat((None, None), missing)
                     yield video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image
                     missing = 0
+            ended = read - missing
+            if pictures and ended < expected:
+                warnings.warn(
+                    f"{self.path} says that it has {expected:.0f} frames; only the first {ended} can be read. The path "
+                    f"ends there, and leaves {expected - ended:.0f} out. Is the file cut?",
+                    stacklevel=2,
+                )
         finally:
             video.release()
 
@@ -173,7 +180,8 @@ def read_frames(path: str | Path) -> FrameSource:
     """Opens a folder of images, in the order of their names, or a video.
 
     Numbers in names count as numbers: ``frame10`` comes after ``frame9``. Where all names are numbers, as KITTI's
-    ``000018.png``, those left out are missing frames.
+    ``000018.png``, those left out are missing frames. In a video a frame that cannot be read is a missing one; at the
+    end of the video such frames are left out, and a warning says how many.
 
     Args:
         path: folder of png, jpg, bmp, tif, pgm, ppm or webp files; or a video file.
