@@ -76,6 +76,7 @@ setup(
             "sphinx-gallery>=0.22",
             "furo>=2025.12",
             "sphinx-copybutton>=0.5.2",
+            "sphinx-design>=0.8",  # the cards of the front page
             "matplotlib",
         ],
         "test": [

@@ -1,4 +1,7 @@
-"""Writes one reference page for each package of torch_denkf that names its public things in ``__all__``."""
+"""Writes one reference page for each package of torch_denkf that names its public things in ``__all__``.
+
+``python docs/_ext/reference_pages.py`` writes ``docs/reference/names.md``, the list of all of them.
+"""
 
 import importlib
 import inspect
@@ -8,6 +11,10 @@ from pathlib import Path
 
 import torch_denkf
 
+COMMAND = "python docs/_ext/reference_pages.py"
+# Up to the end of a sentence, and up to the end of a clause; formulas and code stay whole.
+SENTENCE = re.compile(r"(?:\$[^$]*\$|`[^`]*`|(?!; |\. [A-Z]).)+")
+CLAUSE = re.compile(r"(?:\$[^$]*\$|`[^`]*`|(?!; |\. [A-Z]|: | \((?:[A-Z]\S|[a-z]{2})).)+")
 OWN_METHODS = {
     "DEnKFTransform": """
         ``DEnKFTransform`` inherits about seventy public methods of torchrl's ``Transform``. Its own methods are:
@@ -49,8 +56,38 @@ def directive(package, name):
     value = getattr(package, name)
     if inspect.isclass(value) or inspect.isroutine(value):
         return f".. auto{'class' if inspect.isclass(value) else 'function'}:: {package.__name__}.{name}"
-    shown = f"array of {len(value)}" if hasattr(value, "__array__") else repr(value).replace("typing.", "")
-    return f".. py:data:: {name}\n   :module: {package.__name__}\n   :value: {shown}\n\n   {comment(package, name)}"
+    options = f"   :module: {package.__name__}\n   :value: {shown(value)}"
+    return f".. py:data:: {name}\n{options}\n\n   {comment(package, name)}"
+
+
+def shown(value):
+    """A constant's value, short."""
+    return f"array of {len(value)}" if hasattr(value, "__array__") else repr(value).replace("typing.", "")
+
+
+def summary(package, name):
+    """The first clause of what a public name says of itself, as Markdown."""
+    value = getattr(package, name)
+    if inspect.isclass(value) or inspect.isroutine(value):
+        text = " ".join(inspect.getdoc(value).split("\n\n")[0].split())
+    else:
+        text = comment(package, name) or f"``{shown(value)}``"
+    text = re.sub(r":math:`(.+?)`", r"$\1$", text)
+    text = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", text).replace("``", "`")
+    clause = CLAUSE.match(text)[0]
+    return (clause if len(clause.split()) > 2 else SENTENCE.match(text)[0]).rstrip(".")
+
+
+def names():
+    """The text of the list of all public names, each with the shortest path that imports it."""
+    parts = ["# Public names", "", f"`{COMMAND}` writes this list from the docstrings.", ""]
+    for title, package in packages().items():
+        parts += [f"## {title}", ""]
+        for name in package.__all__:
+            path = "torch_denkf" if name in torch_denkf.__all__ else package.__name__
+            parts.append(f"- `{path}.{name}`: {summary(package, name)}")
+        parts.append("")
+    return "\n".join(parts)
 
 
 def comment(package, name):
@@ -119,3 +156,7 @@ def setup(app):
     app.connect("autodoc-process-docstring", describe_constant)
     app.connect("autodoc-process-signature", own_signature)
     return {"parallel_read_safe": True}
+
+
+if __name__ == "__main__":
+    (Path(__file__).parents[1] / "reference" / "names.md").write_text(names())
