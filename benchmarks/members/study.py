@@ -29,11 +29,10 @@ class Study:
     """How many members does an ensemble need, with and without localisation by significance?"""
 
     out: Path | None = None  # folder for members.csv, members.md and members.png; rows that are there stay
-    kitti: Path | None = None  # KITTI's folder, for the task of the car
     demos: Path = Path("runs/members/ur5")  # of the UR5, collected where they are missing
     members: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
     thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # of which validation data choose one
-    tasks: tuple[str, ...] = ("walks", "reacher", "lorenz96", "wheels", "ur5", "car")
+    tasks: tuple[str, ...] = ("walks", "reacher", "lorenz96", "wheels", "ur5")
     smoke: bool = False  # two small tasks: do they run?
 
 
@@ -45,10 +44,6 @@ def made(study: Study, name: str) -> Task:
         return tasks.lorenz96(*((1, 5) if study.smoke else ()))
     if name == "ur5":
         return tasks.ur5(study.demos)
-    if name == "car":
-        if study.kitti is None:
-            raise SystemExit("--kitti is missing: KITTI's folder, for the task of the car; or leave it out of --tasks")
-        return tasks.car(study.kitti)
     return {"wheels": tasks.wheels, "reacher": tasks.reacher}[name]()
 
 
@@ -87,7 +82,7 @@ def page(rows: list[dict], study: Study, errors: dict[str, str]) -> str:
         "# How many members?",
         "",
         'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
-        "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation. For `ur5` and `car`",
+        "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation. For `ur5`",
         "it is the default.",
         "",
         *head("task", "error", "members", "without", "held", "with", "held", "threshold"),

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import torch
@@ -16,8 +15,6 @@ from torch import Tensor
 from benchmarks.common.lorenz96 import lorenz96_step
 from benchmarks.wheels.task import ensemble_filter, gaussian_filter, recordings
 from torch_denkf import DEnKF, Filter, KalmanFilter, from_pretrained
-from torch_denkf.applications.car.kitti.episodes import find_drives
-from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.reacher import reacher_env
 from torch_denkf.applications.ur5.train import evaluate_ur5_table, whole_demos
 from torch_denkf.functional import analyse
@@ -25,7 +22,7 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = ["Score", "Task", "car", "lorenz96", "reacher", "ur5", "walks", "wheels"]
+__all__ = ["Score", "Task", "lorenz96", "reacher", "ur5", "walks", "wheels"]
 
 LEVEL = 0.9  # of the intervals
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
@@ -217,16 +214,3 @@ def ur5(folder: Path, demos: int = 30) -> Task:
         return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
 
     return Task("ur5", "joints, degrees (mean absolute)", score)
-
-
-def car(root: Path, draws: int = 4) -> Task:
-    """Path of a car by the filter that comes with the library, on real drives that it has not seen."""
-    drives, shipped = find_drives(root, None), from_pretrained("car-odometry")
-
-    def score(members: int, threshold: float | None) -> Score:
-        rows, _ = evaluate_car_filter(resized(shipped, members, threshold), root, drives, draws=draws, progress=False)
-        own = [row for row in rows if row["method"] == "filter"]
-        held = fmean(fmean((row["coverage90_v"], row["coverage90_theta_dot"])) for row in own)
-        return Score(100 * fmean(row["translation_m_per_m"] for row in own), held)
-
-    return Task("car", "end of 100 steps, % of the way", score)

@@ -61,8 +61,8 @@ def policy(ax):
             if row["arm"] == arm:
                 curves.setdefault(int(row["env_steps"]), []).append(float(row["return"]))
         ax.plot([step / 1000 for step in curves], [median(returns) for returns in curves.values()], colour, label=label)
-        ax.fill_between([step / 1000 for step in curves], *zip(*((min(r), max(r)) for r in curves.values()), strict=True),
-                        color=colour, alpha=0.2, linewidth=0)  # fmt: skip
+        lowest, highest = zip(*((min(returns), max(returns)) for returns in curves.values()), strict=True)
+        ax.fill_between([step / 1000 for step in curves], lowest, highest, color=colour, alpha=0.2, linewidth=0)
     ax.set(xlabel="thousand steps of the pendulum", ylabel="return")
     ax.legend()
 
