@@ -19,6 +19,7 @@ from torch_denkf.inductor import compared, refuse_other_numbers
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 from torch_denkf.modules._running import named_modules_of
 
+VERSION = tuple(map(int, torch.__version__.split(".")[:2]))
 needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a C++ compiler, g++")
 
 
@@ -71,8 +72,9 @@ def rows_of_a_jacobian(state):
 
 @needs_compiler
 @pytest.mark.slow
+@pytest.mark.skipif(VERSION >= (2, 15), reason="right in torch 2.15; Select avoids it for torch 2.13")
 def test_torch_still_adds_up_the_rows_of_a_jacobian_of_index_select():
-    """If this fails, torch is right: `Select` may use index_select again, and this test may go."""
+    """Where torch 2.13 is no longer supported, `Select` may use index_select again, and this test may go."""
     state = torch.zeros(4)
     assert rows_of_a_jacobian(state).equal(torch.eye(4)[:2])
     found = torch.compile(rows_of_a_jacobian)(state)

@@ -24,7 +24,7 @@ from torch_denkf.inductor.libraries import clear_full_cache as clear_full_cache
 from torch_denkf.inductor.tracing import trace_below_autograd as trace_below_autograd
 
 #: Versions of torch, by their first two numbers, that the passes were tested with.
-TESTED_VERSIONS = ("2.13",)
+TESTED_VERSIONS = ("2.13", "2.15")
 
 _LOG = logging.getLogger("torch_denkf")
 _said = False
