@@ -16,7 +16,7 @@ from torchrl.modules import set_recurrent_mode
 from torch_denkf._arguments import Checked
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
-from torch_denkf.filters.finish import own, refuse_non_finite
+from torch_denkf.filters.finish import own, refuse_far_belief, refuse_non_finite
 from torch_denkf.filters.messages import mark_up_to_date
 from torch_denkf.filters.primer import refuse_resets_of_groups
 from torch_denkf.filters.refusals import refuse_unguarded
@@ -221,6 +221,7 @@ class DEnKFTransform(Checked, Transform):
             entries = self.filter.entries_of(start, one_step=True)
             given = {key: value for key, value in entries.items() if key not in self.filter.structure.carry}
             self._assert_finite(given, entries, used=self.filter.update_at_reset)
+            refuse_far_belief(entries, self.filter.structure.carry)  # one that was given
         for key, name in self._names.items():
             tensordict_reset.set(name, start.get(self.filter.outer(key)))
         return tensordict_reset
