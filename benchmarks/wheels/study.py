@@ -88,7 +88,7 @@ def main() -> None:
     """Runs the study."""
     study = parse(Study)
     if study.smoke:
-        study = replace(study, runs=1, seconds=1.0, members=(8,), thresholds=(3.0,))
+        study = replace(study, runs=1, seconds=1.0, members=(16,), thresholds=(3.0,))
     torch.set_num_threads(1)
     data = recordings(study.runs, round(study.seconds / DT), study.seed)
     rows = [{"filter": "extended Kalman filter", **row(gaussian_filter(), data)}]
