@@ -21,6 +21,7 @@ COLUMNS = Columns(
     whole=("members",),
     order=lambda row: (row["task"], row["filter"], row.get("members", 0)),
 )
+TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm", "reacher": "reacher", "wheels": "wheels"}
 DEFAULT = 3.0  # threshold where no validation data choose one
 
 
@@ -124,8 +125,13 @@ def draw(rows: list[dict], study: Study, errors: dict[str, str], file: Path) -> 
             if row["filter"] not in (PLAIN, BELIEVED):
                 above.axhline(row["error"], color="gray", linewidth=1, label=row["filter"])
         below.axhline(90, color="gray", linewidth=1, linestyle=":")
-        above.set(title=name, ylabel=errors[name], xscale="log", yscale="log")
+        above.set(title=TITLES[name], ylabel=errors[name], xscale="log")
+        if max(row["error"] for row in own) > 5 * min(row["error"] for row in own):
+            above.set_yscale("log")
+            above.yaxis.set_major_formatter("{x:g}")
+            above.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2346" else "")
         below.set(xlabel="members", ylim=(0, 102), ylabel="% in 90 % intervals")
+        above.tick_params(axis="y", which="both", labelsize=8)
         above.legend(fontsize=7)
         below.set_xticks([8, 32, 128, 512], ["8", "32", "128", "512"])
         below.minorticks_off()

@@ -118,7 +118,7 @@ def walks(runs: int = 16, steps: int = 1000) -> Task:
     noises = {"process_noise": [WALK_STD] * WALKS, "noise": [READING_STD] * WALKS}
     exact = KalmanFilter(eye, eye, **noises, mean=torch.zeros(WALKS), cov=WALK_STD**2 * eye, observation_key="reading")
     best = ("Kalman filter", filtered(exact, test, skip))
-    return Task("walks", "ten walks", partial(score, test), partial(score, other), best)
+    return Task("walks", "error of the walks", partial(score, test), partial(score, other), best)
 
 
 def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
             validate(members, threshold)
         return run("test", members, threshold)[chosen[members, threshold]]
 
-    return Task("lorenz96", "analysis", score, validate)
+    return Task("lorenz96", "error of the analysis", score, validate)
 
 
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
@@ -202,7 +202,7 @@ def reacher(episodes: int = 10, steps: int = 400) -> Task:
     def score(data: TensorDict, members: int, threshold: float | None) -> Score:
         return filtered(resized(shipped, members, threshold), data, 1, slice(2, 4))
 
-    return Task("reacher", "joint velocities, rad/s", partial(score, test), partial(score, other))
+    return Task("reacher", "velocities, rad/s", partial(score, test), partial(score, other))
 
 
 def ur5(folder: Path, demos: int = 30) -> Task:
@@ -213,4 +213,4 @@ def ur5(folder: Path, demos: int = 30) -> Task:
         found = evaluate_ur5_table(resized(shipped, members, threshold), data, cache=folder / "cache", progress=False)
         return Score(found["filter"]["joints, deg"], found["held by 90 % intervals"])
 
-    return Task("ur5", "joints, degrees (mean absolute)", score)
+    return Task("ur5", "joints, degrees", score)

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import NoisyLinear, linear_denkf, linear_kalman, linear_system
+from torch_denkf.modules import FromSensor
 
 FILTERS = {"DEnKF": linear_denkf, "Kalman": linear_kalman}
 every_filter = pytest.mark.parametrize("name", FILTERS)
@@ -157,6 +158,15 @@ def test_so_may_it_in_the_sequence_that_a_loss_filters(name, update_at_reset):
         broken["observation"].data[0, 4] = torch.nan
         with pytest.raises(ValueError, match="no mask hides it"):
             filter.sequence(broken)
+
+
+def test_a_start_that_is_made_of_the_reading_uses_it():
+    start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
+    broken = TensorDict({"observation": torch.zeros(2, 3, 2)}, [2, 3])
+    broken["observation"][1, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"NaN, infinity or more than 1e\+18 in \['observation'\]"):
+        linear_denkf(initial=start).sequence(broken)
+    linear_denkf().sequence(broken)
 
 
 def test_policy_steps_under_vmap():

@@ -1,6 +1,7 @@
 """Localisation by significance: what chance alone explains moves nothing."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from torch_denkf.functional import analyse, letkf
 from torch_denkf.functional.analysis import significant
 from torch_denkf.functional.localisation import Neighbours
+from torch_denkf.modules import EnsembleAnalysis, LocalEnsembleAnalysis
 
 SCHEMES = ("sensor", "perturbed", "etkf", "sakov")
 
@@ -167,10 +169,57 @@ def test_a_local_analysis_weighs_by_the_factors(cases):
     assert torch.autograd.gradcheck(moved, (forecast[0].requires_grad_(), torch.tensor(1.5, requires_grad=True)))
 
 
+def test_each_component_has_a_threshold_and_readings_have_their_mean(cases):
+    forecast, predicted, reading, noise = cases
+    thresholds, moved = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5]), torch.cat([forecast, predicted], -1)
+    for j in range(2):
+        seen = moved[..., 5 + j : 6 + j]
+        columns = [by_hand(moved[..., k : k + 1], seen, float(limit)).mT for k, limit in enumerate(thresholds)]
+        factors = torch.cat([*columns, by_hand(moved[..., 5:], seen, 1.5).mT], -2), torch.ones(1, 1)
+        parts = reading[..., j : j + 1], noise[..., j : j + 1]
+        moved = analyse(moved, seen, *parts, scheme="sakov", taper=factors).ensemble
+    result = analyse(forecast, predicted, reading, noise, scheme="sakov", significance=thresholds).ensemble
+    torch.testing.assert_close(result, moved[..., :5], rtol=0, atol=1e-10)
+
+
+def test_the_past_is_moved_with_the_thresholds_of_the_state(cases):
+    """A past that equals the present moves as the present does."""
+    forecast, *given = cases
+    thresholds = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5])
+    analysis = EnsembleAnalysis("etkf", localisation="significance", threshold=thresholds)
+    now = analysis.compute(forecast, *given, noise=None)[0]
+    past = analysis.move_past(forecast.unsqueeze(-2).expand(-1, -1, 3, -1), *given)
+    torch.testing.assert_close(past, now.unsqueeze(-2).expand_as(past), rtol=0, atol=1e-10)
+
+
+def test_the_local_module_weighs_as_its_formula(cases):
+    near = Neighbours(torch.arange(2).expand(5, 2), torch.ones(5, 2))
+    forecast, *given = cases
+    local = LocalEnsembleAnalysis(near, localisation="significance", threshold=1.5)
+    expected = letkf(forecast, *given, near, significance=1.5)
+    torch.testing.assert_close(local.compute(forecast, *given, noise=None)[0], expected, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="one number for all components"):
+        LocalEnsembleAnalysis(near, localisation="significance", threshold=torch.ones(5))
+
+
+@pytest.mark.parametrize("analysis", [EnsembleAnalysis, partial(LocalEnsembleAnalysis, torch.ones(5, 2))])
+def test_a_threshold_is_positive(analysis):
+    with pytest.raises(ValueError, match="threshold"):
+        analysis(localisation="significance", threshold=0.0)
+    with pytest.raises(ValueError, match='localisation is "significance" or None'):
+        analysis(localisation="distance")
+
+
 def test_members_that_cannot_show_a_significant_correlation_are_refused(cases):
     forecast, predicted, reading, noise = cases
     with pytest.raises(ValueError, match=r"With 24 members no correlation is 5 standard.*is 4.8.*more than 26"):
         analyse(forecast, predicted, reading, noise, scheme="etkf", significance=5.0)
+    ten = forecast[:, :10], predicted[:, :10], reading, noise  # the largest is 3
+    near = Neighbours(torch.arange(2).expand(5, 2), torch.ones(5, 2))
+    for call in (partial(analyse, *ten, scheme="etkf"), partial(letkf, *ten, near)):
+        with pytest.raises(ValueError, match="With 10 members"):
+            call(significance=3.0)
+        call(significance=2.9)
 
 
 def test_ensemble_space_cannot(cases):
