@@ -29,7 +29,7 @@ from torch_denkf.training import Stage
 from torch_denkf.training.checkpoint import read_checkpoint
 from torch_denkf.training.parts import parameters_without
 
-INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.6, 2.0)
+INFLATIONS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.6, 2.0, 2.5, 3.2)
 FLOOR = 1e-8  # of the variances of v and theta_dot
 
 
@@ -152,13 +152,22 @@ def train_filter(
         ]
 
     settings = {"validate_every": max(budget.filter // 3, 1), "save_every": 200, "loggers": loggers, "seed": seed}
-    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts), "gain": gain}
+    notes = {"filter": filter_name, "sensor": kind, "facts": vars(facts)}
 
     def error() -> float:
-        recipe.set_gain(model, gain)
         return calibration_error(recipe, model, base.validation)
 
-    fit_filter(recipe, model, stages, None, out=out, inflations=INFLATIONS, error=error, notes=notes, **settings)
+    def error_with(gain: float) -> float:
+        recipe.set_gain(model, gain)
+        return error()
+
+    def gained_error() -> float:
+        if "gain" not in notes:  # behind the last stage, which may have taken the factor out of the sensor
+            notes["gain"] = min((0.0, gain), key=error_with)
+            recipe.set_gain(model, notes["gain"])
+        return error()
+
+    fit_filter(recipe, model, stages, None, out=out, inflations=INFLATIONS, error=gained_error, notes=notes, **settings)
     recipe.set_gain(model, read_checkpoint(out / "filter.pt").get("gain", 0.0))
     return recipe, model
 

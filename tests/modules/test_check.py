@@ -64,7 +64,7 @@ class Own(SubModel):
         writes = [("belief", name) for name in ("ensemble", "mean", "var")]
         writes += [("info", name) for name in ("innovation", "nis", "log_likelihood")]
         super().__init__(nn.Identity(), reads, writes, optional_keys=[] if mistake == "no mask" else ["observed"])
-        self.mistake, self.reading_keys = mistake, self.in_keys[2:]
+        self.mistake, self.reading_keys = mistake, self.in_keys[:0] if mistake == "nameless" else self.in_keys[2:]
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, rows=None, dtype=None, device=None, **_):
         members = rows if self.mistake == "noise" else members
@@ -123,6 +123,7 @@ def test_an_analysis_of_ones_own_passes():
         ("in place", "changed in place"),
         ("no gradient", "no gradient by the reading"),
         ("no mask", "the mask 'observed', read"),
+        ("nameless", "named in reading_keys"),
         ("noise", "draw_noise of Own"),
         ("own seed", "same seed"),
     ],

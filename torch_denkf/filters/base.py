@@ -28,6 +28,7 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torch_denkf._arguments import Checked
 from torch_denkf._checks import check_count, check_number
 from torch_denkf._slices import as_rows, starts_of
+from torch_denkf.filters.collapse import say_collapse
 from torch_denkf.filters.compiled import CompiledSteps
 from torch_denkf.filters.finish import (
     own,
@@ -45,6 +46,7 @@ from torch_denkf.filters.primer import LastAction
 from torch_denkf.filters.refusals import (
     check_inputs,
     refuse_missing_actions,
+    refuse_nameless_readings,
     refuse_single_readings,
     refuse_two_precisions,
     refuse_unguarded,
@@ -79,7 +81,8 @@ class Filter(Checked, TensorDictSequential):
     * in a policy, behind :meth:`make_tensordict_primer`, like :class:`torchrl.modules.LSTMModule`: the belief at t-1
       comes under ``("previous", ...)``, that of t goes to ``("belief", ...)`` for the actor, and to
       ``("next", "previous", ...)`` for the next step. torchrl's losses, which turn its recurrent mode on, then filter
-      the stored sequences; each begins with a step from the belief that is stored under ``("previous", ...)``.
+      the stored sequences, and leave ``("next", "previous", ...)`` as it was stored; each begins with a step from the
+      belief that is stored under ``("previous", ...)``.
 
     Args:
         modules: TensorDict modules in order, or one dict of them by name. The name (or number) of a module is its
@@ -431,7 +434,12 @@ class Filter(Checked, TensorDictSequential):
         return tensordict
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does."""
+        """A step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
+
+        Raises:
+            KeyError: if an analysis does not say which entries are its readings.
+        """
+        refuse_nameless_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
         hidden = tensordict.copy()
         for key in dict.fromkeys(part.mask_key for part in submodels(self.module) if part.mask_key is not None):
@@ -596,6 +604,8 @@ class Filter(Checked, TensorDictSequential):
                     step_keys,
                 )[1]
         steps.blank(outputs, gathered.fresh)
+        if not (torch.is_grad_enabled() or torch.compiler.is_compiling()):
+            say_collapse(self.messages, structure, outputs)
         return {**own({key: frames[key] for key in keep if key in frames}, given), **outputs}
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:

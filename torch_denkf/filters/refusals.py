@@ -7,13 +7,14 @@ from collections.abc import Collection, Iterable, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 
-from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels
+from torch_denkf.filters.structure import Placed, Structure, previous_key, submodels, takes_reading
 from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import random_parts
+from torch_denkf.modules._running import declared, in_sequences, random_parts, writes
 
 __all__ = [
     "check_inputs",
     "refuse_missing_actions",
+    "refuse_nameless_readings",
     "refuse_single_readings",
     "refuse_two_precisions",
     "refuse_unguarded",
@@ -116,6 +117,21 @@ def refuse_unknown_readings(structure: Structure, without: Sequence[NestedKey]) 
     if unknown:
         raise KeyError(f"without names {unknown}, which no module must find; they read {list(structure.needed)}.")
     return keys
+
+
+def refuse_nameless_readings(structure: Structure) -> None:
+    """Raises a ``KeyError`` where an analysis takes in a reading and does not say so: ``predict`` could not hide it."""
+    frames = {*structure.needed, *structure.frame_keys}
+    for place, module in structure.update:
+        for part in in_sequences(module):
+            read = [key for key in part.in_keys if unravel_key(key) in frames]
+            corrects = not set(structure.carry).isdisjoint(writes(part))
+            if corrects and read and not takes_reading(part) and not declared(part).reading_keys:
+                raise KeyError(
+                    f"{type(part).__name__} at place {place!r} corrects the belief by {read}, and does not say which "
+                    "are readings: predict() cannot leave them out. Let its constructor set self.reading_keys, the "
+                    "reading and its noise, and self.observed_key, the mask that it heeds; or call step() with a mask."
+                )
 
 
 def refuse_single_readings(structure: Structure, without: Sequence[NestedKey]) -> None:

@@ -201,7 +201,8 @@ class SubModel(Checked, TensorDictModule):
     ) -> Tensor:
         """Of an analysis of an ensemble: what a reading says of earlier states of the same members.
 
-        By default what :meth:`compute` would do to them if they were the state, inflation and the like included.
+        By default what :meth:`compute` would do to them if they were one state of L times S components, inflation and
+        the like included. Where :meth:`compute` holds anything of S components, write this method, too.
 
         Args:
             past: ``[*B, E, L, S]``.
@@ -213,9 +214,18 @@ class SubModel(Checked, TensorDictModule):
 
         Returns:
             The updated past, ``[*B, E, L, S]``.
+
+        Raises:
+            RuntimeError: if :meth:`compute` does not take so many components.
         """
         extra = {"noise": noise} if self.draws else {}
-        out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
+        try:
+            out = self.by_key(self.compute(past.flatten(-2), predicted, observation, variance, observed, **extra))
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"{type(self).__name__} is to correct earlier states, and its compute() fails on their "
+                f"{past.shape[-2]} times {past.shape[-1]} components: write {type(self).__name__}.move_past()."
+            ) from error
         return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
 
     def aligned(self, entries: Entries) -> Entries:

@@ -39,7 +39,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             more updates a component sees between two readings about it, the larger.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        **keys: see :class:`EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned observations, not one reading.
+        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
+            learned observations, not one reading.
 
     Raises:
         ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and

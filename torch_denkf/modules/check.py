@@ -14,7 +14,7 @@ from torch_denkf.functional import ensemble_mean, kalman_update
 from torch_denkf.functional.gaussian import GaussianUpdate
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean
-from torch_denkf.modules._running import random_parts, reads
+from torch_denkf.modules._running import declared, in_sequences, random_parts, reads
 
 __all__ = ["check_analysis"]
 
@@ -44,6 +44,7 @@ def check_analysis(
     ``LinearObservation(torch.eye(O, S))``. What is checked, as far as the analysis writes it:
 
     * mean, variances, covariance of the ensemble, innovation, NIS and log-likelihood are those of the Kalman update;
+    * ``reading_keys`` names the reading, so that a filter can leave it out;
     * where nothing is observed, the belief is the forecast, and NaN behind the mask spoils no value and no gradient;
       where some components are observed, the belief is that of the Kalman update with these alone;
     * batches ``[]``, ``[3]`` and ``[2, 3]`` give beliefs of these shapes, and inputs are left as they are;
@@ -183,6 +184,8 @@ def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> It
     yield from _noise(analysis, case)
     if keys.observed is not None:
         read = {key for some in reads(analysis) for key in some}
+        named = [key for part in in_sequences(analysis) for key in map(unravel_key, declared(part).reading_keys)]
+        yield f"the reading {keys.reading!r}, named in reading_keys", float(unravel_key(keys.reading) not in named), 0
         yield f"the mask {keys.observed!r}, read", float(unravel_key(keys.observed) not in read), 0
         width, nothing = case.observation_dim, torch.zeros(2, 1, dtype=torch.bool)
         first = torch.arange(width) > 0 if width > 1 else torch.ones(1, dtype=torch.bool)

@@ -45,8 +45,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
             their correlation from chance, see :class:`EnsembleAnalysis`.
         threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
-        **keys: see :class:`EnsembleAnalysisKeys`. Of learned observations the mean is taken. What is not observed may
-            be NaN, readings and variances alike.
+        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. Of learned observations the
+            mean is taken. What is not observed may be NaN, readings and variances alike.
 
     Raises:
         ValueError: if a taper is not a matrix or asks for a gradient, or the sizes do not fit.

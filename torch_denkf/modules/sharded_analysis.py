@@ -32,7 +32,7 @@ class ShardedEnsembleAnalysis(EnsembleAnalysis):
         inflation: factor on the analysis anomalies, where anything is observed, by whichever process; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         group: the processes; ``None`` for all.
-        **keys: see :class:`EnsembleAnalysisKeys`.
+        **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`.
 
     Raises:
         ValueError: for the scheme ``"perturbed"``, whose draws would be the same in processes of one seed.

@@ -55,8 +55,8 @@ class DEnKFLoss(FilterLoss):
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. It also
-            says what gaps in the labels are.
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, labels of another shape, or slices that are not
@@ -193,8 +193,8 @@ class GaussianLoss(FilterLoss):
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. It also
-            says what gaps in the labels are.
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``, labels of
@@ -269,8 +269,9 @@ class MixtureLoss(FilterLoss):
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see :class:`SequenceOptions`. With a
-            ``state_scale`` the mixture is a density of the state in its own units all the same.
+        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
+            is a density of the state in its own units all the same.
 
     Raises:
         ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``,

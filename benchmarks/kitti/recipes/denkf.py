@@ -14,8 +14,6 @@ from torch_denkf.applications.car.odometry.filter import velocity_analysis
 from torch_denkf.modules import AroundState, EnsembleAnalysis, StochasticMLP
 from torch_denkf.modules.noise import MemberGain
 
-LAGS = 4  # past steps that an innovation may still correct
-
 
 @register
 class DEnKF(KITTIRecipe):
@@ -24,12 +22,14 @@ class DEnKF(KITTIRecipe):
     Attributes:
         size: members; the sensor has as many samples.
         scheme: of the update.
+        lags: past steps that an innovation may still correct.
+        threshold: of the significance of a correlation, in standard deviations; ``None`` believes all of them.
     """
 
-    size, scheme = SAMPLES, "sensor"
+    size, scheme, lags, threshold = SAMPLES, "sensor", 4, None
 
     def modules(self):
-        analysis = velocity_analysis(LAGS, self.scheme)
+        analysis = velocity_analysis(self.lags, self.scheme, self.threshold)
         return OrderedDict(
             noise=self.noise(),
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
@@ -41,7 +41,7 @@ class DEnKF(KITTIRecipe):
         )
 
     def initial(self, std, state_key):
-        return with_history(AroundState(std, ensemble_size=self.size, state_key=state_key), LAGS)
+        return with_history(AroundState(std, ensemble_size=self.size, state_key=state_key), self.lags)
 
     def loss(self, model):
         return self.ensemble_loss(model)

@@ -88,15 +88,20 @@ class CarSettings:
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
-def velocity_analysis(lags: int, scheme: Literal["sensor", "perturbed", "sakov"] = "sensor") -> EnsembleAnalysis:
+def velocity_analysis(
+    lags: int, scheme: Literal["sensor", "perturbed", "sakov"] = "sensor", threshold: float | None = None
+) -> EnsembleAnalysis:
     """The update of a car's velocities, and of those of the last ``lags`` steps, by what was read of a pair of frames.
 
     Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
-    multiplies the present velocities alone: those of past steps would be multiplied again in each step.
+    multiplies the present velocities alone: those of past steps would be multiplied again in each step. A threshold
+    localises by significance.
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
         scheme,
+        localisation=None if threshold is None else "significance",
+        threshold=1.0 if threshold is None else threshold,
         taper=(own, torch.eye(2)),
         inflated=VELOCITIES,
         forecast_key=("forecast", "clone"),

@@ -1,0 +1,87 @@
+"""What is said of an ensemble that is too narrow for its readings."""
+
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torch_denkf.filters import DEnKF
+from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
+
+STEP, NOISE, STEPS = 0.3, 0.1, 80
+
+
+def walk_filter(process_noise, **options):
+    """Of two walks, both of which are read."""
+    return DEnKF(
+        LearnedTransition(nn.Identity(), residual=False),
+        None,
+        Select([0, 1]),
+        ConstantNoise([NOISE, NOISE], in_key="reading"),
+        EnsembleAnalysis("etkf", observation_key="reading"),
+        process_noise=process_noise,
+        initial=GaussianPrior([0.0, 0.0], [0.1, 0.1], ensemble_size=32),
+        **options,
+    )
+
+
+def walks(moving=(1.0, 1.0), steps=STEPS):
+    """Readings of walks, some of which stand still."""
+    torch.manual_seed(0)
+    state = (STEP * torch.tensor(moving) * torch.randn(2, steps, 2)).cumsum(1)
+    return TensorDict({"reading": state + NOISE * torch.randn_like(state)}, [2, steps])
+
+
+def said(filter, data, **options):
+    with warnings.catch_warnings(record=True) as caught, torch.no_grad():
+        warnings.simplefilter("always")
+        torch.manual_seed(1)
+        filter.sequence(data.clone(), **options)
+    return [str(each.message) for each in caught if "too narrow" in str(each.message)]
+
+
+def test_filter_whose_noise_is_right_says_nothing():
+    assert not said(walk_filter([STEP, STEP]), walks())
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_names_the_reading_and_the_component_that_is_held_too_firmly(component):
+    noise = [STEP, STEP]
+    noise[component] = 1e-3
+    (text,) = said(walk_filter(noise), walks())
+    assert "'reading' at place 'analysis'" in text
+    assert f"Number {component} tells most of component {component} of the state" in text
+    assert 'localisation="significance"' in text
+
+
+def test_is_said_once():
+    filter = walk_filter([1e-3, 1e-3])
+    assert len(said(filter, walks())) == 1
+    assert not said(filter, walks())
+
+
+def test_a_wrong_start_and_outliers_are_forgiven():
+    data = walks()
+    data["reading"][:, : STEPS // 2 - 1] += 50.0  # as far off as a start could be
+    data["reading"][:, ::3] += 20.0 * (torch.arange(0, STEPS, 3) % 2).unsqueeze(-1)
+    assert not said(walk_filter([STEP, STEP]), data)
+
+
+def test_hidden_readings_do_not_count():
+    data = walks()
+    data["observed"] = torch.zeros(2, STEPS, 1, dtype=torch.bool)
+    data["observed"][:, : STEPS // 2] = True
+    data["observed"][:, -9:] = True  # 18 readings of the second half: too few to tell
+    assert not said(walk_filter([1e-3, 1e-3]), data)
+    data["observed"][:, -10:] = True
+    assert said(walk_filter([1e-3, 1e-3]), data)
+
+
+def test_nothing_is_looked_at_in_training_or_where_diagnostics_are_not_kept():
+    assert not said(walk_filter([1e-3, 1e-3]), walks(), keep=[("belief", "mean")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        walk_filter([1e-3, 1e-3]).sequence(walks())
+    assert said(walk_filter([1e-3, 1e-3]), walks(), keep=[("info", "nis"), ("info", "innovation")])
