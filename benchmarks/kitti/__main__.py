@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.kitti.frontier import draw
+from benchmarks.kitti.past import compare
 from benchmarks.kitti.study import Study, make_jobs, rows_of, run_jobs
 from benchmarks.kitti.tables import COLUMNS, markdown
 from benchmarks.kitti.training import Budget
@@ -47,12 +48,12 @@ def main() -> None:
     if study.root is None:
         raise SystemExit("--root is missing: the folder with 'sequences' and 'poses' (or --smoke)")
     study.out.mkdir(parents=True, exist_ok=True)
-    if study.command == "frontier" and not study.smoke:
+    if study.command == "table" or study.smoke:
+        table(study)
+    if study.command == "frontier" or study.smoke:
         print(*draw(study), sep="\n")
-        return
-    table(study)
-    if study.smoke:
-        print(*draw(study), sep="\n")
+    if study.command == "past" or study.smoke:
+        print(*compare(study, command("kitti")), sep="\n")
 
 
 if __name__ == "__main__":

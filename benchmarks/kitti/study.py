@@ -33,10 +33,11 @@ class Study:
     """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
 
     table: leave one drive out after the other, in all conditions. frontier: error against milliseconds a step of the
-    filters that a table left. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
+    filters that a table left. past: how long a past the DEnKF corrects, with and without significance, and with how
+    many members. What was broken off goes on where it stopped. See benchmarks/kitti/README.md.
     """
 
-    command: Positional[Literal["table", "frontier"]] = "table"
+    command: Positional[Literal["table", "frontier", "past"]] = "table"
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/kitti")  # checkpoints, logs, table and plots
     drives: tuple[str, ...] = ()  # drives of the study; all that are found
@@ -47,7 +48,7 @@ class Study:
     rendered: int = 0  # drives to render for a first training of the sensor
     first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
-    sizes: tuple[int, ...] = (8, 32, 128, 512)  # of the ensemble, in the frontier
+    sizes: tuple[int, ...] = (8, 32, 128, 512)  # of the ensemble, in the frontier and with the past
     processes: int = 1  # folds side by side
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything, on rendered drives

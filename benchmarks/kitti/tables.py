@@ -34,9 +34,9 @@ FAIRNESS = (
     "In each fold and seed all filters start from the same sensor's weights and learn from the same windows of its "
     "readings, with as many updates and steps back-propagated, at the same rate; each then trains its own copy of the "
     "sensor end to end for as many updates. Each has one number (inflation, or tempering of particle weights) chosen "
-    "from the same nine values by the CRPS of the velocities times the path's error on the same validation readings. "
+    "from the same values by the CRPS of the velocities times the path's error on the same validation readings. "
     "Where the speeds that the sensor reads are off by one factor on all drives that it has not seen (t test, 5 %), "
-    "all filters know that factor; dead reckoning does not."
+    "all filters may know that factor, if validation says so; dead reckoning does not."
 )
 TITLES = {"dead_reckoning": "dead reckoning", "floor": "floor: true v and theta_dot"}
 HEADLINES = ("m/m", "of its sensor", "deg/m", "devkit", "CRPS v", "CRPS theta_dot", "coverage v", "coverage theta_dot")
