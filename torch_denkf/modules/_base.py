@@ -48,7 +48,8 @@ class SubModel(Checked, TensorDictModule):
         info_prefix: prefix of its diagnostics.
         observation_dim: O of what it writes, where it is known beforehand.
         state_dim: S of an initial belief; on a space, the numbers of a tangent.
-        space: in which the states of an initial belief live; ``None`` for plain numbers.
+        space: in which the states of an initial belief or of an analysis live; ``None`` for plain numbers.
+        reading_space: in which the reading of an analysis lives.
         ensemble_size: E of an initial belief.
         input_dim: size of what an initial belief reads, where that is not S.
 
@@ -86,6 +87,7 @@ class SubModel(Checked, TensorDictModule):
     observation_dim: int | None = None
     state_dim: int | None = None
     space: Space | None = None
+    reading_space: Space | None = None
     ensemble_size: int | None = None
     input_dim: int | None = None
     _wants: frozenset[str] = frozenset()

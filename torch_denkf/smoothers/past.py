@@ -175,6 +175,7 @@ class LaggedAnalysis(InPlaceOf):
             optional_keys=analysis.optional_keys,
         )
         self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
+        self.space, self.reading_space = analysis.space, analysis.reading_space
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
         self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
 
