@@ -80,14 +80,16 @@ def error_state_filter(
         turn = _product(turn, _exp(angles))
         move = np.tile(np.eye(6), (runs, 1, 1))
         move[:, :3, :3] = _matrix(_exp(-angles))
-        move[:, :3, 3:] = -step[..., None] * np.eye(3)
+        move[:, :3, 3:] = -step[..., None] * _right_jacobian(angles)
         cov = move @ cov @ move.mT
         cov[:, range(6), range(6)] += np.array([gyro_noise**2] * 3 + [gyro_walk**2] * 3) * step
         up = _up(turn)
         reads = np.concatenate([_skew(up), np.zeros((runs, 3, 3))], -1)
         gain = cov @ reads.mT @ np.linalg.inv(reads @ cov @ reads.mT + up_noise**2 * np.eye(3))
         change = (gain @ (_unit(force[:, row]) - up)[..., None])[..., 0]
-        cov = (np.eye(6) - gain @ reads) @ cov
+        reset = np.tile(np.eye(6), (runs, 1, 1))
+        reset[:, :3, :3] = _right_jacobian(change[:, :3])
+        cov = reset @ (np.eye(6) - gain @ reads) @ cov @ reset.mT
         cov = 0.5 * (cov + cov.mT)
         turn, bias = _product(turn, _exp(change[:, :3])), bias + change[:, 3:]
         found.append((turn, bias, cov))
@@ -110,6 +112,12 @@ def _exp(angles: ndarray) -> ndarray:
 def _matrix(q: ndarray) -> ndarray:
     cross = _skew(q[..., 1:])
     return np.eye(3) + 2 * q[..., :1, None] * cross + 2 * cross @ cross
+
+
+def _right_jacobian(angles: ndarray) -> ndarray:
+    """Of small turns, up to the fourth power."""
+    cross, square = _skew(angles), (angles**2).sum(-1)[..., None, None]
+    return np.eye(3) - (1 / 2 - square / 24) * cross + (1 / 6 - square / 120) * cross @ cross
 
 
 def _up(q: ndarray) -> ndarray:

@@ -10,8 +10,10 @@ from benchmarks.attitude.baselines import error_state_filter, integrate, mahony
 from benchmarks.attitude.study import Study, baseline_rows, page, scores
 from benchmarks.attitude.task import DT, FIELD, GRAVITY, Sensors, simulated, tilt_error, walking
 from tests.real_data import SHARED
+from torch_denkf import EKF
 from torch_denkf.functional.manifolds import SE23, SO3, rotate
-from torch_denkf.motions import Gravity, InertialMotion, Magnetic
+from torch_denkf.modules import ConstantNoise, MomentPrior
+from torch_denkf.motions import AttitudeMotion, Gravity, InertialMotion, Magnetic
 
 ICUB = SHARED / "icub"
 PERFECT = Sensors(*[0.0] * 7)
@@ -83,6 +85,35 @@ def test_the_covariance_is_that_of_many_runs(float64):
     log = {"orientation": truth.unsqueeze(1).expand(runs, rows, 4)}
     found = scores(torch.as_tensor(turns), log, slice(100, None), torch.as_tensor(cov)[..., :3, :3])
     assert found["claimed"] == pytest.approx(found["tilt"], rel=0.1)
+
+
+@pytest.mark.parametrize("up_noise", [0.05, 1.0])
+def test_the_librarys_filter_is_the_one_in_plain_numpy(float64, up_noise):
+    """On simulated runs that turn about; they share no code."""
+    data = simulated(1, 4.0, 9).double()
+    orientation = data["orientation"] / data["orientation"].norm(dim=-1, keepdim=True)
+    motion = AttitudeMotion("dt", gyro_noise=1e-3, gyro_walk=5e-5)
+    ekf = EKF(
+        motion,
+        None,
+        Gravity(motion.space, gravity=1.0),
+        ConstantNoise([up_noise] * 3, in_key="up"),
+        process_noise=motion.noise_of_step(DT),
+        initial=MomentPrior(
+            torch.cat([orientation[0, 0], torch.zeros(3)]),
+            torch.tensor([0.05**2] * 3 + [0.01**2] * 3).diag(),
+            space=motion.space,
+        ),
+        observation_key="up",
+    )
+    data["dt"], up = torch.full_like(data["dt"], DT), data["accelerometer"]
+    data["up"] = up / up.norm(dim=-1, keepdim=True)
+    out = ekf.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "cov")])
+    plain = error_state_filter(*log_of(data), orientation[:, 0].numpy(), 1e-3, 5e-5, up_noise)
+    turns, biases, cov = map(torch.as_tensor, plain)
+    assert SO3().distance(out["belief", "mean"][..., :4], turns).max() < 1e-7
+    assert_close(out["belief", "mean"][..., 4:], biases, rtol=0, atol=1e-9)
+    assert_close(out["belief", "cov"], cov, rtol=1e-6, atol=1e-10)
 
 
 def test_both_sensors_are_better_than_the_gyro():
