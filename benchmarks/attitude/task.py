@@ -21,6 +21,13 @@ DT = 0.01  # s, of a row
 GRAVITY = 9.81  # m/s^2
 FIELD = (0.0, 20.0, -44.0)  # microtesla in the world's axes, x east, y north, z up: as in central Europe
 _FINE = 10  # steps of the simulator in a row
+_BEARS = 60.0  # N, of a foot that stands
+#: Joints of iCub's log, in its order.
+_JOINTS = (
+    "neck_pitch neck_roll neck_yaw torso_pitch torso_roll torso_yaw l_shoulder_pitch l_shoulder_roll l_shoulder_yaw "
+    "l_elbow r_shoulder_pitch r_shoulder_roll r_shoulder_yaw r_elbow l_hip_pitch l_hip_roll l_hip_yaw l_knee "
+    "l_ankle_pitch l_ankle_roll r_hip_pitch r_hip_roll r_hip_yaw r_knee r_ankle_pitch r_ankle_roll"
+).split()
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,8 @@ def walking(folder: Path) -> TensorDict:
 
     Returns:
         ``[1, T]``, in the axes of the robot's root: ``"imu"``, ``"gyro"``, ``"accelerometer"``; ``"dt"``, which varies;
-        the truth as ``"orientation"`` and ``"position"``.
+        the truth as ``"orientation"`` and ``"position"``. ``"leg"``: the velocity of the sensor in m/s, if the foot
+        that bears more stands still; of the joints and the gyro; ``"leg_observed"``, where it bears more than 60 N.
     """
     with np.load(folder / "walking.npz") as file:
         log = {key: file[key] for key in file.files}
@@ -115,9 +123,13 @@ def walking(folder: Path) -> TensorDict:
     entries["imu"] = np.concatenate([entries["gyro"], entries["accelerometer"]], -1)
     entries["orientation"] = _of_rpy(torch.as_tensor(log["base_rpy"])).numpy()
     entries["position"] = log["base_position"]
+    entries["leg"] = _leg_velocity(folder / "model.urdf", log, entries["gyro"])
     steps = np.diff(log["time"])
     entries["dt"] = np.concatenate([[np.median(steps)], steps])[:, None]
-    return _as_data({key: value[None] for key, value in entries.items()}, 1, len(log["time"]))
+    data = _as_data({key: value[None] for key, value in entries.items()}, 1, len(log["time"]))
+    bears = np.maximum(log["left_foot_force_z"], log["right_foot_force_z"]) > _BEARS
+    data["leg_observed"] = torch.as_tensor(bears).reshape(1, -1, 1)
+    return data
 
 
 def tilt_error(orientation: Tensor, truth: Tensor) -> Tensor:
@@ -155,6 +167,32 @@ def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple
         readings[row, 6:] = data.sensordata[6:]
         poses[row] = [*data.qpos[:3], *data.qvel[:3], *data.qpos[3:]]
     return readings, poses
+
+
+def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> np.ndarray:
+    """The velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
+    tree = ElementTree.parse(urdf)
+    for part in list(tree.iter()):
+        for child in list(part):
+            if child.tag in ("visual", "collision", "gazebo", "sensor"):
+                part.remove(child)
+    options = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-4", "boundinertia": "1e-6"}
+    ElementTree.SubElement(ElementTree.SubElement(tree.getroot(), "mujoco"), "compiler", options)
+    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(tree.getroot(), encoding="unicode"))
+    data = mujoco.MjData(model)
+    joints = [model.joint(name).id for name in _JOINTS]
+    root, imu, *feet = (model.body(name).id for name in ("root_link", "root_link_imu_frame", "l_sole", "r_sole"))
+    left = log["left_foot_force_z"] > log["right_foot_force_z"]
+    found, jacobian = np.empty((len(left), 3)), np.empty((3, model.nv))
+    for row, (angles, rates) in enumerate(zip(log["joint_positions"], log["joint_velocities"], strict=True)):
+        data.qpos[model.jnt_qposadr[joints]] = angles
+        mujoco.mj_forward(model, data)
+        foot = feet[0 if left[row] else 1]
+        mujoco.mj_jacBody(model, data, jacobian, None, foot)
+        moves = jacobian[:, model.jnt_dofadr[joints]] @ rates
+        to_root = data.xmat[root].reshape(3, 3).T
+        found[row] = -to_root @ moves - np.cross(gyro[row], to_root @ (data.xpos[foot] - data.xpos[imu]))
+    return found
 
 
 def _of_rpy(angles: Tensor) -> Tensor:
