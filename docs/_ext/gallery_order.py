@@ -8,6 +8,7 @@ ORDER = (
     "own_recordings",
     "two_sensors",
     "late_readings",
+    "phone",
     "smoothing",
     "training",
     "diagnostics",
