@@ -7,11 +7,11 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 
 from benchmarks.attitude.task import DT, FIELD, GRAVITY, Sensors
 from torch_denkf import EKF, UKF, DEnKF, Filter, FusedFilter, FusedSensor
-from torch_denkf.functional.manifolds import SE23, SO3, Space, rotate
+from torch_denkf.functional.manifolds import SO3, Space, rotate
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 from torch_denkf.motions import AttitudeMotion, Gravity, InertialMotion, Magnetic
 from torch_denkf.motions.motion import Motion

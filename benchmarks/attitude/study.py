@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from benchmarks.attitude.baselines import error_state_filter, integrate, mahony
 from benchmarks.attitude.filters import GivenNoise, attitude_filter, inertial_filter, prepared
+from benchmarks.attitude.pictures import draw
 from benchmarks.attitude.task import DT, Sensors, simulated, tilt_error, walking
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
@@ -107,7 +108,7 @@ def baseline_rows(name: str, data: TensorDict, rows: slice) -> Iterator[dict]:
 def belief_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
     """Orientations ``[R, T, 4]`` and their covariances ``[R, T, 3, 3]``, of moments or of members."""
     mean = out[prefix, "mean"][..., :4]
-    if "cov" in out[prefix].keys():
+    if "cov" in out[prefix]:
         return mean, out[prefix, "cov"][..., :3, :3]
     away = SO3().minus(out[prefix, "ensemble"][..., :4], mean.unsqueeze(-2))
     return mean, away.mT @ away / (away.shape[-2] - 1)
@@ -234,6 +235,14 @@ def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int =
     return noise.requires_grad_(False)
 
 
+def picture(data: TensorDict, learned: SubModel, pull: float, path: Path) -> None:
+    """Roll and pitch of iCub's walk, by the extended filter with learned noise and by Mahony's."""
+    orientation, cov, _ = run(attitude_filter("EKF", GYRO_NOISES["iCub"], learned), prepared(data))
+    log = [data[key].double().numpy() for key in ("gyro", "accelerometer", "dt", "orientation")]
+    other = torch.as_tensor(mahony(*log[:3], log[3][:, 0], proportional=pull, integral=pull / 20))
+    draw(data[0], orientation[0], cov[0], other[0], path, name="EKF, learned noise", level=LEVEL)
+
+
 def page(rows: list[dict], study: Study) -> str:
     """The table."""
     lines = [
@@ -294,5 +303,8 @@ def main() -> None:
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "attitude.csv")
-        torch.save(learned.state_dict(), study.out / "noise.pt")
+        if "iCub" in logs:
+            mahonys = [row for row in rows if row["data"] == "simulated" and row["filter"].startswith("Mahony")]
+            pull = min(mahonys, key=lambda row: row["tilt"])["setting"]
+            picture(logs["iCub"][0], learned, pull, study.out / "attitude.png")
     write_page(page(rows, study), None if study.out is None else study.out / "attitude.md")

@@ -27,7 +27,7 @@ _JOINTS = (
     "neck_pitch neck_roll neck_yaw torso_pitch torso_roll torso_yaw l_shoulder_pitch l_shoulder_roll l_shoulder_yaw "
     "l_elbow r_shoulder_pitch r_shoulder_roll r_shoulder_yaw r_elbow l_hip_pitch l_hip_roll l_hip_yaw l_knee "
     "l_ankle_pitch l_ankle_roll r_hip_pitch r_hip_roll r_hip_yaw r_knee r_ankle_pitch r_ankle_roll"
-).split()
+)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> n
     ElementTree.SubElement(ElementTree.SubElement(tree.getroot(), "mujoco"), "compiler", options)
     model = mujoco.MjModel.from_xml_string(ElementTree.tostring(tree.getroot(), encoding="unicode"))
     data = mujoco.MjData(model)
-    joints = [model.joint(name).id for name in _JOINTS]
+    joints = [model.joint(name).id for name in _JOINTS.split()]
     root, imu, *feet = (model.body(name).id for name in ("root_link", "root_link_imu_frame", "l_sole", "r_sole"))
     left = log["left_foot_force_z"] > log["right_foot_force_z"]
     found, jacobian = np.empty((len(left), 3)), np.empty((3, model.nv))

@@ -2,9 +2,9 @@ r"""
 A phone's log to its orientation
 ================================
 
-A phone has a gyro, an accelerometer and a magnetometer. The gyro says how fast the phone turns, and is a little off: its
-angles drift away. The accelerometer says where up is, but also reads each push of the hand. The magnetometer says where
-north is, ten times a second.
+A phone has a gyro, an accelerometer and a magnetometer. The gyro says how fast the phone turns, and is a little off:
+its angles drift away. The accelerometer says where up is, but also reads each push of the hand. The magnetometer says
+where north is, ten times a second.
 
 This page makes one filter of the three. It tells roll, pitch and yaw with bands, and finds out how far off the gyro is.
 The state is an *orientation*, which is no list of plain numbers: :doc:`/how_to/orientation` has the convention.
@@ -13,9 +13,9 @@ The state is an *orientation*, which is no list of plain numbers: :doc:`/how_to/
 # %%
 # The log
 # -------
-# Twelve seconds at 50 Hz. A hand turns the phone about, and pushes it by about 1 m/s^2 for a few tenths of a second at a
-# time. In place of this simulation you would read a file: the gyro in rad/s, the accelerometer in m/s^2 with gravity in
-# it, the magnetometer in microtesla, all in the phone's axes.
+# Twelve seconds at 50 Hz. A hand turns the phone about, and pushes it by about 1 m/s^2 for a few tenths of a second. In
+# place of this simulation you would read a file: the gyro in rad/s, the accelerometer in m/s^2 with gravity in it, the
+# magnetometer in microtesla, all in the phone's axes.
 
 from functools import partial
 
@@ -62,8 +62,8 @@ data["magnetometer_observed"] = (torch.arange(ROWS) % 5 == 0).unsqueeze(-1)
 # %%
 # The filter
 # ----------
-# ``AttitudeMotion`` turns the orientation by what the gyro reads, less its bias. The state is a quaternion and that bias,
-# seven numbers. Errors have six: three of a small turn, three of the bias. So the standard deviations have six, too.
+# ``AttitudeMotion`` turns the orientation by what the gyro reads, less its bias. The state is a quaternion and that
+# bias, seven numbers. Errors have six: three of a small turn, three of the bias. So standard deviations have six, too.
 #
 # A push lasts for many readings, which are then wrong in the same way. The filter takes errors for independent ones. So
 # the accelerometer's standard deviation is several times the size of a push.
