@@ -29,7 +29,7 @@ __all__ = ["SE2", "SE3", "SE23", "SO3", "Circle", "Euclidean", "Product", "Space
 
 _SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # angles squared below which a series is as exact as the formula
 _NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # likewise, of the series of the arc tangent
-_MEAN_STEPS = 4  # of Gauss-Newton; each squares the error, and the first is right to a few percent
+_MEAN_STEPS = 4  # each leaves about a tenth of the variance in rad^2: of 0.3 rad 1e-8 is left, of 0.6 rad 1e-5
 
 
 class Space:
@@ -97,8 +97,8 @@ class Space:
     def mean(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
         """The point ``[*B, P]`` around which the tangents to points ``[*B, E, P]`` add up to zero.
 
-        A few Gauss-Newton steps from the first point. It is unique where the points lie within a quarter turn of one of
-        them.
+        A few steps, each by the mean tangent, from the first point. It is unique where the points lie within a quarter
+        turn of one of them.
 
         Args:
             points: ``[*B, E, P]``.
