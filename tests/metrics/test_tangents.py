@@ -1,4 +1,4 @@
-"""Metrics of points of a space: as with angles, as of numbers, in a turned world, and of beliefs that fit their truth."""
+"""Metrics of points of a space: as with angles, as of numbers, in a turned world, and where a belief fits its truth."""
 
 import math
 
