@@ -134,6 +134,7 @@ def test_every_public_name_is_there():
         "pretrained",
         "fusion",
         "monitoring",
+        "motions",
         "training",
         "deployment",
         "applications.car",

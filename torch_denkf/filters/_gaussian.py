@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
-from torch_denkf.modules._running import check_module
+from torch_denkf.functional.manifolds import Space
+from torch_denkf.modules._running import check_module, declared
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -26,6 +27,8 @@ class GaussianOptions(FilterOptions, total=False):
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default. What is never
             observed grows by it without bound.
         angles: components of the observation that are angles in radians; none by default.
+        reading_space: in which the reading lives, in the place of ``angles``. That of the state is the initial
+            belief's.
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; ``("sensor", "ensemble")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
@@ -33,6 +36,7 @@ class GaussianOptions(FilterOptions, total=False):
 
     inflation: float
     angles: Sequence[int]
+    reading_space: Space | None
     observation_key: NestedKey
     observed_key: NestedKey
 
@@ -63,6 +67,7 @@ class GaussianFilter(Filter):
         initial: TensorDictModuleBase,
         inflation: float = 1.0,
         angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         observation_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
@@ -70,7 +75,10 @@ class GaussianFilter(Filter):
         check_module("noise", noise)
         check_module("initial", initial)
         refuse_other_beliefs(type(self).__name__, initial, transition.in_keys[:2])
+        space = declared(initial).space
+        spaces = {} if space is None and reading_space is None else {"space": space, "reading_space": reading_space}
         update = analysis(
+            **spaces,
             inflation=inflation,
             angles=angles,
             observation_key=observation_key,

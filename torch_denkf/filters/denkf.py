@@ -14,6 +14,7 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
@@ -25,7 +26,7 @@ from torch_denkf.modules import (
     StochasticMLP,
     as_process_noise,
 )
-from torch_denkf.modules._running import check_module, in_sequences, writes
+from torch_denkf.modules._running import check_module, declared, in_sequences, writes
 
 __all__ = ["DEnKF"]
 
@@ -54,6 +55,7 @@ class DEnKF(Filter):
             number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
             ensemble without any process noise collapses. ``None``: the transition's own noise alone.
         angles: components of the observation that are angles in radians, for the default ``analysis``.
+        reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
@@ -85,6 +87,7 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey | None = None,
         **kwargs: Unpack[FilterOptions],
@@ -94,10 +97,13 @@ class DEnKF(Filter):
         check_module("noise", noise)
         check_module("initial", initial)
         if process_noise is not None:
-            transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
-        if analysis is not None and (angles or observation_key is not None or observed_key is not None):
+            q = as_process_noise(process_noise, initial)
+            transition = NoisyTransition(transition, q, space=declared(initial).space)
+        told = angles or reading_space is not None or observation_key is not None or observed_key is not None
+        if analysis is not None and told:
             raise ValueError(
-                "angles, observation_key and observed_key are for the default analysis; give them to yours instead."
+                "angles, reading_space, observation_key and observed_key are for the default analysis; give them to "
+                "yours instead."
             )
         if analysis is None:
             if observation_key is None and sensor is None:
@@ -108,7 +114,13 @@ class DEnKF(Filter):
                 reading = writes(last)[0]
             mask = "observed" if observed_key is None else observed_key
             keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
-            analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)
+            analysis = EnsembleAnalysis(
+                "perturbed" if sensor is None else "sensor",
+                angles=angles,
+                space=declared(initial).space,
+                reading_space=reading_space,
+                **keys,
+            )
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
         modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)
         super().__init__(modules, initial=initial, **kwargs)

@@ -9,6 +9,7 @@ from typing import Unpack
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
+from torch_denkf.modules._running import declared
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.process_noise import as_process_noise
 
@@ -73,5 +74,6 @@ class EKF(GaussianFilter):
         **options: Unpack[GaussianOptions],
     ):
         q = as_process_noise(process_noise, initial)
-        forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient)
+        space = declared(initial).space
+        forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient, space=space)
         super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)

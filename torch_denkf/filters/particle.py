@@ -11,8 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
-from torch_denkf.modules._running import check_module
+from torch_denkf.modules._running import check_module, declared
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
@@ -49,6 +50,7 @@ class ParticleFilter(Filter):
         process_noise: Q of the motion, beside the transition's own noise: standard deviations ``[S]`` (a number for
             all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
         angles: components of the observation that are angles in radians, for the default likelihood.
+        reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
@@ -93,6 +95,7 @@ class ParticleFilter(Filter):
         jitter: float = 0.0,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
         angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
@@ -107,21 +110,25 @@ class ParticleFilter(Filter):
         if process_noise is not None:
             if isinstance(transition, ResampledTransition):
                 raise ValueError("A ResampledTransition holds its motion: put the process noise into that.")
-            transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
+            q = as_process_noise(process_noise, initial)
+            transition = NoisyTransition(transition, q, space=declared(initial).space)
         if likelihood is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
             reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
             keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
-            likelihood = GaussianLikelihood(angles=angles, observation_key=reading, observed_key=observed_key, **keys)
-        elif angles or observation_key is not None:
+            likelihood = GaussianLikelihood(
+                angles=angles, reading_space=reading_space, observation_key=reading, observed_key=observed_key, **keys
+            )
+        elif angles or reading_space is not None or observation_key is not None:
             raise ValueError(
-                "angles and observation_key are for the default likelihood; give them to yours instead, the key as "
-                "observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
+                "angles, reading_space and observation_key are for the default likelihood; give them to yours instead, "
+                "the key as observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
                 "LearnedLikelihood."
             )
         if analysis is None:
-            analysis = ParticleAnalysis(likelihood if isinstance(likelihood, GaussianLikelihood) else None)
+            of_reading = likelihood if isinstance(likelihood, GaussianLikelihood) else None
+            analysis = ParticleAnalysis(of_reading, space=declared(initial).space)
         if not isinstance(transition, ResampledTransition):
             transition = ResampledTransition(
                 transition,

@@ -141,7 +141,7 @@ class Steps(NamedTuple):
             for key in structure.belief:
                 written[key] = where_rows(reset, begin[key], written[key])
         if self.ceiling is not None:
-            hold_variances(written, structure.belief, self.ceiling, self.say)
+            hold_variances(written, structure.belief, self.ceiling, self.say, structure.space)
         if self.reject:
             written[REJECTED] = entries[REJECTED]
         return written

@@ -11,6 +11,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters.rejection import Guard, guards_of
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import (
     declared,
@@ -80,6 +81,7 @@ class Structure(NamedTuple):
         unmasked: modules of the update that take in a reading and read no mask.
         own_info: new names for diagnostics that several analyses would write under one.
         totals: sums of those over the analyses.
+        space: in which the state lives; ``None`` for plain numbers.
         likelihoods: the log-likelihood of each analysis' reading.
         frame_keys: what the frame modules write.
         step_keys: what transition and update write.
@@ -103,6 +105,7 @@ class Structure(NamedTuple):
     unmasked: tuple[Placed, ...]
     own_info: dict[str, dict[NestedKey, NestedKey]]
     totals: dict[NestedKey, tuple[NestedKey, ...]]
+    space: Space | None
     likelihoods: tuple[NestedKey, ...]
     frame_keys: tuple[NestedKey, ...]
     step_keys: tuple[NestedKey, ...]
@@ -202,6 +205,7 @@ class Structure(NamedTuple):
             unmasked=tuple(_unmasked(steps, carry)),
             own_info=own_info,
             totals=totals,
+            space=declared(initial).space,
             likelihoods=tuple(_likelihoods(steps, own_info, totals)),
             frame_keys=tuple(dict.fromkeys(key for _, module in frames for key in writes(module))),
             step_keys=step_keys,

@@ -9,6 +9,7 @@ from typing import Unpack
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
+from torch_denkf.modules._running import declared
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 
@@ -72,6 +73,7 @@ class UKF(GaussianFilter):
         **options: Unpack[GaussianOptions],
     ):
         q = as_process_noise(process_noise, initial)
-        forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa)
+        space = declared(initial).space
+        forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa, space=space)
         update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)
         super().__init__(sensor, noise, forecast, update, initial=initial, **options)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional.linalg import semidefinite_solve
+from torch_denkf.functional.manifolds import Space
 
 
 def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
@@ -42,6 +43,8 @@ def rts_step(
     cross: Tensor,
     smoothed_mean: Tensor,
     smoothed_cov: Tensor,
+    *,
+    space: Space | None = None,
 ) -> tuple[Tensor, Tensor]:
     """One step back in time: the smoothed belief of t from that of t + 1.
 
@@ -55,6 +58,8 @@ def rts_step(
         cross: C, the covariance of the states at t and t + 1 in that forecast, ``[*B, S, S]``, rows at t.
         smoothed_mean: of t + 1, ``[*B, S]``.
         smoothed_cov: P_s of t + 1, ``[*B, S, S]``.
+        space: in which the state lives: means are points, and each covariance is of the tangents at its mean. ``None``
+            for plain numbers.
 
     Returns:
         The smoothed mean ``[*B, S]`` and covariance ``[*B, S, S]`` of t.
@@ -71,15 +76,23 @@ def rts_step(
         >>> mean.round(decimals=4), cov.round(decimals=4)
         (tensor([1.]), tensor([[0.5000]]))
     """
-    square = (*mean.shape, mean.shape[-1])
+    size = mean.shape[-1] if space is None else space.tangent_dim
+    square = (*mean.shape[:-1], size, size)
     for name, value in (("forecast_mean", forecast_mean), ("smoothed_mean", smoothed_mean)):
         check_shape(name, value, mean.shape, "[*B, S]")
     for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross), ("smoothed_cov", smoothed_cov)):
         check_shape(name, value, square, "[*B, S, S]")
     gain = smoothing_gain(cross, forecast_cov)
-    shift = gain @ (smoothed_mean - forecast_mean).unsqueeze(-1)
-    out = cov - gain @ cross.mT + gain @ smoothed_cov @ gain.mT
-    return mean + shift.squeeze(-1), (out + out.mT) / 2
+    if space is None:
+        shift = gain @ (smoothed_mean - forecast_mean).unsqueeze(-1)
+        out = cov - gain @ cross.mT + gain @ smoothed_cov @ gain.mT
+        return mean + shift.squeeze(-1), (out + out.mT) / 2
+    learned = space.minus(smoothed_mean, forecast_mean)
+    back = gain @ torch.linalg.inv(space.right_jacobian(learned))  # from the tangents at the smoothed mean
+    step = (gain @ learned.unsqueeze(-1)).squeeze(-1)
+    turn = space.right_jacobian(step)  # to the tangents at the new mean
+    out = turn @ (cov - gain @ cross.mT + back @ smoothed_cov @ back.mT) @ turn.mT
+    return space.plus(mean, step), (out + out.mT) / 2
 
 
 def rts_smooth(
@@ -91,6 +104,7 @@ def rts_smooth(
     *,
     follows: Tensor | None = None,
     lag: int | None = None,
+    space: Space | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Smooth the beliefs of a whole sequence.
 
@@ -103,6 +117,7 @@ def rts_smooth(
         follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it, such as the first
             of an episode: nothing flows back from there. The first element's is not read. None: all follow.
         lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+        space: in which the state lives, see :func:`rts_step`.
 
     Returns:
         The smoothed means ``[*B, T, S]`` and covariances ``[*B, T, S, S]``.
@@ -127,7 +142,7 @@ def rts_smooth(
     def back(index: slice | int, later_mean: Tensor, later_cov: Tensor) -> tuple[Tensor, Tensor]:
         own = before[..., index, :], before_cov[..., index, :, :]
         step = forecast[..., index, :], predicted_cov[..., index, :, :], link[..., index, :, :]
-        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov)
+        new_mean, new_cov = rts_step(*own, *step, later_mean, later_cov, space=space)
         if follows is None:
             return new_mean, new_cov
         joined = follows[..., index].unsqueeze(-1)

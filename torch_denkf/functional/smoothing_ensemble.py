@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_ensemble, check_number, check_shape
 from torch_denkf.functional.linalg import cholesky, semidefinite_solve
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_anomalies
 from torch_denkf.functional.smoothing import check_lag
 
@@ -81,6 +82,7 @@ def enrts_smooth(
     follows: Tensor | None = None,
     lag: int | None = None,
     damping: float = 1.0,
+    space: Space | None = None,
 ) -> Tensor:
     """Smooth the ensembles of a whole sequence.
 
@@ -90,6 +92,8 @@ def enrts_smooth(
         follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
         lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
         damping: see :func:`enrts_step`.
+        space: in which the state lives: members are points, and :func:`enrts_step` is made with the tangents at the
+            mean of each time. ``None`` for plain numbers.
 
     Returns:
         The smoothed ensembles, ``[*B, T, E, S]``.
@@ -113,8 +117,13 @@ def enrts_smooth(
         follows = follows[..., 1:]
 
     def back(index: slice | int, later: Tensor) -> Tensor:
-        own = before[..., index, :, :]
-        out = enrts_step(own, moved[..., index, :, :], later, damping=damping)
+        own, forecast = before[..., index, :, :], moved[..., index, :, :]
+        if space is None:
+            out = enrts_step(own, forecast, later, damping=damping)
+        else:
+            center, expected = (space.mean(points).unsqueeze(-2) for points in (own, forecast))
+            tangents = [space.minus(points, expected) for points in (forecast, later)]
+            out = space.plus(center, enrts_step(space.minus(own, center), *tangents, damping=damping))
         return out if follows is None else torch.where(follows[..., index][..., None, None], out, own)
 
     count = ensemble.shape[-3]

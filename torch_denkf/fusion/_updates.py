@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
@@ -24,10 +26,18 @@ class Updates:
         lag: L.
         size: S.
         analysis: makes an update.
+        space: in which the state lives; ``None`` for plain numbers.
     """
 
-    def __init__(self, gaussian: bool, lag: int, size: int, analysis: Callable[..., TensorDictModuleBase]):
-        self.gaussian, self.lag, self.size, self.analysis = gaussian, lag, size, analysis
+    def __init__(
+        self,
+        gaussian: bool,
+        lag: int,
+        size: int,
+        analysis: Callable[..., TensorDictModuleBase],
+        space: Space | None = None,
+    ):
+        self.gaussian, self.lag, self.size, self.analysis, self.space = gaussian, lag, size, analysis, space
 
     def in_turn(self, prefix, last, sensors, wired):
         """An update for each sensor."""
@@ -38,7 +48,10 @@ class Updates:
             keys = {"reading": wired[name].reading, "noise": wired[name].noise, "observed": wired[name].observed}
             if model.state_dim is not None:
                 keys["observed"] = model.out_keys[1]
-            modules.update(self._update(name, model, prefix, to, sensor.angles, sensor.analysis, **keys))
+            told: dict[str, Any] = {"angles": list(sensor.angles)}
+            if self.space is not None or sensor.reading_space is not None:
+                told |= {"space": self.space, "reading_space": sensor.reading_space}
+            modules.update(self._update(name, model, prefix, to, told, sensor.analysis, **keys))
             prefix = to
         return modules
 
@@ -47,6 +60,9 @@ class Updates:
         own = [name for name, sensor in sensors.items() if sensor.analysis is not None]
         if own:
             raise ValueError(f"A joint update is one for all sensors, and {own} have an analysis of their own.")
+        spaces = [name for name, sensor in sensors.items() if sensor.reading_space is not None]
+        if spaces:
+            raise ValueError(f"A joint update is for plain numbers, and {spaces} read points: leave joint=True away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
         keys = {
             "reading": ("sensor", "joint"),
@@ -63,8 +79,8 @@ class Updates:
             observation_dim=None if None in sizes else sum(size for size in sizes if size is not None),
         )
         model = JoinedObservation(models, predicted_key=("forecast", "observation"), observed_key=keys["observed"])
-        angles = _joint_angles(sensors)
-        return {"readings": join, **self._update("analysis", model, prefix, last, angles, None, **keys)}
+        told = {"angles": _joint_angles(sensors)} | ({} if self.space is None else {"space": self.space})
+        return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
         """The sensors' weights, and their noise after them."""
@@ -105,9 +121,9 @@ class Updates:
             seen_key=wired.observed if self.gaussian else ("forecast", name, "observed"),
         )
 
-    def _update(self, name, model, prefix, to, angles, analysis, *, reading, noise, observed):
+    def _update(self, name, model, prefix, to, told, analysis, *, reading, noise, observed):
         make = self.analysis if analysis is None else analysis
-        keys = {"noise_variance_key": noise, "observed_key": observed, "belief_prefix": to, "angles": list(angles)}
+        keys = {"noise_variance_key": noise, "observed_key": observed, "belief_prefix": to, **told}
         predicted = unravel_key(model.out_keys[0])
         if self.gaussian:
             keys |= {"observation_key": reading, "forecast_prefix": prefix}

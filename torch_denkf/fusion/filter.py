@@ -125,7 +125,10 @@ class FusedFilter(Filter):
             wired[name] = wire(name, sensor)
             modules.update(wired[name].modules)
         age = -1 if kwargs.get("update_at_reset") else 0
-        size = declared(initial).state_dim or 0
+        space = declared(initial).space
+        size = (declared(initial).state_dim if space is None else space.point_dim) or 0
+        if gaussian and lag and space is not None:
+            raise ValueError(f"Late readings of a mean and a covariance are for plain numbers, not for {space}.")
         if lag and not size:
             raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
         prefix = "forecast"
@@ -137,7 +140,8 @@ class FusedFilter(Filter):
             initial = with_past(initial, lag, ENSEMBLE_PAST, age=age)
         else:
             modules["transition"] = transition
-        build = Updates(gaussian, lag, size, _analysis_for(transition, gaussian) if analysis is None else analysis)
+        made = _analysis_for(transition, gaussian) if analysis is None else analysis
+        build = Updates(gaussian, lag, size, made, space)
         if weights is not None:
             modules.update(build.weighted(prefix, sensors, wired, weights))
         last = "fused" if gaussian and lag else "belief"
@@ -145,7 +149,7 @@ class FusedFilter(Filter):
         _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
         modules.update(updates)
         if lag:
-            modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief()
+            modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief(space=space)
         super().__init__(modules, initial=initial, **kwargs)
         self.sensors, self.lag = tuple(sensors), lag
 
@@ -205,8 +209,9 @@ def _moving(transition, process_noise, initial, gaussian):
         if gaussian:
             raise ValueError("A mean and a covariance need process_noise=..., standard deviations [S] or a module.")
         return transition
-    noise = as_process_noise(process_noise, initial)
-    return EKFTransition(transition, noise) if gaussian else NoisyTransition(transition, noise)
+    noise, space = as_process_noise(process_noise, initial), declared(initial).space
+    made = EKFTransition if gaussian else NoisyTransition
+    return made(transition, noise, space=space)
 
 
 def _analysis_for(transition: TensorDictModuleBase, gaussian: bool) -> Callable[..., TensorDictModuleBase]:

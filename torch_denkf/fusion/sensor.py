@@ -10,6 +10,7 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf._arguments import Checked
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import Renamed
 from torch_denkf.modules import ConstantNoise
 from torch_denkf.modules._running import in_sequences, marks_of, writes
@@ -38,6 +39,7 @@ class FusedSensor(Checked):
             the covariances all since.
         late_key: an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
         angles: components of the reading that are angles in radians.
+        reading_space: in which the reading lives, in the place of ``angles``; R is of tangents.
         features_key: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the
             data, or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
         analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
@@ -51,6 +53,7 @@ class FusedSensor(Checked):
     delay: int = 0
     late_key: NestedKey | None = None
     angles: Sequence[int] = ()
+    reading_space: Space | None = None
     features_key: NestedKey | None = None
     analysis: Callable[..., TensorDictModuleBase] | None = None
 

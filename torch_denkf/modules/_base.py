@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._arguments import Checked
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._call import Call, Entries, Noise, flat_noise
 
 __all__ = ["EXPLAINED", "SubModel"]
@@ -46,7 +47,9 @@ class SubModel(Checked, TensorDictModule):
         mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
         info_prefix: prefix of its diagnostics.
         observation_dim: O of what it writes, where it is known beforehand.
-        state_dim: S of an initial belief.
+        state_dim: S of an initial belief; on a space, the numbers of a tangent.
+        space: in which the states of an initial belief or of an analysis live; ``None`` for plain numbers.
+        reading_space: in which the reading of an analysis lives.
         ensemble_size: E of an initial belief.
         input_dim: size of what an initial belief reads, where that is not S.
 
@@ -83,6 +86,8 @@ class SubModel(Checked, TensorDictModule):
     info_prefix: str | None = None
     observation_dim: int | None = None
     state_dim: int | None = None
+    space: Space | None = None
+    reading_space: Space | None = None
     ensemble_size: int | None = None
     input_dim: int | None = None
     _wants: frozenset[str] = frozenset()

@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from torch_denkf._checks import check_number, check_values
 from torch_denkf.functional.angles import align_angles
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._spaces import checked_spaces
 from torch_denkf.modules._tensors import check_dims
 
 __all__ = ["EnsembleAnalysisKeys", "EnsembleUpdate"]
@@ -52,6 +54,8 @@ class EnsembleUpdate(SubModel):
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        space: of the state; ``None`` for plain numbers.
+        reading_space: of the reading; ``None`` for plain numbers, and ``angles``.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         localisation: ``"significance"`` or ``None``.
         threshold: of ``"significance"``, in standard deviations.
@@ -71,6 +75,8 @@ class EnsembleUpdate(SubModel):
         relaxation: float,
         rotate: bool,
         angles: Sequence[int],
+        space: Space | None = None,
+        reading_space: Space | None = None,
         covariance: bool = False,
         localisation: Literal["significance"] | None = None,
         threshold: float | Tensor = 3.0,
@@ -95,6 +101,7 @@ class EnsembleUpdate(SubModel):
         check_dims("angles", angles)
         self.inflation, self.relaxation, self.rotate = inflation, relaxation, rotate
         self.angles, self.info_prefix = list(angles), info_prefix
+        self.space, self.reading_space = checked_spaces(space, reading_space, angles)
         if localisation not in (None, "significance"):
             raise ValueError(f'localisation is "significance" or None; got {localisation!r}.')
         if localisation is not None:

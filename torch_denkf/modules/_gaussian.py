@@ -11,11 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_number
-from torch_denkf.functional.angles import mean_observation
+from torch_denkf.functional.angles import mean_observation, wrap_angles
 from torch_denkf.functional.gaussian import GaussianUpdate
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._spaces import checked_space, checked_spaces, without_hidden
 from torch_denkf.modules._tensors import check_dims
 from torch_denkf.modules.stochastic import FlipoutLinear, StochasticMLP, deterministic
 
@@ -31,12 +33,14 @@ class GaussianTransitionKeys(TypedDict, total=False):
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
         ensemble_key: what the transition reads, ``("belief", "ensemble")`` by default.
         forecast_ensemble_key: what it writes, ``("forecast", "ensemble")`` by default.
+        space: in which the state lives; ``None`` by default, for plain numbers. Covariances and Q are of tangents.
     """
 
     belief_prefix: str
     forecast_prefix: str
     ensemble_key: NestedKey
     forecast_ensemble_key: NestedKey
+    space: Space | None
 
 
 class GaussianTransition(SubModel):
@@ -62,6 +66,7 @@ class GaussianTransition(SubModel):
         forecast_prefix: str = "forecast",
         ensemble_key: NestedKey = ("belief", "ensemble"),
         forecast_ensemble_key: NestedKey = ("forecast", "ensemble"),
+        space: Space | None = None,
     ):
         check_module("transition", transition)
         check_module("process_noise", process_noise)
@@ -70,7 +75,7 @@ class GaussianTransition(SubModel):
         self_made = [unravel_key(ensemble_key), *out_keys]
         further, optional = further_keys((transition, process_noise), [*in_keys, *self_made])
         super().__init__(transition, in_keys + further, out_keys, optional_keys=optional)
-        self.process_noise = process_noise
+        self.process_noise, self.space = process_noise, checked_space("space", space)
         self.ensemble_key, self.forecast_ensemble_key = map(unravel_key, (ensemble_key, forecast_ensemble_key))
 
     def parts(self):
@@ -109,6 +114,9 @@ class GaussianAnalysisOptions(TypedDict, total=False):
         inflation: factor on the belief's standard deviations, where anything is observed; 1 by default, for none. What
             is never observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
         angles: components of the observation that are angles in radians; their innovation is wrapped to [-pi, pi).
+        space: in which the state lives; ``None`` by default, for plain numbers. ``cov`` and ``var`` are of the tangents
+            at ``mean``.
+        reading_space: in which the reading lives, in the place of ``angles``; innovation and R are tangents.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``;
             ``("sensor", "ensemble")`` by default.
         noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; ``("sensor", "noise")`` by default.
@@ -125,6 +133,8 @@ class GaussianAnalysisOptions(TypedDict, total=False):
 
     inflation: float
     angles: Sequence[int]
+    space: Space | None
+    reading_space: Space | None
     observation_key: NestedKey
     noise_variance_key: NestedKey
     observed_key: NestedKey
@@ -156,6 +166,8 @@ class GaussianAnalysis(SubModel):
         *,
         inflation: float = 1.0,
         angles: Sequence[int] = (),
+        space: Space | None = None,
+        reading_space: Space | None = None,
         observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
         observed_key: NestedKey = "observed",
@@ -175,6 +187,7 @@ class GaussianAnalysis(SubModel):
         check_number("inflation", inflation, above=0)
         check_dims("angles", angles)
         self.inflation, self.angles, self.info_prefix = inflation, list(angles), info_prefix
+        self.space, self.reading_space = checked_spaces(space, reading_space, angles)
         self.ensemble_key, self.predicted_key = unravel_key(ensemble_key), unravel_key(predicted_key)
         self.reading_keys, self.observed_key = self.in_keys[2:4], unravel_key(observed_key)
 
@@ -182,15 +195,38 @@ class GaussianAnalysis(SubModel):
         """The belief and the diagnostics."""
         mean, cov, observation, noise = (self.required(entries, key) for key in self.in_keys[:4])
         if observation.ndim > mean.ndim:
-            observation = mean_observation(observation, self.angles)
+            observation = self._mean_reading(observation)
         update, observed = self._update(entries, mean, cov, observation, noise, call._replace(sample=False))
         values = updated(update, observed, self.inflation)
         return dict(zip(self.out_keys, values, strict=True))
 
+    def _mean_reading(self, samples: torch.Tensor) -> torch.Tensor:
+        """The mean of learned observations ``[*B, E, Q]``."""
+        if self.reading_space is not None:
+            return self.reading_space.mean(samples)
+        return mean_observation(samples, self.angles)
+
+    def _innovation(
+        self, observation: torch.Tensor, predicted: torch.Tensor, observed: torch.Tensor | None
+    ) -> torch.Tensor:
+        """How far the reading is from what is predicted ``[*B, Q]``, the shorter way round: ``[*B, O]``."""
+        if self.reading_space is None:
+            return wrap_angles(observation - predicted, self.angles)
+        return self.reading_space.minus(without_hidden(observation, predicted, observed), predicted)
+
+    def _moved(self, mean: torch.Tensor, update: GaussianUpdate) -> GaussianUpdate:
+        """An update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
+        if self.space is None:
+            return update._replace(mean=mean + update.mean)
+        turn = self.space.right_jacobian(update.mean)
+        cov = turn @ update.cov @ turn.mT
+        return update._replace(mean=self.space.plus(mean, update.mean), cov=(cov + cov.mT) / 2)
+
     def reading_dims(self, entries, call):
         """O, as the model predicts it."""
         mean = self.required(entries, self.in_keys[0])
-        return [self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]] * 2
+        size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
+        return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
 
     def mask(self, entries: Entries, mean: torch.Tensor, call: Call) -> torch.Tensor | None:
         """What is observed, ``[*B, 1]`` or ``[*B, O]``, as the model says that the analysis runs inside."""

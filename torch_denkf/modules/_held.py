@@ -10,6 +10,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torch_denkf._checks import flag_value
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_median
 from torch_denkf.modules._call import Entries
 
@@ -20,7 +21,11 @@ _FARTHEST = 1000.0
 
 
 def hold_variances(
-    written: Entries, belief: Iterable[NestedKey], ceiling: float, say: Callable[[NestedKey], None]
+    written: Entries,
+    belief: Iterable[NestedKey],
+    ceiling: float,
+    say: Callable[[NestedKey], None],
+    space: Space | None = None,
 ) -> None:
     """Holds the variances at the ceiling, in place of the entries ``written``; the correlations stay.
 
@@ -32,6 +37,7 @@ def hold_variances(
         belief: keys of the belief.
         ceiling: largest variance, in the state's units squared.
         say: told which variance is held.
+        space: in which the state lives; there the mean stays, and particles do.
     """
     for key in belief:
         variance = written.get(key) if key[-1] == "var" else None
@@ -52,6 +58,15 @@ def hold_variances(
         factor = (variance / ceiling).clamp(min=1).rsqrt()
         written[key] = variance * factor.square()
         log_weight = written.get((*prefix, "log_weight"))
+        cov, ensemble = written.get((*prefix, "cov")), written.get((*prefix, "ensemble"))
+        if space is not None:
+            if cov is not None:
+                written[*prefix, "cov"] = cov * factor.unsqueeze(-1) * factor.unsqueeze(-2)
+            if ensemble is not None and log_weight is None:
+                center = mean.unsqueeze(-2)
+                limited = space.plus(center, space.minus(ensemble, center) * factor.unsqueeze(-2))
+                written[*prefix, "ensemble"] = torch.where((factor < 1).any(-1)[..., None, None], limited, ensemble)
+            continue
         if log_weight is not None:
             particles = _held_particles(written[*prefix, "ensemble"], log_weight, factor < 1, ceiling, farthest)
             written[mean_key] = torch.where(factor < 1, weighted_mean(particles, log_weight), mean)
@@ -59,10 +74,8 @@ def hold_variances(
             continue
         held = mean.clamp(-farthest, farthest)
         written[mean_key] = held
-        cov = written.get((*prefix, "cov"))
         if cov is not None:
             written[*prefix, "cov"] = cov * factor.unsqueeze(-1) * factor.unsqueeze(-2)
-        ensemble = written.get((*prefix, "ensemble"))
         if ensemble is not None:
             deviations = (ensemble - mean.unsqueeze(-2)) * factor.unsqueeze(-2)
             limited = held.unsqueeze(-2) + deviations

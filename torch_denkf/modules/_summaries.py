@@ -12,6 +12,8 @@ from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
+from torch_denkf.modules._running import declared
+from torch_denkf.modules._spaces import moments_on
 
 __all__ = ["summaries"]
 
@@ -41,8 +43,11 @@ def summaries(
         prefix, name = key[:-1], key[-1]
         ensemble, weights = out.get((*prefix, "ensemble")), out.get((*prefix, "log_weight"))
         cov = out.get((*prefix, "cov"))
+        space = declared(initial).space
         if key in of_past:
             out[key] = of_past[key]
+        elif ensemble is not None and space is not None and name in _OF_PARTICLES:
+            out[key] = moments_on(space, ensemble, weights)[name == "var"]
         elif ensemble is not None and weights is not None and name in _OF_PARTICLES:
             out[key] = _OF_PARTICLES[name](ensemble, weights)
         elif ensemble is not None and weights is None and name in _OF_ENSEMBLE:

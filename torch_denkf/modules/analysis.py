@@ -11,8 +11,10 @@ from tensordict import unravel_key
 from torch_denkf._checks import check_values
 from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
 from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_prior_spread
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
+from torch_denkf.modules._spaces import reading_about
 from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]
@@ -38,6 +40,10 @@ class EnsembleAnalysis(EnsembleUpdate):
         threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
             more updates a component sees between two readings about it, the larger.
         angles: components of the observation that are angles in radians: their innovation is the shorter way round.
+        space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
+            made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
+            :mod:`torch_denkf.functional.manifolds`.
+        reading_space: in which the reading lives; innovation and R are tangents. In the place of ``angles``.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         **keys: see :class:`~torch_denkf.modules._ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
             learned observations, not one reading.
@@ -71,6 +77,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         localisation: Literal["significance"] | None = None,
         threshold: float | torch.Tensor = 3.0,
         angles: Sequence[int] = (),
+        space: Space | None = None,
+        reading_space: Space | None = None,
         covariance: bool = False,
         **keys: Unpack[EnsembleAnalysisKeys],
     ):
@@ -86,6 +94,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             relaxation=relaxation,
             rotate=rotate,
             angles=angles,
+            space=space,
+            reading_space=reading_space,
             covariance=covariance,
             localisation=localisation,
             threshold=threshold,
@@ -121,6 +131,12 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""
+        if self.reading_space is not None:
+            predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
+        center = None
+        if self.space is not None:
+            center = self.space.mean(forecast).unsqueeze(-2)
+            forecast = self.space.minus(forecast, center)
         ensemble, innovation, nis, log_likelihood = self._formula(
             forecast,
             predicted,
@@ -136,9 +152,14 @@ class EnsembleAnalysis(EnsembleUpdate):
             if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
                 inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
-        mean = ensemble_mean(ensemble)
-        cov = (ensemble_cov(ensemble),) if self.covariance else ()
-        return ensemble, mean, ensemble_var(ensemble, mean), innovation, nis, log_likelihood, *cov
+        mean, away = ensemble_mean(ensemble), ensemble
+        if self.space is not None and center is not None:
+            ensemble = self.space.plus(center, ensemble)
+            mean = self.space.mean(ensemble)
+            away = self.space.minus(ensemble, mean.unsqueeze(-2))
+        var = ensemble_var(away, mean if center is None else None)
+        cov = (ensemble_cov(away),) if self.covariance else ()
+        return ensemble, mean, var, innovation, nis, log_likelihood, *cov
 
     def _factor(self, ensemble) -> float | torch.Tensor:
         """Of the inflation: one for all components, or ``[*B, 1, S]``."""
@@ -150,6 +171,12 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
         """See :meth:`SubModel.move_past`; neither inflation nor relaxation touches the past."""
+        if self.reading_space is not None:
+            predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
+        center = None
+        if self.space is not None:
+            center = self.space.mean(past.movedim(-3, -2)).unsqueeze(-3)  # of each time
+            past = self.space.minus(past, center)
         lag, dim = past.shape[-2:]
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
@@ -158,7 +185,8 @@ class EnsembleAnalysis(EnsembleUpdate):
         if isinstance(threshold, torch.Tensor) and threshold.numel() > 1:
             options["significance"] = threshold.repeat(lag)
         moved = self._formula(past.flatten(-2), predicted, observation, variance, observed=observed, **options)
-        return moved.ensemble.unflatten(-1, past.shape[-2:])
+        ensemble = moved.ensemble.unflatten(-1, past.shape[-2:])
+        return ensemble if self.space is None or center is None else self.space.plus(center, ensemble)
 
     def _any(self, observed):
         """Where anything is observed, ``[*B]``."""

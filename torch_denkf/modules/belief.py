@@ -11,7 +11,9 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_values
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._spaces import checked_space, moments_on
 from torch_denkf.modules._tensors import (
     as_floating,
     as_standard_deviations,
@@ -33,9 +35,13 @@ class _InitialEnsemble(SubModel):
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
         optional_keys: Sequence[NestedKey] = (),
+        space: Space | None = None,
     ):
         super().__init__(nn.Identity(), in_keys, out_keys, optional_keys=optional_keys)
         std = as_standard_deviations("std", std)
+        self.space = checked_space("space", space)
+        if space is not None:
+            space.check(tangent=std)
         check_count("ensemble_size", ensemble_size, least=2, cure="One member has no variance")
         self.register_buffer("std", std)
         self.ensemble_size, self.state_dim = ensemble_size, std.numel()
@@ -51,7 +57,11 @@ class _InitialEnsemble(SubModel):
         """Ensemble, mean and variance."""
         if noise is None:
             noise = self.draw_noise(batch_size, device=center.device, dtype=center.dtype)
-        ensemble = center.unsqueeze(-2) + std.unsqueeze(-2) * noise.to(center.dtype)
+        away = std.unsqueeze(-2) * noise.to(center.dtype)
+        if self.space is not None:
+            ensemble = self.space.plus(center.unsqueeze(-2), away)
+            return ensemble, *moments_on(self.space, ensemble)
+        ensemble = center.unsqueeze(-2) + away
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble)
 
 
@@ -65,6 +75,7 @@ class GaussianPrior(_InitialEnsemble):
         mean: ``[S]``, in the state's units.
         std: standard deviations ``[S]``.
         ensemble_size: E.
+        space: in which the state lives; ``None`` for plain numbers. ``mean`` is a point, ``std`` is of the tangents.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Example:
@@ -80,11 +91,14 @@ class GaussianPrior(_InitialEnsemble):
         std: Sequence[float] | torch.Tensor,
         *,
         ensemble_size: int = 32,
+        space: Space | None = None,
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [], out_keys)
+        super().__init__(std, ensemble_size, [], out_keys, space=space)
         mean = as_floating(mean, "mean")
-        if mean.shape != self.std.shape:
+        if space is not None:
+            space.check(mean=mean)
+        elif mean.shape != self.std.shape:
             raise ValueError(f"mean and std differ in shape: {list(mean.shape)} and {list(self.std.shape)}.")
         check_values("mean", mean)
         self.register_buffer("mean", mean)
@@ -101,6 +115,7 @@ class AroundState(_InitialEnsemble):
         std: standard deviations ``[S]``, in the state's units.
         ensemble_size: E.
         state_key: the known state ``[*B, S]``.
+        space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
     Raises:
@@ -119,9 +134,12 @@ class AroundState(_InitialEnsemble):
         *,
         ensemble_size: int = 32,
         state_key: NestedKey = "state",
+        space: Space | None = None,
         out_keys: Sequence[NestedKey] = _BELIEF_KEYS,
     ):
-        super().__init__(std, ensemble_size, [state_key], out_keys)
+        super().__init__(std, ensemble_size, [state_key], out_keys, space=space)
+        if space is not None:
+            self.input_dim = space.point_dim
 
     def compute(self, state, *, noise, batch_size):
         """The belief."""

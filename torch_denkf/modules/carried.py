@@ -99,7 +99,7 @@ class Beside(InPlaceOf):
         super().__init__(initial, needed, list(out_keys), optional_keys=optional)
         self.keys, self.begin = list(map(unravel_key, keys)), begin
         self.follow_keys, self.follow, self.nested = list(map(unravel_key, follow_keys)), follow, nested
-        for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim"):
+        for name in ("ensemble_size", "state_dim", "observation_dim", "input_dim", "space"):
             setattr(self, name, getattr(declared(initial), name))
 
     @property

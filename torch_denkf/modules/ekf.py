@@ -9,7 +9,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torch_denkf.functional import kalman_update, wrap_angles
+from torch_denkf.functional import kalman_update
+from torch_denkf.functional.manifolds import Euclidean, Space
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition, GaussianTransitionKeys
 from torch_denkf.modules._running import reads
@@ -60,7 +61,10 @@ class EKFTransition(GaussianTransition):
             return self._move(rows, states, call), None
 
         entries = _needed(self, entries)
-        forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
+        if self.space is None:
+            forecast, jacobian, _ = _linearise(move, entries, call, mean, mean.shape[-1])
+        else:
+            forecast, jacobian, _ = _linearise_on(move, entries, call, mean, self.space, self.space)
         if self.stop_jacobian_gradient:
             jacobian = jacobian.detach()
         moved = jacobian @ cov
@@ -93,11 +97,15 @@ class EKFAnalysis(GaussianAnalysis):
 
     def _update(self, entries, mean, cov, observation, noise, call):
         entries, size = _needed(self, entries), observation.shape[-1]
-        predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
-        innovation = wrap_angles(observation - predicted, self.angles)
+        if self.space is None and self.reading_space is None:
+            predicted, jacobian, observed = _linearise(self._observe, entries, call, mean, size)
+        else:
+            space, reading_space = self.space or Euclidean(mean.shape[-1]), self.reading_space or Euclidean(size)
+            predicted, jacobian, observed = _linearise_on(self._observe, entries, call, mean, space, reading_space)
+        innovation = self._innovation(observation, predicted, observed)
         # In deviations from the mean: H m would cost digits where the state is far from zero.
-        update = kalman_update(torch.zeros_like(mean), cov, innovation, jacobian, noise, observed=observed)
-        return update._replace(mean=mean + update.mean), observed
+        update = kalman_update(torch.zeros_like(cov[..., 0]), cov, innovation, jacobian, noise, observed=observed)
+        return self._moved(mean, update), observed
 
 
 def _needed(module, entries: Entries) -> Entries:
@@ -105,6 +113,26 @@ def _needed(module, entries: Entries) -> Entries:
     needed, optional = reads(module.module)
     keys = dict.fromkeys([*needed, *optional, module.observed_key])
     return {key: entries[key] for key in keys if key in entries}
+
+
+def _linearise_on(
+    model: Callable[[Entries, Tensor, Call], tuple[Tensor, Tensor | None]],
+    entries: Entries,
+    call: Call,
+    mean: Tensor,
+    space: Space,
+    image_space: Space,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The image of a point ``[*B, P]``, and the Jacobian ``[*B, N, D]`` between the tangents of both."""
+    image, mask = model(entries, mean.unsqueeze(-2), call)
+
+    def tangents(rows: Entries, states: Tensor, call: Call) -> tuple[Tensor, None]:
+        moved, _ = model(rows, space.plus(mean.unsqueeze(-2).expand(*states.shape[:-1], -1), states), call)
+        return image_space.minus(moved, image.expand(moved.shape)), None
+
+    zero = torch.zeros_like(mean[..., :1]).expand(*mean.shape[:-1], space.tangent_dim)
+    _, jacobian, _ = _linearise(tangents, entries, call, zero, image_space.tangent_dim)
+    return image.squeeze(-2), jacobian, mask
 
 
 def _linearise(

@@ -13,10 +13,12 @@ from torch_denkf._checks import check_covariance, check_number, check_shape, che
 from torch_denkf.functional import kalman_predict, kalman_update, wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.linalg import product_of_known
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import as_covariance, further_keys, updated
 from torch_denkf.modules._running import run_module
+from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules._tensors import as_standard_deviations, check_dims, register_constant
 
 __all__ = ["GaussianAround", "KalmanAnalysis", "LinearTransition", "MomentPrior"]
@@ -26,8 +28,9 @@ class MomentPrior(SubModel):
     """A Gaussian belief given by its moments, the same for every episode.
 
     Args:
-        mean: ``[S]``.
-        cov: ``[S, S]``.
+        mean: ``[S]``; on a space a point.
+        cov: ``[S, S]``; on a space of the tangents at ``mean``.
+        space: in which the state lives; ``None`` for plain numbers.
         belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
 
     Raises:
@@ -39,13 +42,18 @@ class MomentPrior(SubModel):
         torch.Size([3, 2, 2])
     """
 
-    def __init__(self, mean: torch.Tensor, cov: torch.Tensor, *, belief_prefix: str = "belief"):
+    def __init__(
+        self, mean: torch.Tensor, cov: torch.Tensor, *, space: Space | None = None, belief_prefix: str = "belief"
+    ):
         super().__init__(nn.Identity(), [], [(belief_prefix, name) for name in ("mean", "cov", "var")])
         register_constant(self, "mean", mean)
         register_constant(self, "cov", cov)
         if self.mean.ndim != 1:
             raise ValueError(f"mean must be [S], got {list(self.mean.shape)}")
-        self.state_dim = self.mean.numel()
+        self.space, self.state_dim = checked_space("space", space), self.mean.numel()
+        if space is not None:
+            space.check(mean=self.mean)
+            self.state_dim = space.tangent_dim
         check_values("mean", self.mean)
         check_covariance("cov", self.cov, self.state_dim)
 
@@ -63,6 +71,7 @@ class GaussianAround(SubModel):
     Args:
         std: standard deviations ``[S]``, in the state's units; zero where the state is known exactly.
         state_key: the known state ``[*B, S]``.
+        space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
         belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``.
 
     Raises:
@@ -78,17 +87,25 @@ class GaussianAround(SubModel):
     """
 
     def __init__(
-        self, std: Sequence[float] | torch.Tensor, *, state_key: NestedKey = "state", belief_prefix: str = "belief"
+        self,
+        std: Sequence[float] | torch.Tensor,
+        *,
+        state_key: NestedKey = "state",
+        space: Space | None = None,
+        belief_prefix: str = "belief",
     ):
         super().__init__(nn.Identity(), [state_key], [(belief_prefix, name) for name in ("mean", "cov", "var")])
         std = as_standard_deviations("std", std)
         self.register_buffer("std", std)
-        self.state_dim = std.numel()
+        self.space, self.state_dim = checked_space("space", space), std.numel()
+        if space is not None:
+            space.check(tangent=std)
+            self.input_dim = space.point_dim
 
     def compute(self, state):
         """The belief."""
         mean = state.to(self.std.dtype)
-        variance = self.std.square().expand_as(mean)
+        variance = self.std.square().expand(*mean.shape[:-1], -1) if self.space else self.std.square().expand_as(mean)
         return mean, variance.diag_embed(), variance
 
 

@@ -13,7 +13,9 @@ from torch import nn
 from torch_denkf._checks import check_count
 from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.angles import mean_observation
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._spaces import checked_spaces, reading_about
 from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -32,6 +34,7 @@ class GaussianLikelihood(SubModel):
 
     Args:
         angles: components of the observation that are angles in radians.
+        reading_space: in which the reading lives, in the place of ``angles``; variances are of tangents.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observation_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: variances ``[*B, O]``, the diagonal of R.
@@ -58,6 +61,7 @@ class GaussianLikelihood(SubModel):
         self,
         *,
         angles: Sequence[int] = (),
+        reading_space: Space | None = None,
         predicted_key: NestedKey = ("forecast", "observation"),
         observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
@@ -69,7 +73,7 @@ class GaussianLikelihood(SubModel):
         )
 
         check_dims("angles", angles)
-        self.angles = list(angles)
+        self.angles, (_, self.reading_space) = list(angles), checked_spaces(None, reading_space, angles)
         self.reading_keys, self.observed_key = self.in_keys[1:], unravel_key(observed_key)
         self.predicted_key = self.in_keys[0]
 
@@ -80,6 +84,8 @@ class GaussianLikelihood(SubModel):
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
+        if self.reading_space is not None:
+            predicted, reading = reading_about(self.reading_space, predicted, reading, observed)
         if reading.ndim > len(batch_size) + 1:
             reading = mean_observation(reading, self.angles)
         if not reading.shape[-1] == predicted.shape[-1] == variance.shape[-1]:

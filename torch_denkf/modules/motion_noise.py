@@ -10,11 +10,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf.functional.linalg import semidefinite_root
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._spaces import checked_space
 from torch_denkf.modules._tensors import check_dims
+from torch_denkf.modules.noise import ConstantNoise
 
 __all__ = ["NoisyTransition"]
 
@@ -40,6 +43,7 @@ class NoisyTransition(SubModel):
         mean_key: the belief's mean ``[*B, S]``.
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
+        space: in which the state lives; ``None`` for plain numbers. Noise and ``dims`` are of the tangents.
 
     Raises:
         KeyError: if an entry is missing.
@@ -71,6 +75,7 @@ class NoisyTransition(SubModel):
         mean_key: NestedKey = ("belief", "mean"),
         forecast_mean_key: NestedKey = ("forecast", "mean"),
         log_weight_key: NestedKey = ("belief", "log_weight"),
+        space: Space | None = None,
     ):
         check_module("transition", transition)
         check_module("noise", noise)
@@ -83,7 +88,7 @@ class NoisyTransition(SubModel):
             transition.out_keys,
             optional_keys=[log_weight_key, *optional, *of_noise_optional],
         )
-        self.log_weight_key = unravel_key(log_weight_key)
+        self.log_weight_key, self.space = unravel_key(log_weight_key), checked_space("space", space)
         self.before, self.mean_key, self.forecast_mean_key = before, *map(unravel_key, (mean_key, forecast_mean_key))
         check_dims("dims", dims or (), once=True)
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
@@ -105,22 +110,30 @@ class NoisyTransition(SubModel):
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, entries = self.required(entries, key), dict(entries)
         log_weights = entries.get(self.log_weight_key)
-        entries[self.mean_key] = state.mean(-2) if log_weights is None else weighted_mean(state, log_weights)
+        entries[self.mean_key] = self._mean(state, log_weights)
         if self.before:
             entries[key] = self._add(state, entries, call)
         written = run_module(self.module["transition"], entries, call.part("transition"))
         if not self.before:
             moved = written[out_key]
-            mean = moved.mean(-2) if log_weights is None else weighted_mean(moved, log_weights)
-            entries[self.forecast_mean_key] = mean
+            entries[self.forecast_mean_key] = self._mean(moved, log_weights)
             written = {**written, out_key: self._add(moved, entries, call)}
         return written
+
+    def _mean(self, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
+        """What the noise model may read; on a space, one that reads the state's width alone gets any member."""
+        if self.space is not None:
+            if isinstance(self.module["noise"], ConstantNoise):
+                return members[..., 0, :]
+            return self.space.mean(members, None if log_weights is None else log_weights.exp())
+        return members.mean(-2) if log_weights is None else weighted_mean(members, log_weights)
 
     def _add(self, ensemble: torch.Tensor, entries: Entries, call: Call) -> torch.Tensor:
         """The ensemble with process noise."""
         model = self.module["noise"]
         covariance = run_module(model, entries, call.part("noise"))[unravel_key(model.out_keys[0])]
-        size = ensemble.shape[-1] if self.dims is None else len(self.dims)
+        whole = ensemble.shape[-1] if self.space is None else self.space.tangent_dim
+        size = whole if self.dims is None else len(self.dims)
         if covariance.shape[-1] != size:
             dims = "all" if self.dims is None else self.dims.tolist()
             raise ValueError(
@@ -137,4 +150,8 @@ class NoisyTransition(SubModel):
             noise = covariance.sqrt().unsqueeze(-2) * normal
         else:
             noise = normal @ semidefinite_root(covariance).mT
+        if self.space is not None:
+            if self.dims is not None:
+                noise = noise.new_zeros(*noise.shape[:-1], whole).index_add(-1, self.dims, noise)
+            return self.space.plus(ensemble, noise)
         return ensemble + noise if self.dims is None else ensemble.index_add(-1, self.dims, noise)

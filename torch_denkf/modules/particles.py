@@ -23,11 +23,13 @@ from torch import nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import jitter_copies, soft_resample, systematic_resample, transport_resample
 from torch_denkf.functional.angles import align_angles
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.resampling import effective_sample_size
 from torch_denkf.functional.weighted import weighted_innovation, weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._spaces import checked_space, moments_on, reading_about
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.likelihood import GaussianLikelihood
 
@@ -270,6 +272,7 @@ class ParticleAnalysis(SubModel):
         likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
             ``None`` for neither.
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
+        space: in which the state lives; ``None`` for plain numbers.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
         log_likelihood_key: :math:`\log p(y | x^i)`, ``[*B, E]``, see :mod:`torch_denkf.modules.likelihood`.
@@ -299,6 +302,7 @@ class ParticleAnalysis(SubModel):
         likelihood: GaussianLikelihood | None = None,
         *,
         tempering: float = 1.0,
+        space: Space | None = None,
         forecast_key: NestedKey = ("forecast", "ensemble"),
         log_weight_key: NestedKey = ("forecast", "log_weight"),
         log_likelihood_key: NestedKey = ("forecast", "log_likelihood"),
@@ -315,8 +319,9 @@ class ParticleAnalysis(SubModel):
             optional_keys=[] if likelihood is None else likelihood.optional_keys,
         )
         check_number("tempering", tempering, above=0)
-        self.tempering, self.info_prefix = tempering, info_prefix
+        self.tempering, self.info_prefix, self.space = tempering, info_prefix, checked_space("space", space)
         self.angles: list[int] = [] if likelihood is None else likelihood.angles
+        self.reading_space = None if likelihood is None else likelihood.reading_space
         if likelihood is not None:
             self.reading_keys, self.predicted_key = likelihood.reading_keys, likelihood.predicted_key
             self.observed_key, self.reads_components = likelihood.observed_key, True
@@ -329,17 +334,23 @@ class ParticleAnalysis(SubModel):
         # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
         seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
+        moments = (
+            (weighted_mean(particles, log_weights), weighted_var(particles, log_weights))
+            if self.space is None
+            else moments_on(self.space, particles, log_weights)
+        )
         return (
             particles,
             log_weights,
-            weighted_mean(particles, log_weights),
-            weighted_var(particles, log_weights),
+            *moments,
             effective_sample_size(log_weights).unsqueeze(-1),
             torch.where(seen | (total == -math.inf), total, torch.zeros_like(total)),
             *(self._innovation(prior, *of_reading) if of_reading else ()),
         )
 
     def _innovation(self, prior, predicted, reading, variance, observed=None) -> tuple[torch.Tensor, torch.Tensor]:
+        if self.reading_space is not None:
+            predicted, reading = reading_about(self.reading_space, predicted, reading, observed)
         predicted, reading = align_angles(predicted, reading, self.angles, observed)
         if reading.ndim == predicted.ndim:
             reading = reading.mean(-2)

@@ -84,10 +84,17 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _forecast(self, entries, mean, cov, call, wanted):
-        points, weights = self._points(mean, cov)
-        moved = self._move(entries, points, call)
-        cross = unscented_cross(points, moved, weights) if wanted else None
-        return *unscented_moments(moved, weights), cross
+        if self.space is None:
+            points, weights = self._points(mean, cov)
+            moved = self._move(entries, points, call)
+            cross = unscented_cross(points, moved, weights) if wanted else None
+            return *unscented_moments(moved, weights), cross
+        points, weights = self._points(torch.zeros_like(cov[..., 0]), cov)
+        moved = self._move(entries, self.space.plus(mean.unsqueeze(-2), points), call)
+        center = self.space.mean(moved, weights.mean)
+        tangents = self.space.minus(moved, center.unsqueeze(-2))
+        cross = unscented_cross(points, tangents, weights) if wanted else None
+        return center, unscented_moments(tangents, weights)[1], cross
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
@@ -129,7 +136,19 @@ class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
 
     def _update(self, entries, mean, cov, observation, noise, call):
-        points, weights = self._points(mean, cov)
-        predicted, observed = self._observe(entries, points, call)
-        update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=self.angles)
-        return update, observed
+        angles = self.angles
+        if self.space is None and self.reading_space is None:
+            points, weights = self._points(mean, cov)
+            predicted, observed = self._observe(entries, points, call)
+            update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=angles)
+            return update, observed
+        points, weights = self._points(torch.zeros_like(cov[..., 0]), cov)
+        around = mean.unsqueeze(-2)
+        around = around + points if self.space is None else self.space.plus(around, points)
+        predicted, observed = self._observe(entries, around, call)
+        if self.reading_space is not None:
+            expected = self.reading_space.mean(predicted, weights.mean)
+            predicted = self.reading_space.minus(predicted, expected.unsqueeze(-2))
+            observation = self._innovation(observation, expected, observed)
+        update = unscented_update(points, predicted, observation, noise, weights, observed=observed, angles=angles)
+        return self._moved(mean, update), observed

@@ -307,6 +307,9 @@ class GatedAnalysis(AnalysisAround):
             return nis, observed.sum(-1, keepdim=True)
         predicted, variance = entries[self.module.in_keys[1]], entries[self.noise_variance_key]
         seen = observed > 0  # what is not observed may be NaN
+        if self.module.reading_space is not None:
+            center = self.module.reading_space.mean(predicted).unsqueeze(-2)
+            predicted = self.module.reading_space.minus(predicted, center)
         predicted = predicted.var(-2) if predicted.shape[-2] > 1 else torch.zeros_like(innovation)
         spread = torch.where(seen, predicted, 0) + torch.where(seen, variance, 1)
         return torch.where(seen, innovation.square() / spread, 0), observed
@@ -324,14 +327,19 @@ class GatedAnalysis(AnalysisAround):
             key = self.module.in_keys[1]
             return {**entries, key: entries[key] * factor.unsqueeze(-1)}
         keys = self.module.in_keys[:2]  # states, and what is predicted of them
-        return {**entries, **{key: spread_about_mean(entries[key], factor.sqrt()) for key in keys}}
+        spaces = (self.module.space, self.module.reading_space)
+        wider = {key: spread_about_mean(entries[key], factor.sqrt(), on) for key, on in zip(keys, spaces, strict=True)}
+        return {**entries, **wider}
 
     def _with_past(self, entries: Entries, factor: Tensor) -> Entries:
         """The entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
         if not isinstance(self.module, LaggedAnalysis):
             return entries
         key = self.module.in_keys[-1]
-        past = entries[key]
+        past, space = entries[key], self.module.space
+        if space is not None:
+            of_times = spread_about_mean(past.movedim(-2, -3), factor.sqrt().unsqueeze(-2), space)
+            return {**entries, key: of_times.movedim(-3, -2)}
         wider = spread_about_mean(past.flatten(-2), factor.sqrt())
         return {**entries, key: wider.unflatten(-1, past.shape[-2:])}
 

@@ -68,8 +68,9 @@ class EnRTS(Smoother):
     def _smooth(self, entries, follows, out):
         self._refuse_inflation()  # it may have been set since
         values, damping = (entries[key] for key in self._needed), 1.0 if self.damping is None else self.damping
-        ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=damping)
-        return ensemble, *moments_of(ensemble, None)
+        space = self.filter.structure.space
+        ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=damping, space=space)
+        return ensemble, *moments_of(ensemble, None, space)
 
     def _refuse_inflation(self) -> None:
         """Raises where gains would carry an inflation back, and nobody said how to damp it."""
@@ -129,7 +130,7 @@ class EnKS(Smoother):
             ensemble = entries[self.prefix, "ensemble"]
         else:
             ensemble = of_own_time(entries[self.prefix, "ensemble"], entries[self.prefix, "past"], follows)[0]
-        return ensemble, *moments_of(ensemble, None)
+        return ensemble, *moments_of(ensemble, None, self.filter.structure.space)
 
 
 def of_own_time(ensemble: Tensor, past: Tensor, follows: Tensor) -> tuple[Tensor, Tensor]:

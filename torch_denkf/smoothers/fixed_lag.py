@@ -69,7 +69,12 @@ class FixedLag(Filter):
         modules = OrderedDict(named_modules_of(filter))
         names = list(modules)
         place = names.index(filter.structure.transition[0])
+        space = filter.structure.space
         if kind == "moments":
+            if space is not None:
+                raise TypeError(
+                    f"FixedLag of a mean and a covariance is for plain numbers, not for {space}: use RTSSmoother."
+                )
             forecast = filter.structure.forecast_of[prefix, "mean"][0]
             modules[names[place]] = CrossTransition(modules[names[place]], cross_key=(forecast, "cross"))
             past = MomentsPast(belief_prefix=prefix, forecast_prefix=forecast)
@@ -77,7 +82,7 @@ class FixedLag(Filter):
             initial = with_past(filter.initial, lag, MOMENTS_PAST, age=age, belief_prefix=prefix)
         else:
             initial = with_past(filter.initial, lag, ENSEMBLE_PAST, age=age, belief_prefix=prefix)
-            last = LaggedBelief(belief_prefix=prefix, weighted=kind == "particles")
+            last = LaggedBelief(belief_prefix=prefix, weighted=kind == "particles", space=space)
             past = EnsemblePast(belief_prefix=prefix)
             if kind == "particles":
                 transition = modules[names[place]]

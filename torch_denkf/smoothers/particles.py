@@ -75,6 +75,8 @@ class ParticleSmoother(Smoother):
                 "ParticleSmoother needs the density of the motion: a NoisyTransition with noise in all dimensions, "
                 "after the motion (process_noise= of ParticleFilter). FixedLag smooths particles of any motion."
             )
+        if filter.structure.space is not None:
+            raise TypeError(f"ParticleSmoother is for plain numbers, not for {filter.structure.space}; FixedLag is.")
         keys = [(prefix, "ensemble"), (prefix, "log_weight")]
         super().__init__(filter, lag, keys, ("ensemble", "log_weight", "mean", "var"))
 

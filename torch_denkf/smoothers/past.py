@@ -20,9 +20,12 @@ from torch import nn
 
 from torch_denkf._checks import check_count, check_shape
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
+from torch_denkf.modules._running import declared
+from torch_denkf.modules._spaces import moments_on
 from torch_denkf.modules.carried import Beside, InPlaceOf
 
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "with_past"]
@@ -42,7 +45,7 @@ class Past(NamedTuple):
     carried: tuple[str, ...]
     follow: tuple[str, ...]
     copies: Callable[[str, int, Entries], Sequence[torch.Tensor]]
-    oldest: Callable[[str, int, Entries], Sequence[torch.Tensor]]
+    oldest: Callable[..., Sequence[torch.Tensor]]
     present: tuple[str, ...] = ()
 
 
@@ -77,12 +80,13 @@ def with_past(
         torch.Size([4, 3, 1])
     """
     check_count("lag", lag, cure="It counts the steps to look back")
+    space = declared(initial).space
     return Beside(
         initial,
         [*((belief_prefix, name) for name in past.carried), (smoothed_prefix, "age")],
         partial(_begin, past.copies, belief_prefix, lag, age),
         follow_keys=[*((belief_prefix, name) for name in past.present), *((smoothed_prefix, n) for n in past.follow)],
-        follow=partial(past.oldest, belief_prefix, lag),
+        follow=partial(past.oldest, belief_prefix, lag, **({} if space is None else {"space": space})),
     )
 
 
@@ -95,9 +99,9 @@ def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
     return [belief[prefix, "ensemble"].unsqueeze(-2).repeat_interleave(lag, -2)]
 
 
-def _oldest(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
+def _oldest(prefix: str, lag: int, entries: Entries, *, space: Space | None = None) -> tuple[torch.Tensor, ...]:
     ensemble = entries[prefix, "past"][..., -1, :]
-    return ensemble, *moments_of(ensemble, entries.get((prefix, "log_weight")))
+    return ensemble, *moments_of(ensemble, entries.get((prefix, "log_weight")), space)
 
 
 #: The members of the past, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
@@ -171,6 +175,7 @@ class LaggedAnalysis(InPlaceOf):
             optional_keys=analysis.optional_keys,
         )
         self.info_prefix, self.reading_keys = analysis.info_prefix, analysis.reading_keys
+        self.space, self.reading_space = analysis.space, analysis.reading_space
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
         self.noise_variance_key, self.predicted_key = analysis.noise_variance_key, analysis.predicted_key
 
@@ -211,6 +216,7 @@ class LaggedBelief(SubModel):
             1]``: by how many steps the state lies back, L, or fewer where the episode is younger.
         past_key: the past after the analysis, ``[*B, E, L, S]``.
         weighted: whether the members are particles with log-weights.
+        space: in which the state lives; ``None`` for plain numbers.
 
     Example:
         >>> from tensordict import TensorDict
@@ -227,16 +233,18 @@ class LaggedBelief(SubModel):
         smoothed_prefix: str = "smoothed",
         past_key: NestedKey = ("forecast", "past"),
         weighted: bool = False,
+        space: Space | None = None,
     ):
         age = (smoothed_prefix, "age")
         out_keys = [(belief_prefix, "past"), *((smoothed_prefix, name) for name in ("ensemble", "mean", "var")), age]
         super().__init__(nn.Identity(), [past_key, age] + [(belief_prefix, "log_weight")] * weighted, out_keys)
+        self.space = space
 
     def compute(self, past, age, log_weight=None):
         """The past, and the belief of its oldest state."""
         check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
-        return past, ensemble, *moments_of(ensemble, log_weight), (age + 1).clamp(max=past.shape[-2])
+        return past, ensemble, *moments_of(ensemble, log_weight, self.space), (age + 1).clamp(max=past.shape[-2])
 
 
 def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
@@ -244,8 +252,12 @@ def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
     check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
 
 
-def moments_of(ensemble: torch.Tensor, log_weight: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+def moments_of(
+    ensemble: torch.Tensor, log_weight: torch.Tensor | None, space: Space | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and variance ``[*B, S]`` of members, or of weighted particles."""
+    if space is not None:
+        return moments_on(space, ensemble, log_weight)
     if log_weight is not None:
         return weighted_mean(ensemble, log_weight), weighted_var(ensemble, log_weight)
     mean = ensemble_mean(ensemble)

@@ -63,8 +63,8 @@ class CrossTransition(InPlaceOf):
 
     def without_step(self, entries):
         """What stands beside the forecast where an episode begins: there is no state before."""
-        mean = self.required(entries, self.in_keys[0])
-        return {unravel_key(self.out_keys[-1]): mean.new_zeros(*mean.shape, mean.shape[-1])}
+        cov = self.required(entries, self.in_keys[1])
+        return {unravel_key(self.out_keys[-1]): torch.zeros_like(cov)}
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:

@@ -61,5 +61,6 @@ class RTSSmoother(Smoother):
         return rebuilt(self.filter, {self.place: own})
 
     def _smooth(self, entries, follows, out):
-        mean, cov = rts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag)
+        space = self.filter.structure.space
+        mean, cov = rts_smooth(*(entries[key] for key in self._needed), follows=follows, lag=self.lag, space=space)
         return mean, cov, cov.diagonal(dim1=-2, dim2=-1)

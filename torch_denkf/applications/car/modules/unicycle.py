@@ -8,7 +8,6 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
-from torch_denkf._checks import check_number
 from torch_denkf.applications.car.modules.pairs import within_pair
 from torch_denkf.applications.car.unicycle import unicycle_move
 from torch_denkf.functional import ensemble_mean, ensemble_var
@@ -16,6 +15,7 @@ from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import check_network
 from torch_denkf.modules._tensors import register_location, register_scale
 from torch_denkf.modules.transition import MemberNetwork
+from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
 
 __all__ = ["UnicycleMotion", "UnicycleTransition"]
 
@@ -180,28 +180,3 @@ class UnicycleMotion(SubModel):
             histories = (torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2),)
         ensemble = torch.cat([unicycle_move(pose, velocity, dt), velocity], -1)
         return ensemble, ensemble_mean(ensemble), ensemble_var(ensemble), *histories
-
-
-def keys_of_dt(dt: float | NestedKey) -> list[NestedKey]:
-    """The key of the time step, if it is no number."""
-    return [] if isinstance(dt, (int, float)) else [dt]
-
-
-def check_dt(dt: float | NestedKey) -> None:
-    """Raises unless a time step is a positive number, or a key.
-
-    Raises:
-        ValueError: if it is a number that is not positive.
-        TypeError: if it is neither.
-    """
-    if not isinstance(dt, (str, tuple)):
-        check_number("dt", dt, least=0, cure="It is the time step in seconds, or the key of one")
-        if not isinstance(dt, (int, float)):
-            raise TypeError(
-                f"dt must be a number of seconds or a key, got {dt!r} ({type(dt).__name__}); pass float(dt)"
-            )
-
-
-def for_members(dt: float | torch.Tensor) -> float | torch.Tensor:
-    """A time step ``[*B, 1]`` as ``[*B, 1, 1]``, beside ensembles ``[*B, E, S]``."""
-    return dt.unsqueeze(-2) if isinstance(dt, torch.Tensor) else dt

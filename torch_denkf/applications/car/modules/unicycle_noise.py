@@ -7,9 +7,9 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch.nn import functional as F
 
-from torch_denkf.applications.car.modules.unicycle import check_dt, keys_of_dt
 from torch_denkf.applications.car.unicycle import unicycle_jacobians
 from torch_denkf.modules.process_noise import NoiseThrough
+from torch_denkf.motions.time_step import check_dt, keys_of_dt
 
 __all__ = ["UnicycleNoise"]
 

@@ -1,0 +1,23 @@
+"""Known motions on spaces, and what sensors read of their states: inertial sensors, poses, landmarks.
+
+A state is a point of a space, see :mod:`torch_denkf.functional.manifolds`: orientation first, as a unit quaternion with
+w first, or as an angle in the plane; the world's z points up. Motions draw no noise. ``process_noise`` of a motion says
+how much of it a filter is to add after each step: one standard deviation for each number of a tangent.
+"""
+
+from torch_denkf.motions.inertial import AttitudeMotion, InertialMotion
+from torch_denkf.motions.planar import PlanarMotion
+from torch_denkf.motions.readings import Gravity, Magnetic, PoseOf, PositionInBody, RangeBearing
+from torch_denkf.motions.twist import ConstantTwist
+
+__all__ = [
+    "AttitudeMotion",
+    "ConstantTwist",
+    "Gravity",
+    "InertialMotion",
+    "Magnetic",
+    "PlanarMotion",
+    "PoseOf",
+    "PositionInBody",
+    "RangeBearing",
+]

@@ -1,0 +1,159 @@
+"""A body whose gyro and accelerometer say how it moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+
+from torch_denkf._checks import check_number
+from torch_denkf.functional.inertial import move_inertially
+from torch_denkf.functional.manifolds import SE23, SO3, Euclidean, Product
+from torch_denkf.motions.motion import Motion, densities, integrated, walked
+
+__all__ = ["AttitudeMotion", "InertialMotion"]
+
+
+class InertialMotion(Motion):
+    r"""Orientation, velocity and position, moved by what a gyro and an accelerometer read: inertial navigation.
+
+    The state is a point of ``Product(SE23(), Euclidean(3), Euclidean(3))``, 16 numbers: orientation, velocity in m/s
+    and position in m, both in the world's axes; then what the gyro reads too much, in rad/s, and the accelerometer, in
+    m/s^2, both in the body's axes. The tangent has 15 numbers, three for each of these.
+
+    The readings drive the motion, so they are no reading of an analysis. That of a step is what the sensors read while
+    it lasted. Of sensors that are sampled where it begins and ends, take the mean of both: then the error of a step
+    falls with the third power of its length. An accelerometer reads specific force: at rest it reads ``gravity``
+    upwards.
+
+    The integration is exact where rate and specific force are constant in the body's axes, see
+    :func:`torch_denkf.functional.inertial.move_inertially`. The body is where the accelerometer sits.
+
+    Noises are what a data sheet calls densities. A data sheet that has degrees and micro-g: 0.005 deg/s/sqrt(Hz) is
+    8.7e-5 rad/s/sqrt(Hz), and 400 ug/sqrt(Hz) is 3.9e-3 m/s^2/sqrt(Hz).
+
+    Args:
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
+        gyro_noise: density of its white noise in rad/s/sqrt(Hz); a number, or one for each axis.
+        accelerometer_noise: in m/s^2/sqrt(Hz).
+        gyro_walk: of the random walk of its bias, in rad/s^2/sqrt(Hz): standard deviation after a second, in rad/s.
+        accelerometer_walk: in m/s^3/sqrt(Hz).
+        gravity: in m/s^2; the world's z points up.
+        imu_key: entry ``[*B, 6]``: the gyro in rad/s, then the accelerometer in m/s^2, in the body's axes.
+        gyro_key: entry ``[*B, 3]``, where both have entries of their own.
+        accelerometer_key: entry ``[*B, 3]``, likewise.
+        in_key: the belief's ensemble ``[*B, E, 16]``.
+        out_key: forecast ensemble ``[*B, E, 16]``.
+
+    Raises:
+        ValueError: if ``dt`` or a noise is negative, or only one sensor has a key of its own.
+
+    Source:
+        Forster et al. 2017, IEEE T-RO 33 (model and noises); Brossard et al. 2022, IEEE T-RO 38 (integration).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> motion = InertialMotion(0.01, gyro_noise=8.7e-5, accelerometer_noise=3.9e-3)
+        >>> state = motion.space.neutral().expand(32, 16)
+        >>> imu = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 9.81])  # ahead with 1 m/s^2
+        >>> moved = motion(TensorDict({("belief", "ensemble"): state, "imu": imu}))["forecast", "ensemble"]
+        >>> moved[0, 4:7]
+        tensor([0.0100, 0.0000, 0.0000])
+        >>> len(motion.process_noise)
+        15
+    """
+
+    def __init__(
+        self,
+        dt: float | NestedKey,
+        *,
+        gyro_noise: float | Sequence[float] | Tensor = 0.0,
+        accelerometer_noise: float | Sequence[float] | Tensor = 0.0,
+        gyro_walk: float | Sequence[float] | Tensor = 0.0,
+        accelerometer_walk: float | Sequence[float] | Tensor = 0.0,
+        gravity: float = 9.81,
+        imu_key: NestedKey = "imu",
+        gyro_key: NestedKey | None = None,
+        accelerometer_key: NestedKey | None = None,
+        in_key: NestedKey = ("belief", "ensemble"),
+        out_key: NestedKey = ("forecast", "ensemble"),
+    ):
+        check_number("gravity", gravity)
+        actions = {imu_key: 6}
+        if gyro_key is not None and accelerometer_key is not None:
+            actions = {gyro_key: 3, accelerometer_key: 3}
+        elif gyro_key is not None or accelerometer_key is not None:
+            raise ValueError("InertialMotion needs gyro_key and accelerometer_key, or imu_key alone, which holds both.")
+        super().__init__(Product(SE23(), Euclidean(3), Euclidean(3)), dt, actions, in_key, out_key)
+        self.gravity = float(gravity)
+        self.gyro_noise = densities("gyro_noise", gyro_noise, 3)
+        self.accelerometer_noise = densities("accelerometer_noise", accelerometer_noise, 3)
+        self.gyro_walk = densities("gyro_walk", gyro_walk, 3)
+        self.accelerometer_walk = densities("accelerometer_walk", accelerometer_walk, 3)
+
+    def move(self, state, *readings, dt):
+        """The state moved by the readings without their biases."""
+        gyro, accelerometer = readings if len(readings) == 2 else readings[0].split(3, -1)
+        pose, gyro_bias, accelerometer_bias = self.space.points(state)
+        moved = move_inertially(pose, gyro - gyro_bias, accelerometer - accelerometer_bias, dt, self.gravity)
+        return torch.cat([moved, gyro_bias, accelerometer_bias], -1)
+
+    def noise_of_step(self, dt):
+        """Of orientation, velocity, position, the gyro's bias and the accelerometer's."""
+        force = self.accelerometer_noise
+        moved = walked(self.gyro_noise, dt) + walked(force, dt) + integrated(force, dt)
+        return moved + walked(self.gyro_walk, dt) + walked(self.accelerometer_walk, dt)
+
+
+class AttitudeMotion(Motion):
+    r"""An orientation, moved by what a gyro reads: :math:`R' = R \exp((\omega - b) \Delta t)`.
+
+    The state is a point of ``Product(SO3(), Euclidean(3))``, 7 numbers: the orientation, and what the gyro reads too
+    much, in rad/s. The tangent has 6 numbers. See :class:`InertialMotion` for velocity and position, and for what a
+    reading belongs to.
+
+    Args:
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
+        gyro_noise: density of the gyro's white noise in rad/s/sqrt(Hz); a number, or one for each axis.
+        gyro_walk: of the random walk of its bias, in rad/s^2/sqrt(Hz): standard deviation after a second, in rad/s.
+        gyro_key: entry ``[*B, 3]`` in rad/s, the body's axes.
+        in_key: the belief's ensemble ``[*B, E, 7]``.
+        out_key: forecast ensemble ``[*B, E, 7]``.
+
+    Raises:
+        ValueError: if ``dt`` or a noise is negative.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> motion = AttitudeMotion(0.5, gyro_noise=8.7e-5)
+        >>> gyro = torch.tensor([0.0, 0.0, torch.pi])  # half a turn a second, to the left
+        >>> state = motion.space.neutral().expand(32, 7)
+        >>> moved = motion(TensorDict({("belief", "ensemble"): state, "gyro": gyro}))["forecast", "ensemble"]
+        >>> moved[0, :4]  # a quarter turn
+        tensor([0.7071, 0.0000, 0.0000, 0.7071])
+    """
+
+    def __init__(
+        self,
+        dt: float | NestedKey,
+        *,
+        gyro_noise: float | Sequence[float] | Tensor = 0.0,
+        gyro_walk: float | Sequence[float] | Tensor = 0.0,
+        gyro_key: NestedKey = "gyro",
+        in_key: NestedKey = ("belief", "ensemble"),
+        out_key: NestedKey = ("forecast", "ensemble"),
+    ):
+        super().__init__(Product(SO3(), Euclidean(3)), dt, {gyro_key: 3}, in_key, out_key)
+        self.gyro_noise = densities("gyro_noise", gyro_noise, 3)
+        self.gyro_walk = densities("gyro_walk", gyro_walk, 3)
+
+    def move(self, state, gyro, *, dt):
+        """The orientation turned by the reading without its bias."""
+        orientation, bias = self.space.points(state)
+        return torch.cat([SO3().plus(orientation, (gyro - bias) * dt), bias], -1)
+
+    def noise_of_step(self, dt):
+        """Of orientation and bias."""
+        return walked(self.gyro_noise, dt) + walked(self.gyro_walk, dt)

@@ -1,0 +1,120 @@
+"""What all known motions share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_values
+from torch_denkf.functional.manifolds import Product
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import as_vector
+from torch_denkf.motions.time_step import check_dt, for_members, keys_of_dt
+
+__all__ = ["Motion", "densities", "integrated", "walked"]
+
+
+class Motion(SubModel):
+    """A known motion of states that are points of a space.
+
+    A subclass writes :meth:`move` and :meth:`noise_of_step`.
+
+    Args:
+        space: of the states, P numbers a point and D a tangent.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
+        actions: the keys of what drives the motion, and how many numbers each has.
+        in_key: the belief's ensemble ``[*B, E, P]``.
+        out_key: the forecast ensemble ``[*B, E, P]``.
+    """
+
+    space: Product
+
+    def __init__(
+        self,
+        space: Product,
+        dt: float | NestedKey,
+        actions: dict[NestedKey, int],
+        in_key: NestedKey,
+        out_key: NestedKey,
+    ):
+        check_dt(dt)
+        super().__init__(nn.Identity(), [in_key, *actions, *keys_of_dt(dt)], [out_key])
+        self.space, self.dt, self.actions = space, dt, actions
+
+    def move(self, *values: Any, **_: Any) -> Tensor:
+        """The states ``[*, P]`` one step later.
+
+        Args:
+            *values: the states ``[*, P]``, then the actions ``[*, A]``.
+            **_: ``dt``, seconds, a number or ``[*, 1]``.
+        """
+        raise NotImplementedError
+
+    def noise_of_step(self, dt: float) -> list[float]:
+        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents."""
+        raise NotImplementedError
+
+    @property
+    def process_noise(self) -> list[float]:
+        """The standard deviations ``[D]`` that a step adds, in the space's tangents: the noise to give to a filter.
+
+        Raises:
+            ValueError: if steps differ in length, or no noise was given.
+        """
+        name = type(self).__name__
+        if not isinstance(self.dt, (int, float)):
+            raise ValueError(
+                f"{name} reads the length of its steps from {self.dt!r}, so that each has a noise of its own. Give the "
+                "filter noise_of_step(dt), with the seconds of a typical step."
+            )
+        noise = self.noise_of_step(self.dt)
+        if not any(noise):
+            raise ValueError(
+                f"{name} was given no noise, so that a filter would trust it blindly: pass its arguments ..._noise."
+            )
+        return noise
+
+    def compute(self, ensemble, *others):
+        """The forecast ensemble."""
+        *actions, dt = others if keys_of_dt(self.dt) else (*others, self.dt)
+        self.space.check(point=ensemble)
+        for (key, size), action in zip(self.actions.items(), actions, strict=True):
+            if action.shape[-1:] != (size,):
+                raise ValueError(f"{key!r} of {type(self).__name__} is [*B, {size}]; got {list(action.shape)}.")
+        if isinstance(dt, Tensor):
+            if dt.shape[-1:] != (1,):
+                raise ValueError(f"{self.dt!r} of {type(self).__name__} is [*B, 1]; got {list(dt.shape)}.")
+            dt = dt.to(ensemble.dtype)
+        actions = [action.to(ensemble.dtype).unsqueeze(-2) for action in actions]
+        return self.move(ensemble, *actions, dt=for_members(dt))
+
+
+def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:
+    """Noise densities, one for each of ``size`` numbers, of one for all or of one for each.
+
+    Raises:
+        TypeError: if they are no numbers.
+        ValueError: if one is negative or not finite, or they are neither one nor ``size``.
+    """
+    vector = as_vector(name, torch.as_tensor(value, dtype=torch.float64), size)
+    check_values(name, vector, least=0)
+    return vector.tolist()
+
+
+def walked(density: Sequence[float], dt: float) -> list[float]:
+    """The standard deviations of a random walk after ``dt`` seconds."""
+    return [each * math.sqrt(dt) for each in density]
+
+
+def integrated(density: Sequence[float], dt: float) -> list[float]:
+    """The standard deviations of a random walk's integral after ``dt`` seconds.
+
+    They are correlated with those of the walk by .87. In a filter, where the next step moves by what this one has
+    drawn, all but the last step's correlation is there.
+    """
+    return [each * math.sqrt(dt**3 / 3) for each in density]

@@ -1,0 +1,274 @@
+"""What sensors read of a pose: gravity, the magnetic field, the pose itself, landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from torch_denkf._checks import check_count, check_number, check_values
+from torch_denkf.functional.manifolds import SE2, SE3, SE23, SO3, Circle, Euclidean, Product, Space, rotate
+from torch_denkf.modules._base import SubModel
+from torch_denkf.modules._tensors import register_constant
+
+__all__ = ["Gravity", "Magnetic", "PoseOf", "PositionInBody", "RangeBearing"]
+
+
+class _Reading(SubModel):
+    """Reads one part of the forecast states ``[*B, E, P]``, writes the predicted reading ``[*B, E, Q]``.
+
+    Attributes:
+        reading_space: the space of what is written.
+    """
+
+    kinds: tuple[type[Space], ...] = (Space,)
+    space: Space
+
+    def __init__(self, space: Space, part: int, reading_space: Space | None, in_key: NestedKey, out_key: NestedKey):
+        if not isinstance(space, Space):
+            raise TypeError(f"space of {type(self).__name__} is that of the states, a Space; got {space!r}.")
+        super().__init__(nn.Identity(), [in_key], [out_key])
+        parts = space.parts if isinstance(space, Product) else (space,)
+        check_count("part", part, least=0, most=len(parts) - 1, cure=f"It is the place of a part of {space}")
+        if not isinstance(parts[part], self.kinds):
+            names = " or ".join(f"{kind.__name__}()" for kind in self.kinds)
+            raise TypeError(f"{type(self).__name__} reads a part that is {names}; part {part} of {space} is none.")
+        self.space, self.read_space = space, parts[part]
+        self.reading_space = self.read_space if reading_space is None else reading_space
+        self.begin = sum(each.point_dim for each in parts[:part])
+
+    def observe(self, point: Tensor) -> Tensor:
+        """What is read of the part's points ``[*, P]``, ``[*, Q]``."""
+        raise NotImplementedError
+
+    def compute(self, ensemble):
+        """The predicted readings."""
+        self.space.check(point=ensemble)
+        return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
+
+
+class PoseOf(_Reading):
+    """One part of a state, its pose for example, as it is: what a motion capture system or a satellite receiver reads.
+
+    The reading is a point of that part's space, ``reading_space``; its noise has one number for each of a tangent.
+
+    Args:
+        space: of the states.
+        part: the place of the part in a ``Product``.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, Q]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> state = Product(SE2(), Euclidean(3))
+        >>> td = TensorDict({("forecast", "ensemble"): torch.arange(6.0).expand(32, 6)})
+        >>> PoseOf(state)(td)["forecast", "observation"][0]
+        tensor([0., 1., 2.])
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        *,
+        part: int = 0,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(space, part, None, in_key, out_key)
+
+    def observe(self, point):
+        """The same point."""
+        return point
+
+
+class Magnetic(_Reading):
+    r"""A direction of the world seen from the body, :math:`R^\top m`: what a magnetometer reads.
+
+    Args:
+        space: of the states.
+        field: :math:`m` in the world's axes, ``[3]``, in the sensor's unit.
+        part: the place of the part with the orientation, ``SO3()``, ``SE3()`` or ``SE23()``, in a ``Product``.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 3]``.
+
+    Raises:
+        TypeError: if the part has no orientation in space.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> north = Magnetic(SO3(), [0.0, 20.0, -40.0])  # microtesla; x points east, z up
+        >>> left = SO3().exp(torch.tensor([[0.0, 0.0, torch.pi / 2]]))  # x of the body points north
+        >>> north(TensorDict({("forecast", "ensemble"): left}))["forecast", "observation"].round(decimals=3) + 0.0
+        tensor([[ 20.,   0., -40.]])
+    """
+
+    kinds = (SO3, SE3, SE23)
+    field: Tensor
+
+    def __init__(
+        self,
+        space: Space,
+        field: Sequence[float] | Tensor,
+        *,
+        part: int = 0,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(space, part, Euclidean(3), in_key, out_key)
+        _register_vectors(self, "field", field, [3])
+
+    def observe(self, point):
+        """The direction in the body's axes."""
+        return rotate(_inverse(point), self.field)
+
+
+class Gravity(Magnetic):
+    """What an accelerometer reads while the velocity is constant: specific force, upwards, in the body's axes.
+
+    Args:
+        space: of the states.
+        gravity: in m/s^2; 1 if readings are directions.
+        part: the place of the part with the orientation, ``SO3()``, ``SE3()`` or ``SE23()``, in a ``Product``.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 3]``.
+
+    Raises:
+        TypeError: if the part has no orientation in space.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> nose_down = SO3().exp(torch.tensor([[0.0, torch.pi / 2, 0.0]]))  # x points down
+        >>> td = TensorDict({("forecast", "ensemble"): nose_down})
+        >>> Gravity(SO3(), gravity=1.0)(td)["forecast", "observation"].round(decimals=3) + 0.0
+        tensor([[-1.,  0.,  0.]])
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        *,
+        gravity: float = 9.81,
+        part: int = 0,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        check_number("gravity", gravity, above=0)
+        super().__init__(space, [0.0, 0.0, float(gravity)], part=part, in_key=in_key, out_key=out_key)
+
+
+class PositionInBody(_Reading):
+    r"""Where landmarks lie as seen from the body, :math:`R^\top (l - p)`: what a stereo camera or a lidar reads.
+
+    Args:
+        space: of the states.
+        landmark: where it lies in the world, ``[3]``, in the plane ``[2]``; of several ``[L, 3]`` or ``[L, 2]``.
+        part: the place of the pose, ``SE2()``, ``SE3()`` or ``SE23()``, in a ``Product``.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 3 L]``, in the plane ``[*B, E, 2 L]``.
+
+    Raises:
+        TypeError: if the part is no pose.
+        ValueError: if landmarks have another shape.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> pose = torch.tensor([[torch.pi / 2, 1.0, 0.0]])  # it looks along y
+        >>> sees = PositionInBody(SE2(), [1.0, 5.0])
+        >>> sees(TensorDict({("forecast", "ensemble"): pose}))["forecast", "observation"].round(decimals=3) + 0.0
+        tensor([[5., 0.]])
+    """
+
+    kinds: tuple[type[Space], ...] = (SE2, SE3, SE23)
+    landmark: Tensor
+
+    def __init__(
+        self,
+        space: Space,
+        landmark: Sequence[float] | Sequence[Sequence[float]] | Tensor,
+        *,
+        part: int = 0,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(space, part, None, in_key, out_key)
+        size = 2 if isinstance(self.read_space, SE2) else 3
+        _register_vectors(self, "landmark", landmark, [size], [len(landmark), size])
+        self.reading_space = Euclidean(self.landmark.numel())
+
+    def observe(self, point):
+        """The landmarks in the body's axes."""
+        size = self.landmark.shape[-1]
+        away = self.landmark.reshape(-1, size) - point[..., -size:].unsqueeze(-2)
+        if size == 3:
+            return rotate(_inverse(point).unsqueeze(-2), away).flatten(-2)
+        cos, sin = point[..., :1].cos(), point[..., :1].sin()
+        x, y = away.unbind(-1)
+        return torch.stack([cos * x + sin * y, cos * y - sin * x], -1).flatten(-2)
+
+
+class RangeBearing(PositionInBody):
+    """How far a landmark in the plane is, and by how much to the left of straight ahead.
+
+    The second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle())``, ``reading_space``.
+
+    Args:
+        space: of the states.
+        landmark: where it lies in the world, ``[2]``.
+        part: the place of the pose, ``SE2()``, in a ``Product``.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 2]``: the unit of length, and rad.
+
+    Raises:
+        TypeError: if the part is no pose in the plane.
+        ValueError: if the landmark has another shape.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> pose = torch.tensor([[0.0, 1.0, 0.0]])
+        >>> RangeBearing(SE2(), [1.0, 5.0])(TensorDict({("forecast", "ensemble"): pose}))["forecast", "observation"]
+        tensor([[5.0000, 1.5708]])
+    """
+
+    kinds = (SE2,)
+
+    def __init__(
+        self,
+        space: Space,
+        landmark: Sequence[float] | Tensor,
+        *,
+        part: int = 0,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(space, landmark, part=part, in_key=in_key, out_key=out_key)
+        if self.landmark.ndim != 1:
+            raise ValueError(f"landmark is one, [2]; got {list(self.landmark.shape)}.")
+        self.reading_space = Product(Euclidean(1), Circle())
+
+    def observe(self, point):
+        """Range and bearing; at the landmark itself zero, and so is their gradient."""
+        away = super().observe(point)
+        there = (away == 0).all(-1, keepdim=True)
+        away = torch.where(there, torch.ones_like(away), away)
+        polar = torch.stack([torch.linalg.vector_norm(away, dim=-1), torch.atan2(away[..., 1], away[..., 0])], -1)
+        return torch.where(there, torch.zeros_like(polar), polar)
+
+
+def _inverse(pose: Tensor) -> Tensor:
+    """The world's orientation seen from the body, of a pose whose first four numbers are a quaternion."""
+    return SO3().inverse(pose[..., :4])
+
+
+def _register_vectors(module: nn.Module, name: str, value: Sequence | Tensor, *shapes: list[int]) -> None:
+    """Keeps finite numbers of one of these shapes.
+
+    Raises:
+        ValueError: if they have another one.
+    """
+    register_constant(module, name, value)
+    found = getattr(module, name)
+    if list(found.shape) not in shapes:
+        raise ValueError(f"{name} is {' or '.join(map(str, shapes))}; got {list(found.shape)}.")
+    check_values(name, found)
