@@ -17,6 +17,7 @@ import torch_denkf
 from tests.filters.factories import FixedEnsemble, NoisyLinear
 from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, KalmanFilter, ParticleFilter
 from torch_denkf.functional.localisation import Neighbours
+from torch_denkf.functional.manifolds import Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor, SensorAttention
 from torch_denkf.modules import (
     ConstantNoise,
@@ -302,6 +303,7 @@ def test_a_gate_that_spreads_members_over_more_than_a_turn_takes_their_angles_fo
 
 ANGLES = {"angles": [0]}
 BOTH = {**ANGLES, "observation_angles": [0]}
+PLANE = Product(Circle(), Euclidean(1))
 
 
 SAMPLED = ensemble("sensor", "samples")  # a filter whose sensor draws samples
@@ -314,6 +316,10 @@ LOSSES = {
     **{
         f"MixtureLoss, {score}": (MixtureLoss, particles(), {**ANGLES, "score": score}) for score in ("mixture", "crps")
     },
+    "DEnKFLoss, space": (DEnKFLoss, SAMPLED, {"space": PLANE, "observation_angles": [0]}),
+    "GaussianLoss, space": (GaussianLoss, gaussian(EKF), {"space": PLANE, "observation_angles": [0], "score": "nll"}),
+    "MixtureLoss, space": (MixtureLoss, particles(), {"space": PLANE}),
+    "TransitionLoss, space": (TransitionLoss, SAMPLED, {"space": PLANE, "spread": [0.1, 0.1]}),
     "TransitionLoss": (TransitionLoss, SAMPLED, ANGLES),
     "TransitionLoss of moments": (TransitionLoss, gaussian(EKF), ANGLES),
     "SensorLoss": (SensorLoss, SAMPLED, {"observation_angles": [0]}),

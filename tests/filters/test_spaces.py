@@ -369,7 +369,9 @@ def test_a_turned_world_turns_what_is_smoothed(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_step_and_sequence_agree(kind):
     filter = make(kind)
-    data = with_noise(filter, log())
+    data = log()
+    data["is_init"] = torch.arange(T).reshape(T, 1).expand(B, T, 1) == 0
+    data = with_noise(filter, data)
     close(stepwise(filter, data.clone()), filter.sequence(data.clone()), [*filter.belief_keys], atol=1e-10)
 
 

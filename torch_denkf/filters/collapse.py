@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_denkf._checks import flag_value
 from torch_denkf.filters.messages import Messages
 from torch_denkf.filters.structure import Structure
 from torch_denkf.modules._call import Entries
@@ -41,8 +42,9 @@ def _say(
 ) -> None:
     late = nis.shape[-2] // 2
     seen = (innovation != 0).sum(-1)[..., late:]
-    far = (nis.squeeze(-1)[..., late:] / seen).sqrt()[seen > 0]
-    if len(far) < _READINGS or not far.median() > _FAR:
+    far = torch.where(seen > 0, (nis.squeeze(-1)[..., late:] / seen).sqrt(), torch.nan)
+    median = far.nanmedian()
+    if not flag_value(((seen > 0).sum() >= _READINGS) & (median > _FAR)):
         return
     members, predicted = (outputs.get(key) for key in module.in_keys[:2])
     component = ""
@@ -56,7 +58,7 @@ def _say(
     messages.once(
         f"narrow at {place!r}",
         f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of them lie more "
-        f"than {float(far.median()):.1f} standard deviations from what it expects.{component} Chance correlations of "
+        f"than {float(median):.1f} standard deviations from what it expects.{component} Chance correlations of "
         "few members shrink what fast sensors say nothing about: take more members, or "
         'EnsembleAnalysis(localisation="significance"). Else the noise of these readings, or that of the motion, is '
         "too small.",

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -514,6 +515,89 @@ class Product(Space):
 
     def _each(self, function: Callable[..., Tensor], *values: Sequence[Tensor]) -> Tensor:
         return torch.cat([function(*own) for own in zip(self.parts, *values, strict=True)], -1)
+
+
+class Place(NamedTuple):
+    """A part of a product, and where it stands.
+
+    Attributes:
+        space: the part.
+        point: its numbers among those of a point.
+        tangent: its numbers among those of a tangent.
+        rotation: those of the tangent that are a rotation, an angle or an axis times an angle; they may be none.
+    """
+
+    space: Space
+    point: slice
+    tangent: slice
+    rotation: slice
+
+
+def places_of(space: Space) -> list[Place]:
+    """The parts of a product, and of products within it; a space that is none is its own part.
+
+    Example:
+        >>> [place.rotation for place in places_of(Product(Euclidean(2), SE3()))]
+        [slice(0, 0, None), slice(2, 5, None)]
+    """
+    places, point, tangent = [], 0, 0
+    todo = [space]
+    while todo:
+        part = todo.pop(0)
+        if isinstance(part, Product):
+            todo = [*part.parts, *todo]
+            continue
+        angles = 3 if isinstance(part, _RotationAndVectors) else int(isinstance(part, (Circle, SE2)))
+        ends = point + part.point_dim, tangent + part.tangent_dim
+        places.append(Place(part, slice(point, ends[0]), slice(tangent, ends[1]), slice(tangent, tangent + angles)))
+        point, tangent = ends
+    return places
+
+
+def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Of which parts all is known: a rotation of which one number is missing is not, nor is its pose.
+
+    Args:
+        space: S.
+        known: which numbers of points are known, ``[*, P]`` bool. Plain numbers are known one by one.
+
+    Returns:
+        The numbers of points that stand in whole parts, ``[*, P]``, and the tangents' numbers that can be told,
+        ``[*, D]``.
+
+    Example:
+        >>> whole_parts(Product(SO3(), Euclidean(2)), torch.tensor([True, True, False, True, True, False]))[1]
+        tensor([False, False, False,  True, False])
+    """
+    points, tangents = [], []
+    for place in places_of(space):
+        own = known[..., place.point]
+        if isinstance(place.space, Euclidean):
+            points.append(own)
+            tangents.append(own)
+        else:
+            own = own.all(-1, keepdim=True)
+            points.append(own.expand(*own.shape[:-1], place.space.point_dim))
+            tangents.append(own.expand(*own.shape[:-1], place.space.tangent_dim))
+    return torch.cat(points, -1), torch.cat(tangents, -1)
+
+
+def check_space(space: Space | None, angles: Sequence[int] = ()) -> None:
+    """Raises unless this is a space, and angles are not named beside it; or it is ``None``.
+
+    Raises:
+        TypeError: for what is no space.
+        ValueError: for angles beside it.
+    """
+    if space is None:
+        return
+    if not isinstance(space, Space):
+        raise TypeError(f"space must be one, such as Product(SO3(), Euclidean(3)); got {space!r}"[:200])
+    if len(angles):
+        raise ValueError(
+            f"angles={list(angles)} are components of plain numbers, but space={space} says itself which of its are "
+            "angles; pass one of the two."
+        )
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional import wrap_angle
-from torch_denkf.metrics.state import mean_of_known, state_difference
+from torch_denkf.functional.manifolds import Space, check_space
+from torch_denkf.metrics.state import known_tangents, mean_of_known, state_difference
 
 __all__ = [
     "SpreadError",
@@ -41,7 +42,12 @@ class SpreadError(NamedTuple):
 
 
 def spread_skill_ratio(
-    mean: torch.Tensor, variance: torch.Tensor, truth: torch.Tensor, ensemble_size: int | None = None
+    mean: torch.Tensor,
+    variance: torch.Tensor,
+    truth: torch.Tensor,
+    ensemble_size: int | None = None,
+    *,
+    space: Space | None = None,
 ):
     r"""Spread over skill, :math:`\sqrt{\frac{E+1}{E}\,\overline{s^2}} / \mathrm{RMSE}`: one for a calibrated ensemble.
 
@@ -53,6 +59,7 @@ def spread_skill_ratio(
         variance: of the ensemble with divisor E-1, ``[*B, S]``.
         truth: ``[*B, S]``, in the same units; what is NaN does not count.
         ensemble_size: E; ``None`` for a distribution whose moments are exact.
+        space: whose points ``[*B, P]`` mean and truth are; the variance is one of tangents.
 
     Returns:
         One ratio a state dimension, ``[S]``.
@@ -70,16 +77,26 @@ def spread_skill_ratio(
         >>> spread_skill_ratio(members.mean(1), members.var(1), truth, 8).round(decimals=1)
         tensor([1.])
     """
-    if not mean.shape == variance.shape == truth.shape:
+    check_space(space)
+    shape = mean.shape if space is None else (*mean.shape[:-1], space.tangent_dim)
+    if mean.shape != truth.shape or variance.shape != shape:
         shapes = [list(part.shape) for part in (mean, variance, truth)]
-        raise ValueError(f"mean, variance and truth need one shape; got {shapes}.")
+        kind = "one shape" if space is None else f"shapes of points of {space}, tangents and points"
+        raise ValueError(f"mean, variance and truth need {kind}; got {shapes}.")
     factor = 1.0 if ensemble_size is None else (ensemble_size + 1) / ensemble_size
-    spread, error = (mean_of_known(values, truth) for values in (variance, (mean - truth).square()))
+    square, truth = state_difference(mean, truth, space=space).square(), known_tangents(truth, space)
+    spread, error = (mean_of_known(values, truth) for values in (variance, square))
     return (factor * spread).sqrt() / error.sqrt()
 
 
 def interval_coverage(
-    mean: Tensor, variance: Tensor, truth: Tensor, *, level: float = 0.9, angles: Sequence[int] = ()
+    mean: Tensor,
+    variance: Tensor,
+    truth: Tensor,
+    *,
+    level: float = 0.9,
+    angles: Sequence[int] = (),
+    space: Space | None = None,
 ) -> Tensor:
     """Share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
@@ -91,6 +108,7 @@ def interval_coverage(
         truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval.
         angles: dimensions that are angles in rad, whose errors are wrapped.
+        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
 
     Returns:
         One share a state dimension, ``[S]``.
@@ -103,15 +121,20 @@ def interval_coverage(
         >>> interval_coverage(torch.zeros(4, 1), torch.ones(4, 1), truth, level=0.9)  # z = 1.645
         tensor([0.7500])
     """
-    error = state_difference(mean, truth, angles=angles)
+    error = state_difference(mean, truth, angles=angles, space=space)
     _check_variance(variance, error)
     _check_level(level)
     quantile = torch.special.ndtri(torch.tensor(0.5 + level / 2, dtype=torch.float64)).item()
-    return _share(error.abs() <= quantile * variance.sqrt(), truth)
+    return _share(error.abs() <= quantile * variance.sqrt(), known_tangents(truth, space))
 
 
 def ensemble_interval_coverage(
-    ensemble: Tensor, truth: Tensor, *, level: float = 0.9, angles: Sequence[int] = ()
+    ensemble: Tensor,
+    truth: Tensor,
+    *,
+    level: float = 0.9,
+    angles: Sequence[int] = (),
+    space: Space | None = None,
 ) -> Tensor:
     """Share of the truth inside the central interval of the members: ``level`` if calibrated, Gaussian or not.
 
@@ -124,6 +147,7 @@ def ensemble_interval_coverage(
         truth: ``[*B, S]``, in the same units; what is NaN does not count.
         level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
         angles: dimensions that are angles in rad; members are taken around their mean direction.
+        space: whose points members and truth are, in place of ``angles``; tangents at the members' mean are ranked.
 
     Returns:
         One share a state dimension, ``[S]``.
@@ -140,9 +164,9 @@ def ensemble_interval_coverage(
         >>> ensemble_interval_coverage(members, torch.tensor([[0.5], [18.5]]), level=0.9)  # from 0 to 18
         tensor([0.5000])
     """
-    members, offset = _around_mean(ensemble, truth, angles)
+    members, offset = _around_mean(ensemble, truth, angles, space)
     lower, upper = ensemble_interval(members, level=level)
-    return _share((lower <= offset) & (offset <= upper), truth)
+    return _share((lower <= offset) & (offset <= upper), known_tangents(truth, space))
 
 
 def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
@@ -182,7 +206,9 @@ def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, 
     return lower, upper
 
 
-def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+def pit(
+    mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
+) -> Tensor:
     r"""Probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
 
     It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident one gathers it at both ends, a timid one
@@ -193,6 +219,7 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] 
         variance: ``[*B, S]``.
         truth: ``[*B, S]``, in the same units.
         angles: dimensions that are angles in rad, whose errors are wrapped.
+        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
 
     Returns:
         ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean. NaN where
@@ -208,14 +235,19 @@ def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, angles: Sequence[int] 
         >>> pit(torch.zeros(3, 1), torch.ones(3, 1), torch.tensor([[-1.2816], [0.0], [1.2816]])).flatten()
         tensor([0.1000, 0.5000, 0.9000])
     """
-    error = state_difference(truth, mean, angles=angles)
+    error = state_difference(truth, mean, angles=angles, space=space)
     _check_variance(variance, error)
     score = error / variance.sqrt()
     return torch.special.ndtr(torch.where((error == 0) & (variance == 0), 0.0, score))
 
 
 def rank_histogram(
-    ensemble: Tensor, truth: Tensor, *, log_weight: Tensor | None = None, angles: Sequence[int] = ()
+    ensemble: Tensor,
+    truth: Tensor,
+    *,
+    log_weight: Tensor | None = None,
+    angles: Sequence[int] = (),
+    space: Space | None = None,
 ) -> Tensor:
     """How often the truth falls into each of the E+1 gaps between and beyond the sorted members.
 
@@ -228,6 +260,7 @@ def rank_histogram(
         log_weight: of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and a truth
             between two ranks in both. Without it, all members weigh the same.
         angles: dimensions that are angles in rad; members are taken around their mean direction.
+        space: whose points members and truth are, in place of ``angles``; tangents at the members' mean are ranked.
 
     Returns:
         Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
@@ -249,7 +282,7 @@ def rank_histogram(
         if log_weight.shape != ensemble.shape[:-1]:
             raise ValueError(f"log_weight must be [*B, E], {list(ensemble.shape[:-1])}; got {list(log_weight.shape)}")
         count = log_weight.shape[-1] * log_weight.double().softmax(-1).unsqueeze(-1)
-    members, offset = _around_mean(ensemble, truth, angles, count)
+    members, offset = _around_mean(ensemble, truth, angles, space, count)
     if not bool(members.isfinite().all() and offset.isfinite().all()):
         raise ValueError("ensemble and truth must be finite; leave out the rows that are not")
     offset, size = offset.unsqueeze(-2), members.shape[-2]
@@ -307,6 +340,7 @@ def spread_error(
     bins: int = 8,
     ensemble_size: int | None = None,
     angles: Sequence[int] = (),
+    space: Space | None = None,
 ) -> SpreadError:
     """Predicted spread and actual error, in bins of states with similar spread.
 
@@ -320,6 +354,7 @@ def spread_error(
         ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
             distribution whose moments are exact.
         angles: dimensions that are angles in rad, whose errors are wrapped.
+        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``; the variance is one of tangents.
 
     Returns:
         A :class:`SpreadError`, in the units of the state.
@@ -332,8 +367,9 @@ def spread_error(
         >>> spread_error(mean, torch.tensor([[1.0], [1.0], [4.0], [4.0]]), truth, bins=2)
         SpreadError(spread=tensor([[1., 2.]]), error=tensor([[1., 3.]]))
     """
-    difference = state_difference(mean, truth, angles=angles)
+    difference = state_difference(mean, truth, angles=angles, space=space)
     _check_variance(variance, difference)
+    truth = known_tangents(truth, space)
     known = ~truth.isnan().flatten(0, -2)
     fewest = int(known.sum(0).min())
     if not 1 <= bins <= fewest:
@@ -349,13 +385,22 @@ def spread_error(
 
 
 def _around_mean(
-    ensemble: Tensor, truth: Tensor, angles: Sequence[int], count: Tensor | float = 1.0
+    ensemble: Tensor, truth: Tensor, angles: Sequence[int], space: Space | None, count: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Members and truth relative to the members' mean, in which angles are wrapped: ``[*B, E, S]`` and ``[*B, S]``."""
+    """Members and truth relative to the members' mean, in which angles are wrapped: ``[*B, E, S]`` and ``[*B, S]``.
+
+    Of points of a space they are tangents: members and truth that are drawn alike are so in these axes, too.
+    """
     if ensemble.ndim != truth.ndim + 1 or (*ensemble.shape[:-2], ensemble.shape[-1]) != truth.shape:
         raise ValueError(
             f"ensemble must be [*B, E, S] and truth [*B, S]; got {list(ensemble.shape)} and {list(truth.shape)}."
         )
+    check_space(space, angles)
+    if space is not None:
+        size = ensemble.shape[-2]
+        share = torch.full_like(ensemble[..., 0], 1 / size) if isinstance(count, float) else count.squeeze(-1) / size
+        centre = space.mean(ensemble, share.to(ensemble.dtype))
+        return space.minus(ensemble, centre.unsqueeze(-2)), space.minus(truth, centre)
     centre = (count * ensemble).mean(-2)
     for dim in angles:
         sine, cosine = ((count * part).mean(-2) for part in (ensemble.sin(), ensemble.cos()))

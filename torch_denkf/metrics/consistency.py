@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.metrics.state import state_difference
 
 __all__ = ["NEES", "gaussian_nll", "nees"]
@@ -30,7 +31,9 @@ class NEES(NamedTuple):
     values: Tensor
 
 
-def gaussian_nll(mean: Tensor, covariance: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+def gaussian_nll(
+    mean: Tensor, covariance: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
+) -> Tensor:
     """Negative log-likelihood of the truth under a Gaussian belief, in nats: lower is better.
 
     Args:
@@ -38,6 +41,8 @@ def gaussian_nll(mean: Tensor, covariance: Tensor, truth: Tensor, *, angles: Seq
         covariance: ``[*B, S, S]``, or the variances ``[*B, S]``.
         truth: ``[*B, S]``, in the same units.
         angles: dimensions that are angles in rad; their errors are wrapped, which suits spreads well below π.
+        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``. The covariance, and the density, is
+            then one of tangents at the mean, S their number.
 
     Returns:
         With a covariance the joint one, ``[*B]``; with variances that of each dimension, ``[*B, S]``.
@@ -52,7 +57,7 @@ def gaussian_nll(mean: Tensor, covariance: Tensor, truth: Tensor, *, angles: Seq
         >>> gaussian_nll(torch.zeros(2), torch.tensor([[1.0, 0.0], [0.0, 4.0]]), torch.tensor([1.0, 0.0]))
         tensor(3.0310)
     """
-    error = state_difference(truth, mean, angles=angles)
+    error = state_difference(truth, mean, angles=angles, space=space)
     scale = _scale(error, covariance)
     zero = torch.zeros_like(error)
     if covariance.ndim == error.ndim:
@@ -66,6 +71,7 @@ def nees(
     truth: Tensor,
     *,
     angles: Sequence[int] = (),
+    space: Space | None = None,
     level: float = 0.95,
     dim: int | None = None,
 ) -> NEES:
@@ -84,6 +90,8 @@ def nees(
         covariance: P, ``[*B, S, S]``, or the variances ``[*B, S]`` where the errors are uncorrelated.
         truth: ``[*B, S]``, in the same units.
         angles: dimensions that are angles in rad, whose errors are wrapped.
+        space: whose points ``[*B, P]`` mean and truth are, in place of ``angles``. The covariance is then one of
+            tangents at the mean, S their number.
         level: probability of the bounds.
         dim: batch dimension to average over; all of them by default.
 
@@ -108,7 +116,7 @@ def nees(
         raise ValueError(f"level is the probability of the bounds, in (0, 1); got {level}")
     if bool(truth.isnan().any()):
         raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
-    error = state_difference(mean, truth, angles=angles)
+    error = state_difference(mean, truth, angles=angles, space=space)
     scale = _scale(error, covariance)
     if covariance.ndim == error.ndim:
         whitened = error / scale
@@ -118,7 +126,7 @@ def nees(
     count = values.numel() if dim is None else values.shape[dim]
     if count == 0:
         raise ValueError(f"there are no errors to average over, got {list(truth.shape)}")
-    freedom = count * truth.shape[-1]
+    freedom = count * error.shape[-1]
     lower, upper = (_chi_square_quantile(p, freedom) / count for p in ((1 - level) / 2, (1 + level) / 2))
     return NEES(values.mean() if dim is None else values.mean(dim), lower, upper, values)
 

@@ -2,6 +2,10 @@
 
 A truth that is NaN is not known: it counts nowhere. Of data with a mask of labels that is
 ``truth.where(data["state_observed"], torch.nan)``.
+
+States may be points of a space, such as ``Product(SO3(), Euclidean(3))``: pass ``space=`` in place of ``angles=``.
+Errors, variances and covariances are then those of tangents, ``[*B, D]``, and each figure is one of a component of
+tangents. A part of the space whose truth is NaN in places is not known.
 """
 
 from __future__ import annotations
@@ -13,8 +17,9 @@ import torch
 from torch import Tensor
 
 from torch_denkf.functional import wrap_angle
+from torch_denkf.functional.manifolds import Space, check_space, places_of, whole_parts
 
-__all__ = ["StateErrors", "mean_of_known", "state_difference", "state_errors"]
+__all__ = ["StateErrors", "known_tangents", "mean_of_known", "rotation_error", "state_difference", "state_errors"]
 
 
 class StateErrors(NamedTuple):
@@ -29,19 +34,24 @@ class StateErrors(NamedTuple):
     mae: Tensor
 
 
-def state_difference(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> Tensor:
+def state_difference(
+    estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
+) -> Tensor:
     """Estimate minus truth, where headings that differ by whole turns are the same.
+
+    From the truth to the estimate and back leads a tangent and its negative: it is the error at either.
 
     Args:
         estimated: states, ``[*B, S]``.
         truth: the true states, of the same shape.
         angles: dimensions that are angles in rad; (2,) of KITTI's (x, y, θ, v, θ_dot). Turn rates are none.
+        space: whose points the states are, in place of ``angles``.
 
     Returns:
-        The differences, ``[*B, S]``; angles in [-π, π).
+        The differences, ``[*B, S]``; angles in [-π, π). Of points of a space the tangents, ``[*B, D]``.
 
     Raises:
-        ValueError: if the shapes differ.
+        ValueError: if the shapes differ, or for angles beside a space.
         IndexError: if there is no such dimension.
 
     Examples:
@@ -54,6 +64,9 @@ def state_difference(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] 
             f"estimate and truth must both be [*B, S], got {list(estimated.shape)} and {list(truth.shape)}; for "
             "ensembles pass the mean"
         )
+    check_space(space, angles)
+    if space is not None:
+        return space.minus(estimated, truth)
     difference = estimated - truth
     for dim in angles:
         if not -truth.shape[-1] <= dim < truth.shape[-1]:
@@ -62,7 +75,9 @@ def state_difference(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] 
     return difference
 
 
-def state_errors(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()) -> StateErrors:
+def state_errors(
+    estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = (), space: Space | None = None
+) -> StateErrors:
     """Root mean square and mean absolute error of each dimension, over all batch dims.
 
     Dimensions are kept apart: a mean over metres, radians and metres per second, as the reference script of the DEnKF
@@ -72,6 +87,8 @@ def state_errors(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()
         estimated: states, ``[*B, S]``, such as the mean of a belief.
         truth: the true states, of the same shape; NaN where they are not known, which does not count.
         angles: dimensions that are angles in rad, see :func:`state_difference`.
+        space: whose points the states are, in place of ``angles``; see :func:`rotation_error` for angles between
+            orientations.
 
     Returns:
         A :class:`StateErrors`; NaN in a dimension whose truth is nowhere known.
@@ -86,10 +103,49 @@ def state_errors(estimated: Tensor, truth: Tensor, *, angles: Sequence[int] = ()
         >>> errors.rmse, errors.mae
         (tensor([2.2361, 0.2002]), tensor([2.0000, 0.1416]))
     """
-    difference = state_difference(estimated, truth, angles=angles)
+    difference = state_difference(estimated, truth, angles=angles, space=space)
     if difference.numel() == 0:
         raise ValueError(f"there are no states to average over, got {list(truth.shape)}")
+    truth = known_tangents(truth, space)
     return StateErrors(mean_of_known(difference.square(), truth).sqrt(), mean_of_known(difference.abs(), truth))
+
+
+def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
+    """The angle between an estimated and a true orientation, in degrees.
+
+    It is the length of the shortest turn from one to the other, the geodesic distance.
+
+    Args:
+        estimated: points of the space, ``[*B, P]``.
+        truth: the true points, of the same shape; NaN where they are not known.
+        space: one with K orientations: ``Circle``, ``SO3``, ``SE2``, ``SE3``, ``SE23``, or a product with some.
+
+    Returns:
+        ``[*B, K]``, in [0, 180]; NaN where the truth is.
+
+    Raises:
+        ValueError: if the shapes do not fit, or if the space has no orientation.
+
+    Examples:
+        >>> import torch
+        >>> from torch_denkf.functional.manifolds import SO3
+        >>> upright, quarter_turn = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.7071, 0.0, 0.0, 0.7071]])
+        >>> rotation_error(upright, quarter_turn, space=SO3()).round(decimals=2)
+        tensor([90.])
+    """
+    error = state_difference(estimated, truth, space=space)
+    turns = [place.rotation for place in places_of(space) if place.rotation.start < place.rotation.stop]
+    if not turns:
+        raise ValueError(f"{space} has no orientation; see state_errors")
+    return torch.stack([torch.linalg.vector_norm(error[..., turn], dim=-1) for turn in turns], -1).rad2deg()
+
+
+def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
+    """What is NaN where no error is known: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
+    if space is None:
+        return truth
+    known = whole_parts(space, ~truth.isnan())[1]
+    return torch.zeros_like(known, dtype=truth.dtype).where(known, torch.nan)
 
 
 def mean_of_known(values: Tensor, truth: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torch_denkf._checks import check_mask
 from torch_denkf.functional import wrap_angles
+from torch_denkf.functional.manifolds import Space, whole_parts
 from torch_denkf.modules._running import declared
 
 if TYPE_CHECKING:
@@ -53,11 +54,12 @@ class Labels(NamedTuple):
     """True values, as far as they are known and count.
 
     Attributes:
-        values: ``[*B, N]``; zero where there is no label.
-        mask: ``[*B, N]``, True where there is one.
+        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral where there is none.
+        mask: ``[*B, N]``, True where there is one. N are the tangents' components of a space.
         dims: of the N components those that count.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
         angles: components that are angles, whose errors are wrapped.
+        space: the space whose points they are; ``None`` of plain numbers.
     """
 
     values: Tensor
@@ -65,18 +67,37 @@ class Labels(NamedTuple):
     dims: Sequence[int]
     scale: Tensor | None = None
     angles: Sequence[int] = ()
+    space: Space | None = None
 
     @property
     def rows(self) -> Tensor:
         """Which elements have a label, ``[*B]``."""
         return self.mask.any(-1)
 
-    def errors(self, estimate: Tensor) -> Tensor:
-        """Scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label."""
-        values, mask = self.values, self.mask
-        if estimate.ndim > values.ndim:
+    def errors(self, estimate: Tensor, weights: Tensor | None = None, *, each: bool = False) -> Tensor:
+        """Scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label.
+
+        In a space they are tangents. Those of members and of the truth are taken at the members' mean, and subtracted:
+        members that are drawn like the truth then have tangents that are distributed like the truth's, and their score
+        is proper. At the truth their axes turn with it, and a spread that is not the truth's scores best. The mean is
+        a constant to the gradient: it only lays the axes.
+
+        Args:
+            estimate: of points ``[*B, P]``, or ``[*B, E, P]``, where there is a space.
+            weights: of members, ``[*B, E]``, for their mean; ``None`` for equal ones.
+            each: of members each on its own, in the tangent space at the truth.
+        """
+        values, mask, space = self.values, self.mask, self.space
+        members = estimate.ndim > values.ndim
+        if members:
             values, mask = values.unsqueeze(-2), mask.unsqueeze(-2)
-        errors = wrap_angles(estimate - values, self.angles)
+        if space is None:
+            errors = wrap_angles(estimate - values, self.angles)
+        elif each or not members:
+            errors = space.minus(estimate, values)
+        else:
+            center = space.mean(estimate.detach(), None if weights is None else weights.detach()).unsqueeze(-2)
+            errors = space.minus(estimate, center) - space.minus(values, center)
         return torch.where(mask, errors if self.scale is None else errors / self.scale, 0)
 
     def mean(self, scores: Tensor) -> Tensor:
@@ -93,7 +114,7 @@ class Labels(NamedTuple):
         Raises:
             ValueError: if there are more or fewer.
         """
-        size = self.values.shape[-1]
+        size = self.mask.shape[-1]
         if value.numel() == 1 or (value.numel() == size and isinstance(self.dims, range)):
             return value.expand(size)
         if value.numel() != len(self.dims):
@@ -111,7 +132,8 @@ class Labels(NamedTuple):
         scale = self.in_all_components(name, scale)
         mask = self.mask & scale.isfinite()
         scale = torch.where(scale.isfinite(), scale, 1)
-        return Labels(torch.where(mask, self.values, 0), mask, self.dims, scale, angles)
+        values = torch.where(mask, self.values, 0) if self.space is None else self.values
+        return self._replace(values=values, mask=mask, scale=scale, angles=angles)
 
 
 class Truth:
@@ -176,24 +198,45 @@ class Truth:
 
     def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
         """What a model observes in the true state; what it makes of NaN is NaN: no label."""
-        values, dims = self.entry(self.keys.state, given=True), self.loss.dims
+        # The components of a space are those of tangents: its points are whole.
+        values, dims = self.entry(self.keys.state, given=True), None if self.loss.space else self.loss.dims
         size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))
         return observe(self._known("state", values, size, dims))
 
     def state_size(self) -> int | None:
-        """S, of the belief where there is one; ``None`` where nobody says."""
+        """S, of the belief where there is one, P of a space; ``None`` where nobody says."""
         filter = self.loss.filter
+        if self.loss.space is not None:
+            return self.loss.space.point_dim
         values = (self.out.get(key, None) for key in filter.structure.carry if key[-1] in ("ensemble", "mean"))
         sizes = (value.shape[-1] for value in values if value is not None)
         return next(sizes, declared(filter.initial).state_dim)
 
     def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
+        space = self.loss.space if name == "state" else None
+        if space is not None:
+            return self._points(space, values, size, dims)
         known = self._known(name, values, size, dims)
         dims = range(min(values.shape[-1], size)) if dims is None else dims
         counting = torch.zeros(size, dtype=torch.bool, device=known.device)
         counting[list(dims)] = True
         mask = ~known.isnan() & counting
         return Labels(torch.where(mask, known, 0), mask, dims)
+
+    def _points(self, space: Space, values: Tensor, size: int, dims: Sequence[int] | None) -> Labels:
+        """True points, and which components of tangents they have labels for."""
+        if size != space.point_dim:
+            raise ValueError(
+                f"a point of space={space} has {space.point_dim} numbers, but the belief's state has {size}"
+            )
+        known = self._known("state", values, size, None)
+        whole, mask = whole_parts(space, ~known.isnan())
+        given = torch.arange(size) < values.shape[-1]
+        dims = range(int(whole_parts(space, given)[1].sum())) if dims is None else dims
+        counting = torch.zeros(space.tangent_dim, dtype=torch.bool, device=known.device)
+        counting[list(dims)] = True
+        points = space.normalise(torch.where(whole, known, space.neutral(known)))
+        return Labels(points, mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
         """Labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.

@@ -81,7 +81,11 @@ class Particles(OfBelief):
         if log_weights is None:
             log_weights = torch.full_like(particles[..., 0], -math.log(particles.shape[-2]))
         labels = truth.state(particles.shape[-1])
-        return labels.errors(particles), log_weights, labels
+        return labels.errors(particles, log_weights.softmax(-1), each=self.each(truth)), log_weights, labels
+
+    def each(self, truth: Truth) -> bool:
+        """Whether the score has a tangent space at each particle: the width around it is in that."""
+        return truth.loss.score == "mixture"
 
 
 class Mean(Particles):
@@ -91,6 +95,10 @@ class Mean(Particles):
         errors, log_weights, labels = self.errors(truth)
         # The mean of errors, because the mean of angles on both sides of pi is none.
         return labels.mean(weighted_mean(errors, log_weights).square()), labels.rows
+
+    def each(self, truth):
+        """Never."""
+        return False
 
 
 class Sensor(Term):

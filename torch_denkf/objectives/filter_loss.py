@@ -16,6 +16,7 @@ from torch_denkf._arguments import Checked, check_key
 from torch_denkf._checks import check_number
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.modules._tensors import as_floating, check_dims
 from torch_denkf.objectives._labels import Keys, Truth
 
@@ -61,11 +62,17 @@ class StateOptions(TypedDict, total=False):
             dimension with infinite scale does not count.
         angles: state dimensions that are angles in radians, counted in the whole state; their errors are wrapped to
             [-pi, pi).
+        space: the space whose points the states are, such as ``Product(SO3(), Euclidean(3))``, in place of ``angles``.
+            Errors are then tangents ``[D]``, whose components ``dims`` and ``state_scale`` count; the belief's
+            covariance is one of tangents at its mean. A part of the space has a label where all of its numbers have.
+            Scores of members compare tangents at the members' mean, which makes them proper; a Gaussian's density is
+            that of the tangent from its mean to the truth, in the units of tangents.
     """
 
     dims: Sequence[int] | None
     state_scale: Scale
     angles: Sequence[int]
+    space: Space | None
 
 
 class SequenceOptions(ReadingsOptions, StateOptions, total=False):
@@ -171,15 +178,17 @@ class FilterLoss(Checked, LossModule):
             dimension with infinite scale does not count: means are taken over the others.
         observation_scale: ``[O]``, what errors of observations are divided by.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
+        space: whose points the states are, in place of ``angles``; ``dims`` and ``state_scale`` are then those of
+            tangents, see :class:`StateOptions`.
         observation_angles: dimensions of observations that are angles in radians.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
 
     Raises:
-        TypeError: for what is no filter or no term.
+        TypeError: for what is no filter, no term or no space.
         ValueError: on an unknown score, two terms of one name, a scale that is not positive, infinite in all
-            dimensions, or of another length than what is scored, labels of another shape, or slices that are not
-            marked.
+            dimensions, or of another length than what is scored, a space with ``angles``, labels of another shape, or
+            slices that are not marked.
 
     Example:
         >>> from torch_denkf.filters import KalmanFilter
@@ -211,6 +220,7 @@ class FilterLoss(Checked, LossModule):
         state_scale: Scale = None,
         observation_scale: Scale = None,
         angles: Sequence[int] = (),
+        space: Space | None = None,
         observation_angles: Sequence[int] = (),
         detach_every: int | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
@@ -228,7 +238,13 @@ class FilterLoss(Checked, LossModule):
             check_dims("dims", dims, once=True)
             if not len(dims):
                 raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
+        check_space(space, angles)
+        if space is not None and dims is not None and max(dims) >= space.tangent_dim:
+            raise ValueError(
+                f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."
+            )
         super().__init__()
+        self.space = space
         self.dims = None if dims is None else [int(dim) for dim in dims]
         self.filter, self.score, self.reduction, self.detach_every = filter, score, reduction, detach_every
         self.angles, self.observation_angles = list(angles), list(observation_angles)

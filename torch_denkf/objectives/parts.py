@@ -18,6 +18,7 @@ from torch_denkf._checks import check_count
 from torch_denkf._one_sequence import refuse_unmarked_slices
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import declared, reads, reads_of, run_module, run_modules
 from torch_denkf.modules._tensors import as_floating
@@ -187,12 +188,12 @@ class TransitionLoss(FilterLoss):
         score: ``"crps"``, ``"energy"`` or ``"mse"`` of members, as in :class:`~torch_denkf.objectives.DEnKFLoss`;
             ``"crps"``, ``"nll"`` or ``"mse"`` of a Gaussian, as in :class:`~torch_denkf.objectives.GaussianLoss`. A
             transition without noise has no spread but ``spread``: teach it by ``"mse"``.
-        spread: standard deviation around the truth, in the state's units: a number or ``[S]``. Members are drawn anew
-            in each call.
+        spread: standard deviation around the truth, in the state's units: a number or ``[S]``, of a space of tangents
+            ``[D]``. Members are drawn anew in each call.
         members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
-        **options: ``dims``, ``state_scale`` and ``angles``, see :class:`StateOptions`.
+        **options: ``dims``, ``state_scale``, ``angles`` and ``space``, see :class:`StateOptions`.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, a negative spread, too few members, a filter that
@@ -256,7 +257,8 @@ class TransitionLoss(FilterLoss):
         truth = Truth(self, tensordict, tensordict).whole_state().values
         # Whatever else reads the true state finds no NaN either.
         known = tensordict.copy().set(self.tensor_keys.state, truth)
-        written = forecasts_from_truth(self.filter, known, truth, self.belief, spread=self.spread, members=self.members)
+        around = {"spread": self.spread, "members": self.members, "space": self.space}
+        written = forecasts_from_truth(self.filter, known, truth, self.belief, **around)
         return TensorDict(written, tensordict.batch_size)
 
     def _counts(self, tensordict):
@@ -301,7 +303,14 @@ def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
 
 
 def forecasts_from_truth(
-    filter: Filter, tensordict: TensorDictBase, truth: Tensor, belief: str, *, spread: Tensor, members: int | None
+    filter: Filter,
+    tensordict: TensorDictBase,
+    truth: Tensor,
+    belief: str,
+    *,
+    spread: Tensor,
+    members: int | None,
+    space: Space | None = None,
 ) -> Entries:
     """What the transition writes at every time of ``[*B, T]`` where the state before was the true one.
 
@@ -314,6 +323,7 @@ def forecasts_from_truth(
         belief: prefix of the belief.
         spread: standard deviation of members around the truth, or of the Gaussian, ``[S]`` or one number.
         members: E.
+        space: whose points the states are; ``None`` for plain numbers.
 
     Returns:
         What it writes, by the names of the belief: ``(belief, "ensemble")`` and so on.
@@ -325,7 +335,7 @@ def forecasts_from_truth(
     if any(key in structure.frame_keys for keys in reads(transition) for key in keys):
         with torch.no_grad():  # these parts are not the ones that are trained
             entries.update(run_modules(structure.frames, entries, call))
-    carried = _belief_at(truth, belief, spread, members)
+    carried = _belief_at(truth, belief, spread, members, space)
     others = [key for key in structure.carry if key not in carried and key not in entries]
     if others:
         without = {key: value for key, value in entries.items() if unravel_key(key) not in structure.belief}
@@ -344,14 +354,16 @@ def forecasts_from_truth(
     return {key: written[forecast] for key, forecast in structure.forecast_of.items()}
 
 
-def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None) -> Entries:
+def _belief_at(truth: Tensor, belief: str, spread: Tensor, members: int | None, space: Space | None) -> Entries:
     """What a belief may hold that is at the truth, or around it by ``spread``."""
-    std = spread.to(truth.dtype).expand_as(truth)
+    size = truth.shape[-1] if space is None else space.tangent_dim
+    std = spread.to(truth.dtype).expand(*truth.shape[:-1], size)
     if members is None:
         return {(belief, "mean"): truth, (belief, "cov"): std.square().diag_embed()}
     ensemble = truth.unsqueeze(-2).expand(*truth.shape[:-1], members, truth.shape[-1])
     if spread.any():
-        ensemble = ensemble + std.unsqueeze(-2) * torch.randn_like(ensemble)
+        away = std.unsqueeze(-2) * torch.randn_like(ensemble[..., :1].expand(*ensemble.shape[:-1], size))
+        ensemble = ensemble + away if space is None else space.plus(ensemble, away)
     return {
         (belief, "ensemble"): ensemble,
         (belief, "log_weight"): torch.full_like(ensemble[..., 0], -log(members)),

@@ -55,7 +55,7 @@ class DEnKFLoss(FilterLoss):
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
@@ -193,7 +193,7 @@ class GaussianLoss(FilterLoss):
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
 
     Raises:
@@ -269,7 +269,7 @@ class MixtureLoss(FilterLoss):
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
         terms: terms of your own beside these, see :class:`Term`.
-        **options: ``dims``, scales, angles, ``detach_every`` and ``reduction``, see
+        **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
             is a density of the state in its own units all the same.
 

@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.functional import ensemble_mean, ensemble_var
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.functional.weighted import weighted_mean, weighted_var
 
@@ -55,6 +56,7 @@ def read_belief(
     *,
     belief: NestedKey = "belief",
     one_sequence: bool = False,
+    space: Space | None = None,
 ) -> Belief:
     """Reads ``("belief", ...)``, the truth and the observed mask.
 
@@ -66,6 +68,7 @@ def read_belief(
         belief: which belief of the roll-out, such as ``"smoothed"``. One of the state ``"age"`` steps ago, as
             :class:`~torch_denkf.smoothers.FixedLag` writes it, is moved to the row of that state.
         one_sequence: whether ``*B`` has to be ``T``.
+        space: whose points ``[*B, P]`` the states are; variances are those of tangents ``[*B, D]``.
 
     Raises:
         KeyError: if the roll-out has no belief, or not the key that was named.
@@ -86,7 +89,7 @@ def read_belief(
         age = root.get("age", None)
         if age is not None and (weight := run.get(("belief", "log_weight"), None)) is not None:
             parts.setdefault("log_weight", number(weight))  # particles of long ago weigh what they weigh now
-    parts = _summarise(parts)
+    parts = _summarise(parts, space)
     batch = parts["mean"].shape[:-1]
     known = torch.ones(batch, dtype=torch.bool)
     if age is not None:
@@ -195,12 +198,17 @@ def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str,
     return moved, latest >= 0
 
 
-def _summarise(parts: dict[str, Tensor]) -> dict[str, Tensor]:
+def _summarise(parts: dict[str, Tensor], space: Space | None) -> dict[str, Tensor]:
     """Adds mean and variance where they follow from what is there."""
+    if space is not None:
+        space.check(**{name: parts[name] for name in ("mean", "ensemble") if name in parts})
     ensemble, weight, cov = parts.get("ensemble"), parts.get("log_weight"), parts.get("cov")
     out = dict(parts)
     if cov is not None:
         out.setdefault("var", cov.diagonal(dim1=-2, dim2=-1))
+    if ensemble is not None and space is not None:
+        out.setdefault("mean", space.mean(ensemble, None if weight is None else weight.softmax(-1)))
+        ensemble = space.minus(ensemble, out["mean"].unsqueeze(-2))
     if ensemble is not None and weight is None:
         out.setdefault("mean", ensemble_mean(ensemble))
         if ensemble.shape[-2] > 1:

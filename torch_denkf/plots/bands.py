@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torch_denkf.functional import wrap_angle
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.calibration import ensemble_interval
 from torch_denkf.plots._axes import (
     BELIEF,
@@ -26,6 +27,7 @@ from torch_denkf.plots._axes import (
     times_of,
 )
 from torch_denkf.plots._belief import Belief, Truth, dims_of, number, read_belief, turns_of, with_truth
+from torch_denkf.plots._space import angles_of, in_components, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,6 +50,7 @@ def plot_bands(
     level: float = 0.9,
     band: Literal["auto", "ensemble", "variance"] = "auto",
     angles: Sequence[int] = (),
+    space: Space | None = None,
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> list[Axes]:
@@ -73,6 +76,9 @@ def plot_bands(
         band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
             the ensemble where its members have equal weights and are enough for ``level``.
         angles: components that are angles in rad: the mean is unwrapped, all else lies within π of it.
+        space: whose points the states are, in place of ``angles``. Components are then those of tangents, with roll,
+            pitch and yaw of a quaternion in degrees, between -180 and 180: a line that leaves at one end goes on at the
+            other. ``readings`` of angles are in rad.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
@@ -94,11 +100,17 @@ def plot_bands(
         [-3.29, 3.29]
     """
     seen = None if isinstance(observed, Mapping) else observed
-    read = read_belief(run, truth, seen, belief=belief, one_sequence=True)
+    check_space(space, angles)
+    read = read_belief(run, truth, seen, belief=belief, one_sequence=True, space=space)
+    if space is not None:
+        read, angles = in_components(read, space), angles_of(space)
     chosen = dims_of(read, dims)
     masks = _masks(run, observed) if isinstance(observed, Mapping) else dict.fromkeys(chosen, _seen(read))
     panels = axes_for(ax, len(chosen), (8, 1.2 + 2 * len(chosen)), share=True)
-    labels, scales = labels_for(names, chosen), one_each("factors", factors, [1.0] * len(chosen))
+    if names is None and space is not None:
+        names = [names_of(space)[dim] for dim in chosen]
+    usual = [180 / np.pi if space is not None and dim in angles else 1.0 for dim in chosen]
+    labels, scales = labels_for(names, chosen), one_each("factors", factors, usual)
     seconds = times_of(time, len(read.mean))
     bounds = step_bounds(seconds)
     turns = turns_of(read, chosen, angles)
@@ -114,23 +126,36 @@ def plot_bands(
         seen = masks.get(dim)
         if seen is not None:
             _shade(axes, bounds, _outages(seen, seconds, gap))
-        if lower is not None and upper is not None:
-            edges = (scale * lower[:, column].numpy(), scale * upper[:, column].numpy())
-            style: dict[str, Any] = {"color": BELIEF, "alpha": 0.3, "linewidth": 0, "label": within}
-            axes.fill_between(seconds, *edges, **style)
+        values = None
         if readings is not None and dim in readings:
             values = number(readings[dim]).reshape(-1, 1)
             if len(values) != len(seconds):
                 raise ValueError(f"readings of component {dim} must be [{len(seconds)}]; got {len(values)}")
             values = _beside(values, mean[:, [column]], [angular[column]])[:, 0]
-            shown = values.isfinite()
             if seen is not None:
-                shown &= seen
-            dots = scale * values[shown].numpy()
-            axes.plot(seconds[shown.numpy()], dots, ".", color=READING, markersize=3.5, label="readings")
-        if true is not None:
-            axes.plot(seconds, scale * true[:, column].numpy(), color=TRUTH, linewidth=1.2, label="truth")
-        axes.plot(seconds, scale * mean[:, column].numpy(), color=BELIEF, linewidth=1.4, label=read.name)
+                values = values.where(seen, torch.nan)
+        line, turns = mean[:, column], [0]
+        if space is not None and angular[column]:
+            turns = _turns([mean, lower, upper, true], column)
+        for turn in turns:
+            away, named = 2 * np.pi * turn, turn == turns[0]
+            if lower is not None and upper is not None:
+                low, high = ((scale * (edge[:, column] - away)).numpy() for edge in (lower, upper))
+                style: dict[str, Any] = {"color": BELIEF, "alpha": 0.3, "linewidth": 0}
+                axes.fill_between(seconds, low, high, **style, label=within if named else None)
+            if values is not None:
+                shown = values.isfinite()
+                dots = (scale * (values[shown] - away)).numpy()
+                style = {"color": READING, "markersize": 3.5, "label": "readings" if named else None}
+                axes.plot(seconds[shown.numpy()], dots, ".", **style)
+            if true is not None:
+                style = {"color": TRUTH, "linewidth": 1.2, "label": "truth" if named else None}
+                axes.plot(seconds, (scale * (true[:, column] - away)).numpy(), **style)
+            style = {"color": BELIEF, "linewidth": 1.4, "label": read.name if named else None}
+            axes.plot(seconds, (scale * (line - away)).numpy(), **style)
+        if len(turns) > 1:  # what lies beyond half a turn is cut off, and drawn at the other end
+            axes.set_ylim(-np.pi * scale, np.pi * scale)
+            axes.set_yticks(scale * np.linspace(-np.pi, np.pi, 5))
         axes.set_ylabel(label)
         axes.set_xlim(bounds[0], bounds[-1])
     label_below(panels, "step" if time is None else "time, s")
@@ -180,6 +205,16 @@ def _unwrap(angle: Tensor) -> Tensor:
     out, known = angle.clone(), angle[angle.isfinite()]
     out[angle.isfinite()] = torch.cat([known[:1], known[:1] + wrap_angle(known.diff()).cumsum(0)])
     return out
+
+
+def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
+    """The turns, 0 from -pi to pi, that unwrapped angles go through: of what is drawn, ``[T, K]`` each, in a column."""
+    values = torch.cat([value[:, column] for value in drawn if value is not None])
+    values = values[values.isfinite()]
+    if not len(values):
+        return [0]
+    first, last = (int(((end + np.pi) / (2 * np.pi)).floor()) for end in (values.min(), values.max()))
+    return list(range(first, last + 1))
 
 
 def _beside(values: Tensor, mean: Tensor, angular: list[bool]) -> Tensor:

@@ -1,0 +1,84 @@
+"""Beliefs of points of a space, in numbers that can be drawn: roll, pitch and yaw of a quaternion."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf.functional.manifolds import Place, Space, places_of
+from torch_denkf.plots._belief import Belief
+
+__all__ = ["angles_of", "in_components", "names_of"]
+
+
+def in_components(read: Belief, space: Space) -> Belief:
+    """The belief in as many numbers as tangents have, D: roll, pitch and yaw in rad stand for a quaternion.
+
+    Roll is about x, then pitch about y, then yaw about z, of axes that do not turn; pitch lies in [-pi/2, pi/2]. The
+    variances, of tangents at the mean, are carried over by the derivative there. It has no end where pitch is +-pi/2:
+    roll and yaw are the same turn there.
+
+    Args:
+        read: points ``[*, P]``, variances and covariances of tangents.
+        space: whose points they are.
+
+    Returns:
+        A belief ``[*, D]``; NaN where a part of the truth is not known.
+    """
+    truth = read.truth
+    if truth is not None and truth.shape[-1] < space.point_dim:
+        missing = truth.new_full((*truth.shape[:-1], space.point_dim - truth.shape[-1]), torch.nan)
+        truth = torch.cat([truth, missing], -1)
+    var = read.var
+    if var is not None:
+        cov = var.diag_embed() if read.cov is None else read.cov
+        slope = _slope(read.mean, space)
+        var = (slope @ cov @ slope.mT).diagonal(dim1=-2, dim2=-1)
+    mean, truth = _components(read.mean, space), None if truth is None else _components(truth, space)
+    ensemble = None if read.ensemble is None else _components(read.ensemble, space)
+    return read._replace(mean=mean, var=var, cov=None, ensemble=ensemble, truth=truth)
+
+
+def angles_of(space: Space) -> list[int]:
+    """Which of the D numbers are angles."""
+    return [index for place in places_of(space) for index in range(place.rotation.start, place.rotation.stop)]
+
+
+def names_of(space: Space) -> list[str]:
+    """A label for each of the D numbers, with degrees for angles."""
+    names = [f"state {index}" for index in range(space.tangent_dim)]
+    for place in places_of(space):
+        turns = ("roll, deg", "pitch, deg", "yaw, deg") if _turns(place) == 3 else ("heading, deg",) * _turns(place)
+        names[place.rotation] = turns
+    return names
+
+
+def _turns(place: Place) -> int:
+    return place.rotation.stop - place.rotation.start
+
+
+def _components(point: Tensor, space: Space) -> Tensor:
+    """``[*, D]`` of points ``[*, P]``."""
+    parts = []
+    for place in places_of(space):
+        own = point[..., place.point]
+        if _turns(place) == 3:
+            w, x, y, z = own[..., :4].unbind(-1)
+            roll = torch.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+            pitch = torch.asin((2 * (w * y - z * x)).clamp(-1, 1))
+            yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            own = torch.cat([torch.stack([roll, pitch, yaw], -1), own[..., 4:]], -1)
+        parts.append(own)
+    return torch.cat(parts, -1)
+
+
+def _slope(mean: Tensor, space: Space) -> Tensor:
+    """The derivative of the D numbers by the tangent, ``[*, D, D]``, at points ``[*, P]``."""
+
+    def moved(tangent: Tensor, point: Tensor) -> Tensor:
+        return _components(space.plus(point, tangent), space)
+
+    flat = mean.reshape(-1, mean.shape[-1])
+    zero = flat.new_zeros(len(flat), space.tangent_dim)
+    slope = torch.func.vmap(torch.func.jacfwd(moved))(zero, flat)
+    return slope.reshape(*mean.shape[:-1], *slope.shape[1:])
