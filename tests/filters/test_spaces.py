@@ -65,11 +65,11 @@ class Orientation(SubModel):
         return state[..., :4]
 
 
-def make(kind, **options):
+def make(kind, members=E, **options):
     """A filter of orientations."""
     parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
     known = {"process_noise": Q, "observation_key": "pose", "reading_space": SO3(), **options}
-    around = AroundState(STD, ensemble_size=200 if kind == "particles" else E, state_key="start", space=SPACE)
+    around = AroundState(STD, ensemble_size=200 if kind == "particles" else members, state_key="start", space=SPACE)
     if kind in ("EKF", "UKF"):
         filter = {"EKF": EKF, "UKF": UKF}[kind]
         return filter(*parts, initial=GaussianAround(STD, state_key="start", space=SPACE), **known)
@@ -90,12 +90,12 @@ def make(kind, **options):
 def log(steps=T, seed=0, hidden=True):
     """True states, gyro, readings of the orientation, some of which are missing, and where a filter starts."""
     torch.manual_seed(seed)
-    rates, bias = torch.randn(B, steps, 3), 0.1 * torch.randn(B, 1, 3)
-    turns = [SO3().exp(2 * torch.randn(B, 3))]
+    rates, turns, biases = torch.randn(B, steps, 3), [SO3().exp(2 * torch.randn(B, 3))], [0.1 * torch.randn(B, 3)]
     for t in range(steps - 1):
-        turns.append(SO3().plus(turns[-1], DT * rates[:, t]))
-    turns = torch.stack(turns, 1)
-    data = TensorDict({"state": torch.cat([turns, bias.expand(B, steps, 3)], -1), "action": rates + bias}, [B, steps])
+        turns.append(SO3().plus(SO3().plus(turns[-1], DT * rates[:, t]), Q[0] * torch.randn(B, 3)))
+        biases.append(biases[-1] + Q[3] * torch.randn(B, 3))
+    turns, biases = torch.stack(turns, 1), torch.stack(biases, 1)
+    data = TensorDict({"state": torch.cat([turns, biases], -1), "action": rates + biases}, [B, steps])
     data["pose"] = SO3().plus(turns, R[0] * torch.randn(B, steps, 3))
     start = SPACE.plus(data["state"][:, 0], torch.tensor(STD) * torch.randn(B, 6))
     data["start"] = start.unsqueeze(1).expand(B, steps, 7).contiguous()
@@ -444,7 +444,7 @@ def test_a_ceiling_holds_the_tangents(kind):
 
 def test_errors_are_as_large_as_they_say_and_smoothers_are_better():
     data = log(steps=150, seed=2, hidden=False)
-    filters = {kind: make(kind) for kind in ("EKF", "UKF", "etkf")}
+    filters = {kind: make(kind, members=100) for kind in ("EKF", "UKF", "etkf")}  # an ensemble that is large enough
     errors = {}
     for kind, filter in filters.items():
         smoother = EnRTS(filter) if kind == "etkf" else RTSSmoother(filter)

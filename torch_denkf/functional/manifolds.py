@@ -104,12 +104,16 @@ class Space:
             points: ``[*B, E, P]``.
             weights: ``[*B, E]``, which add up to one; ``None`` for equal ones.
         """
-        center = self.normalise(self._between(points, weights))
+        center = self.near(points, weights).unsqueeze(-2)
         for _ in range(_MEAN_STEPS):
             away = self.minus(points, center)
             step = away.mean(-2) if weights is None else (weights.unsqueeze(-1) * away).sum(-2)
             center = self.plus(center, step.unsqueeze(-2))
         return center.squeeze(-2)
+
+    def near(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """A point ``[*B, P]`` near the mean, where any will do for tangents: the mean of the numbers."""
+        return self.normalise(self._between(points, weights)).squeeze(-2)
 
     def _between(self, points: Tensor, weights: Tensor | None) -> Tensor:
         """A point ``[*B, 1, P]`` near the mean: the mean of the numbers, counted from the first point."""
@@ -192,6 +196,10 @@ class Euclidean(Space):
     def mean(self, points, weights=None):
         """The mean."""
         return points.mean(-2) if weights is None else (weights.unsqueeze(-1) * points).sum(-2)
+
+    def near(self, points, weights=None):
+        """The mean."""
+        return self.mean(points, weights)
 
 
 @dataclass(frozen=True)
@@ -504,6 +512,10 @@ class Product(Space):
     def mean(self, points, weights=None):
         """Part by part."""
         return self._each(lambda part, own: part.mean(own, weights), self.points(points))
+
+    def near(self, points, weights=None):
+        """Part by part."""
+        return self._each(lambda part, own: part.near(own, weights), self.points(points))
 
     def points(self, point: Tensor) -> Sequence[Tensor]:
         """The parts of a point."""

@@ -11,7 +11,7 @@ from torch_denkf.functional import ensemble_var
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.weighted import weighted_var
 
-__all__ = ["checked_space", "checked_spaces", "moments_on", "reading_about", "without_hidden"]
+__all__ = ["checked_space", "checked_spaces", "mean_and_tangents", "moments_on", "reading_about", "without_hidden"]
 
 
 def checked_space(name: str, space: Space | None) -> Space | None:
@@ -46,8 +46,20 @@ def moments_on(space: Space, ensemble: Tensor, log_weights: Tensor | None = None
     return mean, ensemble_var(away) if log_weights is None else weighted_var(away, log_weights)
 
 
+def mean_and_tangents(space: Space, ensemble: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean ``[*B, P]`` of members, and the tangents ``[*B, E, D]`` to them, by two steps from a point near it.
+
+    For members that an update has just placed about ``start`` ``[*B, P]``; wide ones need more, see :meth:`Space.mean`.
+    """
+    mean = start
+    for _ in range(2):
+        away = space.minus(ensemble, mean.unsqueeze(-2))
+        mean = space.plus(mean, away.mean(-2))
+    return mean, away
+
+
 def reading_about(space: Space, predicted: Tensor, reading: Tensor, observed: Tensor | None) -> tuple[Tensor, Tensor]:
-    """What members predict, and a reading, as tangents at the predictions' mean.
+    """What members predict, and a reading, as tangents at a point near the predictions' mean.
 
     Args:
         space: of the reading.
@@ -58,7 +70,7 @@ def reading_about(space: Space, predicted: Tensor, reading: Tensor, observed: Te
     Returns:
         Tangents ``[*B, E, O]``, and ``[*B, O]`` or ``[*B, E, O]``.
     """
-    center = space.mean(predicted)
+    center = space.near(predicted)
     expected = center.unsqueeze(-2)
     about = expected if reading.ndim == predicted.ndim else center
     return space.minus(predicted, expected), space.minus(without_hidden(reading, about, observed), about)

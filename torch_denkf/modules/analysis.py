@@ -14,7 +14,7 @@ from torch_denkf.functional.inflation import inflate, random_rotation, relax_to_
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.moments import ensemble_cov
 from torch_denkf.modules._ensemble import EnsembleAnalysisKeys, EnsembleUpdate
-from torch_denkf.modules._spaces import reading_about
+from torch_denkf.modules._spaces import mean_and_tangents, reading_about
 from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["EnsembleAnalysis"]
@@ -135,7 +135,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None
         if self.space is not None:
-            center = self.space.mean(forecast).unsqueeze(-2)
+            center = self.space.near(forecast).unsqueeze(-2)
             forecast = self.space.minus(forecast, center)
         ensemble, innovation, nis, log_likelihood = self._formula(
             forecast,
@@ -155,8 +155,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         mean, away = ensemble_mean(ensemble), ensemble
         if self.space is not None and center is not None:
             ensemble = self.space.plus(center, ensemble)
-            mean = self.space.mean(ensemble)
-            away = self.space.minus(ensemble, mean.unsqueeze(-2))
+            mean, away = mean_and_tangents(self.space, ensemble, self.space.plus(center.squeeze(-2), mean))
         var = ensemble_var(away, mean if center is None else None)
         cov = (ensemble_cov(away),) if self.covariance else ()
         return ensemble, mean, var, innovation, nis, log_likelihood, *cov
@@ -175,7 +174,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             predicted, observation = reading_about(self.reading_space, predicted, observation, observed)
         center = None
         if self.space is not None:
-            center = self.space.mean(past.movedim(-3, -2)).unsqueeze(-3)  # of each time
+            center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time
             past = self.space.minus(past, center)
         lag, dim = past.shape[-2:]
         # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.

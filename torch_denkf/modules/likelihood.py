@@ -15,7 +15,7 @@ from torch_denkf.functional import wrap_angles
 from torch_denkf.functional.angles import mean_observation
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._spaces import checked_spaces, reading_about
+from torch_denkf.modules._spaces import checked_spaces, without_hidden
 from torch_denkf.modules._tensors import as_vector, check_dims, mean_of_members
 from torch_denkf.modules.stochastic import StochasticMLP
 
@@ -84,16 +84,20 @@ class GaussianLikelihood(SubModel):
                 f"GaussianLikelihood takes variances [*B, O]; {self.in_keys[2]!r} has shape {list(variance.shape)}. "
                 "Use DiagonalNoise or ConstantNoise."
             )
-        if self.reading_space is not None:
-            predicted, reading = reading_about(self.reading_space, predicted, reading, observed)
         if reading.ndim > len(batch_size) + 1:
-            reading = mean_observation(reading, self.angles)
+            space = self.reading_space
+            reading = mean_observation(reading, self.angles) if space is None else space.mean(reading)
+        reading = reading.unsqueeze(-2)
+        if self.reading_space is not None:  # from each particle by itself: they may lie all around
+            reading = without_hidden(reading, predicted, None if observed is None else observed.unsqueeze(-2))
+            reading = self.reading_space.minus(reading.expand_as(predicted), predicted)
+            predicted = torch.zeros_like(reading)
         if not reading.shape[-1] == predicted.shape[-1] == variance.shape[-1]:
             widths = {
                 key: value.shape[-1] for key, value in zip(self.in_keys, (predicted, reading, variance), strict=True)
             }
             raise ValueError(f"GaussianLikelihood compares vectors of one width; their widths are {widths}.")
-        reading, variance = reading.unsqueeze(-2), variance.unsqueeze(-2)
+        variance = variance.unsqueeze(-2)
         if observed is not None:
             # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
             observed = observed.unsqueeze(-2)
