@@ -23,9 +23,11 @@ from torch_denkf.modules import (
     LearnedTransition,
     NoisyTransition,
     StochasticMLP,
+    Visibility,
     as_process_noise,
 )
-from torch_denkf.modules._running import check_module, in_sequences, writes
+from torch_denkf.modules._running import check_module, reading_of
+from torch_denkf.modules.visible import heeding
 
 __all__ = ["DEnKF"]
 
@@ -56,6 +58,8 @@ class DEnKF(Filter):
         angles: components of the observation that are angles in radians, for the default ``analysis``.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.modules.Visible`.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
@@ -87,6 +91,7 @@ class DEnKF(Filter):
         angles: Sequence[int] = (),
         observation_key: NestedKey | None = None,
         observed_key: NestedKey | None = None,
+        visibility: Visibility | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
         check_module("transition", transition)
@@ -102,16 +107,15 @@ class DEnKF(Filter):
         if analysis is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
-            reading = observation_key
-            if sensor is not None and observation_key is None:
-                *_, last = in_sequences(sensor)
-                reading = writes(last)[0]
+            reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
             mask = "observed" if observed_key is None else observed_key
             keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis("perturbed" if sensor is None else "sensor", angles=angles, **keys)
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)
-        super().__init__(modules, initial=initial, **kwargs)
+        if visibility is not None:
+            modules["visibility"] = visibility
+        modules.update(noise=noise, transition=transition, observation=observation)
+        super().__init__(modules | {"analysis": heeding(visibility, analysis)}, initial=initial, **kwargs)
 
     @classmethod
     def paper(

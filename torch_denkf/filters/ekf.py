@@ -34,8 +34,8 @@ class EKF(GaussianFilter):
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
-            :class:`GaussianOptions`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter
+            takes, see :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
