@@ -52,7 +52,10 @@ def test_what_stands_behind_moves_nothing_in_front():
     after, before = updated(7, 9)
     share = torch.tensor([[0.4], [0.7]], dtype=torch.float64)
     assert_close(
-        mix_members(share, after, before)[..., :4], mix_members(share, after[..., :4], before[..., :4]), rtol=0, atol=1e-12
+        mix_members(share, after, before)[..., :4],
+        mix_members(share, after[..., :4], before[..., :4]),
+        rtol=0,
+        atol=1e-12,
     )
 
 

@@ -38,7 +38,9 @@ def particles(**options):
 ANALYSES = {
     "etkf": lambda **options: Visible(EnsembleAnalysis("etkf", observation_key=KEY), **options),
     "perturbed": lambda **options: Visible(EnsembleAnalysis("perturbed", observation_key=KEY), **options),
-    "Kalman": lambda **options: Visible(KalmanAnalysis(torch.eye(1, dtype=torch.float64), None, observation_key=KEY), **options),
+    "Kalman": lambda **options: Visible(
+        KalmanAnalysis(torch.eye(1, dtype=torch.float64), None, observation_key=KEY), **options
+    ),
     "EKF": lambda **options: Visible(EKFAnalysis(Select([0]), observation_key=KEY), **options),
     "UKF": lambda **options: Visible(UKFAnalysis(Select([0]), observation_key=KEY), **options),
     "particles": particles,
@@ -189,7 +191,8 @@ def test_moments_of_the_belief_are_those_of_the_mixture(name):
     before = {"forecast": moments(td.exclude(("forecast", "cov"), ("forecast", "mean")), "forecast")}["forecast"]
     alone, mixed = analysis(td.clone()), Visible(analysis)(td.clone())
     q = mixed["info", "visible"]
-    assert (q > 0).all() and (q < 1).all()
+    assert (q > 0).all()
+    assert (q < 1).all()
     (mean, cov), (other_mean, other_cov) = moments(alone, "belief"), before
     apart, share = (mean - other_mean).unsqueeze(-1), q.unsqueeze(-1)
     ours = moments(mixed, "belief")
@@ -230,9 +233,10 @@ def test_p_of_one_and_of_zero(name, dtype):
         out = TensorDictSequential(*first, Visible(inner))(td.clone().set(VISIBLE, torch.full((3, 1), p, dtype=dtype)))
         for key in BELIEF:
             wanted = expected.get((prefix, key), None)
-            if wanted is not None and out.get(("belief", key), None) is not None:
-                if p == 1 or key != "mean" or name != "particles":  # the forecast's mean is not the weighted one here
-                    assert_close(out["belief", key], wanted, rtol=0, atol=tolerance)
+            unknown = wanted is None or out.get(("belief", key), None) is None
+            # The forecast's mean is not the one of these weights.
+            if not unknown and (p == 1 or key != "mean" or name != "particles"):
+                assert_close(out["belief", key], wanted, rtol=0, atol=tolerance)
         assert (out["info", "visible"] == p).all()
         if p == 1:
             assert_close(out["info", "log_likelihood"], alone["info", "log_likelihood"], rtol=0, atol=tolerance)
@@ -294,14 +298,17 @@ def test_gradients_reach_the_head_and_are_finite_far_out(name):
 def test_a_head_says_what_it_was_told_to_start_from():
     head = Visibility(4, start=0.7, floor=0.01)
     encoding = torch.randn(5, 4)
-    assert_close(head(TensorDict({("sensor", "encoding"): encoding}, [5]))["sensor", "visible"], torch.full((5, 1), 0.7))
+    assert_close(
+        head(TensorDict({("sensor", "encoding"): encoding}, [5]))["sensor", "visible"], torch.full((5, 1), 0.7)
+    )
     samples = torch.randn(5, 6, 4)
     head.module.layers[-1].weight.data.normal_(std=100.0)
     p = head(TensorDict({("sensor", "encoding"): samples}, [5]))["sensor", "visible"]
     assert_close(p, head(TensorDict({("sensor", "encoding"): samples.mean(1)}, [5]))["sensor", "visible"])
-    assert p.min() >= 0.01 - 1e-6 and p.max() <= 0.99 + 1e-6
+    assert p.min() >= 0.01 - 1e-6
+    assert p.max() <= 0.99 + 1e-6
     for wrong in ({"floor": 0.5}, {"floor": 0.0}, {"start": 1.0}):
-        with pytest.raises(ValueError, match="floor|start"):
+        with pytest.raises(ValueError, match=r"floor|start"):
             Visibility(4, **wrong)
 
 

@@ -17,6 +17,7 @@ from torch_denkf.filters.options import FilterOptions
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
+    FadingBias,
     GaussianPrior,
     ImageSensor,
     LearnedObservation,
@@ -27,6 +28,7 @@ from torch_denkf.modules import (
     as_process_noise,
 )
 from torch_denkf.modules._running import check_module, reading_of
+from torch_denkf.modules.bias import biased_parts
 from torch_denkf.modules.visible import heeding
 
 __all__ = ["DEnKF"]
@@ -58,6 +60,9 @@ class DEnKF(Filter):
         angles: components of the observation that are angles in radians, for the default ``analysis``.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
+        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
+            state, behind its S components, of transition, process noise, observation and initial belief. All these are
+            given for the state alone.
         visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
             update heeds it, see :class:`~torch_denkf.modules.Visible`.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
@@ -91,6 +96,7 @@ class DEnKF(Filter):
         angles: Sequence[int] = (),
         observation_key: NestedKey | None = None,
         observed_key: NestedKey | None = None,
+        sensor_error: FadingBias | None = None,
         visibility: Visibility | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
@@ -98,6 +104,9 @@ class DEnKF(Filter):
         check_module("observation", observation)
         check_module("noise", noise)
         check_module("initial", initial)
+        if sensor_error is not None:
+            biased = biased_parts(sensor_error, transition, observation, process_noise, initial)
+            transition, observation, process_noise, initial = biased
         if process_noise is not None:
             transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
         if analysis is not None and (angles or observation_key is not None or observed_key is not None):

@@ -123,7 +123,9 @@ def mix_members(share: Tensor, members: Tensor, other: Tensor) -> Tensor:
     inverse = torch.where(scale > 0, 1 / torch.where(scale > 0, scale, 1), 0)
     unit = inverse.unsqueeze(-1) * inverse.unsqueeze(-2)
     # As much as rounding leaves of directions in which the members do not differ, lest others are found in there.
-    ridge = max(_RIDGE, torch.finfo(members.dtype).eps) * torch.eye(scale.shape[-1], dtype=scale.dtype, device=scale.device)
+    ridge = max(_RIDGE, torch.finfo(members.dtype).eps) * torch.eye(
+        scale.shape[-1], dtype=scale.dtype, device=scale.device
+    )
     first, wanted = cholesky(unit * gram + ridge), cholesky(unit * whole + ridge)
     scaled = torch.linalg.solve_triangular(first, (inverse.unsqueeze(-2) * base).mT, upper=False)
     return other_mean + q * apart + (scale.unsqueeze(-2) * (scaled.mT @ wanted.mT)).to(members.dtype)

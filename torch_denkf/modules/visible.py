@@ -22,7 +22,7 @@ from typing import cast
 import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var
@@ -113,9 +113,9 @@ class Visible(AnalysisAround):
     =====================  =============================================================================================
 
     With p = 1 that is the analysis alone, with p = 0 the forecast. ``(info_prefix, "log_likelihood")`` is that of the
-    mixture, and ``(info_prefix, "visible")`` ``[*B, 1]`` is q, 0 where nothing is observed. Innovation and ``nis`` are those of the reading as it
-    came. b is the Gaussian that the reading is expected from, ``broad`` times as wide: it is in the reading's own unit,
-    and grows while nothing is seen.
+    mixture, and ``(info_prefix, "visible")`` ``[*B, 1]`` is q, 0 where nothing is observed. Innovation and ``nis`` are
+    those of the reading as it came. b is the Gaussian that the reading is expected from, ``broad`` times as wide: it is
+    in the reading's own unit, and grows while nothing is seen.
 
     Args:
         analysis: of an ensemble, of a mean and a covariance, or of particles with a Gaussian likelihood. Its keys and
@@ -144,9 +144,7 @@ class Visible(AnalysisAround):
         0.00 0.00
     """
 
-    def __init__(
-        self, analysis: SubModel, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")
-    ):
+    def __init__(self, analysis: SubModel, *, broad: float = 10.0, visible_key: NestedKey = ("sensor", "visible")):
         check_number("broad", broad, above=1)
         self_made = _kind(analysis)
         super().__init__(

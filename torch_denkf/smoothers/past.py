@@ -208,7 +208,9 @@ def lagged(analysis: SubModel) -> SubModel:
     Raises:
         TypeError: if it does not say what it does to other states.
     """
-    return analysis.around(lagged(analysis.module)) if isinstance(analysis, AnalysisAround) else LaggedAnalysis(analysis)
+    if isinstance(analysis, AnalysisAround):
+        return analysis.around(lagged(analysis.module))
+    return LaggedAnalysis(analysis)
 
 
 class LaggedBelief(SubModel):
