@@ -50,7 +50,7 @@ class Study:
     filter_runs: int = 200  # that the filters are trained on
     test_runs: int = 200  # of 150 steps
     epochs: int = 6  # of the camera
-    iterations: int = 150  # of each filter
+    iterations: int = 80  # of each filter
     window: int = 60  # steps of a training window
     batch: int = 32
     seed: int = 0
@@ -133,7 +133,7 @@ def draw(outs: dict[str, TensorDict], data: TensorDict, file: Path) -> None:
         axis.set(ylabel=name, ylim=(-5, size + 5))
     axes[1].axhspan(*PILLAR, color="gray", alpha=0.15)
     axes[1].legend(ncols=4, fontsize="small", loc="upper right")
-    for label, out in outs.items():
+    for out in outs.values():
         if ("sensor", "visible") in out.keys(True, True):
             axes[3].plot(second, out["sensor", "visible"][run, span], label="p, from the picture")
             axes[3].plot(second, out["info", "visible"][run, span], label="q, with the reading")

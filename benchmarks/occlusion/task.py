@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import torch
@@ -10,14 +12,15 @@ from torch import Tensor, nn
 
 from torch_denkf.filters import EKF, DEnKF, Filter, LSTMFilter, ParticleFilter
 from torch_denkf.modules import (
+    AroundState,
     DiagonalNoise,
     EnsembleAnalysis,
     FadingBias,
-    GaussianPrior,
+    GaussianAround,
     ImageSensor,
     LearnedTransition,
-    MomentPrior,
     Select,
+    SubModel,
     Visibility,
 )
 
@@ -26,10 +29,10 @@ __all__ = ["KINDS", "RATE", "camera", "drawn", "filter_of", "read", "runs"]
 WIDTH, HEIGHT, RADIUS = 64, 48, 3.0  # pixels
 PILLAR = (24, 40)  # columns
 RATE = 10  # pictures a second
-PUSH = 0.03  # standard deviation of what a step adds to each component of the speed, in pixels a step
-PROCESS = [0.0, 0.0, PUSH, PUSH]
-#: Where a run starts, as far as a filter knows: place in pixels, speed in pixels a step.
-MEAN, STD = [WIDTH / 2, HEIGHT / 2, 0.0, 0.0], [16.0, 12.0, 1.2, 1.2]
+PUSH = 0.02  # standard deviation of what a step adds to each component of the speed, in pixels a step
+NEAR, TURN = 2.0, 0.7  # so many pixels from a wall a filter does not know whether the ball has bounced: pixels a step
+#: Of place and speed, pixels and pixels a step; and how well a filter knows where a run starts.
+MEAN, STD, START = [WIDTH / 2, HEIGHT / 2, 0.0, 0.0], [16.0, 12.0, 1.2, 1.2], [2.0, 2.0, 0.5, 0.5]
 ENCODING, READING = 32, 1.0  # features of the camera; pixels, of a reading's noise before training
 MEMBERS = {"DEnKF": 32, "particle filter": 200}
 KINDS = ("DEnKF", "EKF", "particle filter", "LSTM")
@@ -47,6 +50,20 @@ class Bounce(nn.Module):
         return torch.cat([place, speed], -1)
 
 
+class WallNoise(SubModel):
+    """The noise of the motion: a push, and near a wall the doubt whether the ball has bounced."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("belief", "mean"), ("forecast", "mean")], [("forecast", "noise")])
+
+    def compute(self, _, mean):
+        """Variances ``[*B, 4]``."""
+        place = mean[..., :2]
+        wall = torch.maximum(RADIUS - place, place - (place.new_tensor([WIDTH, HEIGHT]) - RADIUS)) > -NEAR
+        speed = PUSH**2 + wall * TURN**2
+        return torch.cat([torch.zeros_like(speed), speed], -1)
+
+
 def runs(count: int, steps: int, seed: int) -> TensorDict:
     """True states ``[count, steps, 4]``; and how much of the ball is seen: ``visible`` ``[count, steps, 1]``.
 
@@ -54,12 +71,15 @@ def runs(count: int, steps: int, seed: int) -> TensorDict:
     """
     generator = torch.Generator().manual_seed(seed)
     place = RADIUS + torch.rand(count, 2, generator=generator) * (torch.tensor([WIDTH, HEIGHT]) - 2 * RADIUS)
-    way = 2 * torch.pi * torch.rand(count, 1, generator=generator)
-    speed = (0.7 + 0.9 * torch.rand(count, 1, generator=generator)) * torch.cat([way.cos(), way.sin()], -1)
+    slope = torch.pi / 4 * (2 * torch.rand(count, 1, generator=generator) - 1)
+    side = torch.randint(2, (count, 1), generator=generator) * 2 - 1
+    way = torch.cat([side * slope.cos(), slope.sin()], -1)
+    speed = (0.7 + 0.9 * torch.rand(count, 1, generator=generator)) * way
     state, states, bounce = torch.cat([place, speed], -1), [], Bounce()
     for _ in range(steps):
         states.append(state)
-        state = bounce(state) + torch.tensor(PROCESS) * torch.randn(count, 4, generator=generator)
+        push = PUSH * torch.randn(count, 2, generator=generator)
+        state = bounce(state) + nn.functional.pad(push, (2, 0))
     data = TensorDict({"state": torch.stack(states, 1)}, [count, steps])
     x, (left, right) = data["state"][..., :1], PILLAR
     hidden, seen = (x - RADIUS >= left) & (x + RADIUS <= right), (x + RADIUS <= left) | (x - RADIUS >= right)
@@ -81,10 +101,10 @@ def drawn(states: Tensor, seed: int) -> Tensor:
 
 def camera() -> ImageSensor:
     """A network that reads a place from a picture."""
-    trunk = nn.Sequential(
-        nn.Conv2d(1, 8, 5, 2, 2), nn.ReLU(), nn.Conv2d(8, 16, 3, 2, 1), nn.ReLU(), nn.Conv2d(16, 16, 3, 2, 1), nn.ReLU(),
-        nn.Flatten(), nn.Linear(16 * 6 * 8, 64), nn.ReLU(),
-    )  # fmt: skip
+    sizes, trunk = (1, 8, 16, 16), []
+    for before, after in pairwise(sizes):
+        trunk += [nn.Conv2d(before, after, 5 if before == 1 else 3, 2, 2 if before == 1 else 1), nn.ReLU()]
+    trunk = nn.Sequential(*trunk, nn.Flatten(), nn.Linear(16 * 6 * 8, 64), nn.ReLU())
     return ImageSensor(
         2,
         image_shape=(1, HEIGHT, WIDTH),
@@ -130,12 +150,15 @@ def filter_of(kind: str, *, visibility: bool = False, error: FadingBias | None =
     noise = DiagonalNoise(2, r=READING, in_features=ENCODING, in_key="encoding")
     head = Visibility(ENCODING, encoding_key="encoding") if visibility else None
     parts = LearnedTransition(Bounce(), residual=False), None, Select([0, 1])
-    options = {"process_noise": PROCESS, "visibility": head}
+    options = {"process_noise": WallNoise(), "visibility": head}
     if kind == "EKF":
-        initial = MomentPrior(torch.tensor(MEAN), torch.tensor(STD).square().diag())
-        return EKF(*parts, noise, initial=initial, observation_key="reading", sensor_error=error, **options)
-    initial = GaussianPrior(MEAN, STD, ensemble_size=MEMBERS[kind])
+        return EKF(
+            *parts, noise, initial=GaussianAround(START), observation_key="reading", sensor_error=error, **options
+        )
+    initial = AroundState(START, ensemble_size=MEMBERS[kind])
     if kind == "particle filter":
-        return ParticleFilter(*parts, noise=noise, initial=initial, observation_key="reading", **options)
+        # Pushes alone leave too few different particles.
+        options |= {"observation_key": "reading", "jitter": 0.5}
+        return ParticleFilter(*parts, noise=noise, initial=initial, **options)
     analysis = EnsembleAnalysis("etkf", observation_key="reading")
     return DEnKF(*parts, noise, analysis, initial=initial, sensor_error=error, **options)

@@ -11,9 +11,9 @@ from torch import nn
 from benchmarks.occlusion.task import camera, drawn
 from torch_denkf.filters import Filter
 from torch_denkf.modules import FadingBias, ImageSensor
-from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss
+from torch_denkf.objectives import DEnKFLoss, GaussianLoss, MixtureLoss, SensorLoss
 
-__all__ = ["fit_camera", "fit_filter", "lasting_error"]
+__all__ = ["fit_camera", "fit_filter", "fit_frames", "lasting_error"]
 
 
 def fit_camera(data: TensorDict, epochs: int, seed: int) -> ImageSensor:
@@ -41,11 +41,25 @@ def lasting_error(data: TensorDict, *, seen: bool) -> FadingBias:
     return FadingBias.from_residuals(torch.where(data["visible"] == 1, errors, torch.nan) if seen else errors)[0]
 
 
+def fit_frames(filter: Filter, data: TensorDict, *, labels: bool, iterations: int) -> None:
+    """Trains what a filter learns of single readings: how far off they are, and with labels whether the camera sees."""
+    loss = SensorLoss(filter, sensor=0.0, noise=1.0, visible=float(labels))
+    loss.set_keys(sensor="reading")
+    optimiser, frames = torch.optim.Adam(loss.parameters(), 5e-3), data.reshape(-1)
+    for _ in range(iterations):
+        total = sum(loss(frames[torch.randint(len(frames), (512,))]).values())
+        optimiser.zero_grad()
+        total.backward()
+        optimiser.step()
+
+
 def fit_filter(
     filter: Filter, data: TensorDict, *, labels: bool, iterations: int, window: int, batch: int, seed: int
 ) -> Filter:
-    """The filter, trained on windows of the readings by the CRPS of the true place and speed."""
+    """The filter, trained on single readings, and then on windows of them by the CRPS of the true place and speed."""
     torch.manual_seed(seed)
+    if any(place == "noise" for place, _ in filter.structure.frames):
+        fit_frames(filter, data, labels=labels, iterations=5 * iterations)
     weights = {"visible": 0.1} if labels else {}
     scale = {"dims": [0, 1, 2, 3], "state_scale": [4.0, 4.0, 0.4, 0.4]}
     if ("belief", "log_weight") in filter.belief_keys:
