@@ -290,7 +290,11 @@ class BiasedBelief(SubModel):
         self.ensemble_size, self.observation_dim = told.ensemble_size, told.observation_dim
         self.input_dim = told.input_dim or told.state_dim
         self.state_dim = None if told.state_dim is None else told.state_dim + len(bias)
-        self.noise_names = ("",) if any(key[-1] == "ensemble" for key in self.out_keys) else ()
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """The draws of an ensemble's biases."""
+        return ("",) if any(key[-1] == "ensemble" for key in self.out_keys) else ()
 
     def parts(self):
         """The initial belief of the state."""

@@ -22,7 +22,7 @@ from typing import cast
 import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.functional import ensemble_mean, ensemble_var
@@ -86,7 +86,7 @@ class Visibility(SubModel):
         network = StochasticMLP(encoding_dim, 1, num_cells, layer="none", output_gain=0.0)
         share = (start - floor) / (1 - 2 * floor)
         with torch.no_grad():
-            network.layers[-1].bias.fill_(math.log(share / (1 - share)))
+            cast(nn.Linear, network.layers[-1]).bias.fill_(math.log(share / (1 - share)))
         super().__init__(network, [encoding_key], [out_key], optional_keys=[observed_key])
         self.floor = floor
 
