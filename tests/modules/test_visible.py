@@ -321,3 +321,20 @@ def test_what_cannot_be_is_refused():
             Visible(other)
     with pytest.raises(KeyError, match="visible"):
         Visible(inner)(several(samples=True).exclude(VISIBLE).rename_key_(KEY, ("sensor", "ensemble")))
+
+
+@pytest.mark.parametrize("name", ["etkf", "UKF", "particles"])
+def test_a_turn_more_is_the_same_reading(name):
+    likelihood = GaussianLikelihood(observation_key=KEY, angles=[0])
+    inner = {
+        "etkf": lambda: EnsembleAnalysis("etkf", observation_key=KEY, angles=[0]),
+        "UKF": lambda: UKFAnalysis(Select([0, 1]), observation_key=KEY, angles=[0]),
+        "particles": lambda: ParticleAnalysis(likelihood),
+    }[name]()
+    update = TensorDictSequential(*([likelihood] if name == "particles" else []), Visible(inner))
+    td = several()
+    turned = td.clone()
+    turned[KEY][..., 0] += 2 * math.pi
+    out, other = update(td), update(turned)
+    for key in (("belief", "mean"), ("belief", "var"), ("info", "visible"), ("info", "log_likelihood")):
+        assert_close(out[key], other[key])
