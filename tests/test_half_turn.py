@@ -30,6 +30,7 @@ from torch_denkf.modules import (
     Select,
     SubModel,
     UKFTransition,
+    Visible,
 )
 from torch_denkf.monitoring import Gated, GatedAnalysis
 from torch_denkf.objectives import (
@@ -107,6 +108,7 @@ def frames(turn):
     data["compass"], data["other"] = data["samples"][..., :1], reading[..., 1:]
     data["encoding"] = torch.randn(B, T, 3, generator=generator)
     data["observed"] = torch.rand(B, T, 2, generator=generator) < 0.8
+    data["visible"] = torch.linspace(0, 1, B * T).reshape(B, T, 1)
     for name, component in (("compass", slice(0, 1)), ("other", slice(1, 2))):
         data[f"{name}_observed"] = data["observed"][..., component]
     return data
@@ -189,6 +191,16 @@ def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
     return make
 
 
+def heeding(make):
+    """The filter, whose update heeds how likely it is that its sensor sees."""
+
+    def heeds(turn):
+        filter = make(turn)
+        return filter.replace("analysis", Visible(filter["analysis"], visible_key="visible"))
+
+    return heeds
+
+
 def gated(make, **options):
     return lambda turn: Gated(make(turn), **options)
 
@@ -212,6 +224,16 @@ FILTERS = {
     **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
     "particles": particles(),
     "particles, learned": particles(learned_likelihood),
+    **{
+        f"{name} that heeds visibility": heeding(make)
+        for name, make in {
+            "ensemble": ensemble(),
+            "ensemble of samples": ensemble("sensor", "samples"),
+            "Kalman": kalman,
+            "UKF": gaussian(UKF),
+            "particles": particles(),
+        }.items()
+    },
     **{
         f"fused {motion}, {name}": fused(motion, **options)
         for motion in ("ensemble", "Kalman", "UKF")

@@ -318,3 +318,32 @@ def test_errors_name_key_dtype_and_shape():
 
 def test_no_frames_are_no_trouble():
     assert disturb(SaltAndPepper(), torch.zeros(0, 3, 4, 4)).shape == (0, 3, 4, 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_what_is_seen_in_the_place_of_a_box(dtype):
+    """Blur is OpenCV's box filter; noise is uniform between black and white; around the box nothing changes."""
+    image = pictures(2, size=(3, 32, 32))
+    image = image if dtype == torch.uint8 else image.float() / 255
+    white = 255 if dtype == torch.uint8 else 1.0
+    inside = (..., slice(8, 24), slice(16, 32))
+    for fill in ("blur", "noise"):
+        out = disturb(OccludingBox((0.5, 0.5), (0.25, 0.5), fill=fill, generator=rng()), image)
+        assert out.dtype == dtype
+        changed = out != image
+        assert changed[inside].float().mean() > 0.9
+        changed[inside] = False
+        assert not changed.any()
+        values = out[inside].double() / white
+        if fill == "noise":  # 4,608 numbers: their mean and standard deviation are known to 0.004
+            assert values.mean().item() == pytest.approx(0.5, abs=0.02)
+            assert values.std().item() == pytest.approx(12**-0.5, abs=0.02)
+            assert values.min() >= 0
+            assert values.max() <= 1
+        else:
+            side = 9
+            expected = torch.tensor(cv2.blur(image[0, 0].numpy().astype(np.float64), (side, side)))[8:24, 16:24]
+            difference = out[0, 0, 8:24, 16:24].double() - expected  # away from the right border, which cv2 mirrors
+            assert difference.abs().max() < (1 if dtype == torch.uint8 else 1e-5)
+    with pytest.raises(ValueError, match="fill is"):
+        OccludingBox(fill="white")

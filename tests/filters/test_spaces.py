@@ -20,11 +20,13 @@ from torch_denkf.modules import (
     AroundState,
     ConstantNoise,
     EnsembleAnalysis,
+    FadingBias,
     GaussianAround,
     LearnedTransition,
     MomentPrior,
     Select,
     SubModel,
+    Visibility,
     check_analysis,
 )
 from torch_denkf.monitoring import Gated
@@ -481,6 +483,10 @@ def test_what_does_not_fit_is_refused():
         FixedLag(make("EKF"), lag=2)
     with pytest.raises(TypeError, match="FixedLag is"):
         ParticleSmoother(make("particles"))
+    with pytest.raises(ValueError, match="put the biases into the state"):
+        make("EKF", sensor_error=FadingBias([0.1], time=10.0))
+    with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
+        make("EKF", visibility=Visibility(3, encoding_key="pose"))
     sensor = FusedSensor(Orientation(), R, reading_space=SO3(), delay=2)
     start = GaussianAround(STD, state_key="start", space=SPACE)
     with pytest.raises(ValueError, match="plain numbers"):

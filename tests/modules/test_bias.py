@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_denkf.filters import EKF, UKF, DEnKF
+from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
 from torch_denkf.modules import (
     BiasedNoise,
     BiasedObservation,
@@ -168,3 +168,149 @@ def test_what_cannot_be_is_refused():
         BiasedObservation(Select([0]), FadingBias([1.0], time=1.0))(
             TensorDict({("forecast", "ensemble"): torch.zeros(3, 1)}, [])
         )
+
+
+# --------------------------------------------------------------------------------------------- one option of a filter
+
+
+def unit(dtype=torch.double):
+    return {"mean": torch.zeros(2, dtype=dtype), "std": torch.tensor(START[:2], dtype=dtype)}
+
+
+def known_bias(**options):
+    return FadingBias(torch.tensor(STD, dtype=torch.double), TIME, trainable=False, **options)
+
+
+@pytest.mark.parametrize("kind", [EKF, UKF, KalmanFilter])
+def test_the_option_is_the_augmented_kalman_filter(kind):
+    given = unit()
+    q = torch.tensor([0.0, Q], dtype=torch.double)
+    if kind is KalmanFilter:
+        filter = KalmanFilter(
+            motion().module.weight,
+            torch.eye(1, 2, dtype=torch.double),
+            process_noise=q,
+            noise=torch.tensor([R], dtype=torch.double),
+            mean=given["mean"],
+            cov=given["std"].square().diag(),
+            sensor_error=known_bias(),
+            observation_key="reading",
+        )
+    else:
+        initial = MomentPrior(given["mean"], given["std"].square().diag())
+        r = ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading")
+        options = {"process_noise": q, "initial": initial, "observation_key": "reading", "sensor_error": known_bias()}
+        filter = kind(motion(), None, Select([0]), r, **options)
+    out, mean, cov = beside_the_oracle(filter)
+    torch.testing.assert_close(out["belief", "mean"], mean, atol=1e-9, rtol=1e-7)
+    torch.testing.assert_close(out["belief", "cov"], cov, atol=1e-9, rtol=1e-7)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_option_of_an_ensemble_comes_close_to_it(own):
+    """With process noise as an option, and with that of the transition itself."""
+    torch.manual_seed(0)
+    q, given = torch.tensor([0.0, Q], dtype=torch.double), unit()
+    initial = GaussianPrior(given["mean"], given["std"], ensemble_size=20000)
+    analysis = EnsembleAnalysis("etkf", observation_key="reading")
+    r = ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading")
+    noise = ConstantNoise(q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
+    moves = NoisyTransition(motion(), noise) if own else motion()
+    options = {"initial": initial, "sensor_error": known_bias(), "process_noise": None if own else q}
+    out, mean, cov = beside_the_oracle(DEnKF(moves, None, Select([0]), r, analysis, **options))
+    std = cov.diagonal(dim1=1, dim2=2).sqrt()
+    assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.08  # members say it to 0.7 % a step
+    assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
+
+
+def test_steps_are_the_sequence_and_all_learns():
+    torch.manual_seed(0)
+    bias = FadingBias([0.5], time=4.0)
+    initial = GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=6)
+    r = ConstantNoise([R], in_key="reading")
+    filter = DEnKF(
+        motion().float(),
+        None,
+        Select([0]),
+        r,
+        initial=initial,
+        process_noise=0.1,
+        sensor_error=bias,
+        observation_key="reading",
+    )
+    td = filter.draw_noise(TensorDict({"reading": torch.randn(2, 5, 1)}, [2, 5]))
+    whole, belief = filter.sequence(td.copy()), None
+    assert whole["belief", "mean"].shape == (2, 5, 3)
+    for t in range(5):
+        row = td[:, t].copy()
+        belief = (filter.initialise(row) if belief is None else filter.step(row.update(belief))).select(
+            *filter.belief_keys
+        )
+        torch.testing.assert_close(belief["belief", "ensemble"], whole["belief", "ensemble"][:, t])
+    (whole["belief", "mean"].square().sum() + whole["belief", "var"].sum()).backward()
+    assert all(parameter.grad.abs() > 0 for parameter in (bias.log_std, bias.log_time))
+
+
+def test_errors_of_a_factor():
+    state = torch.tensor([[2.0, 4.0, 0.1, -0.5]])
+    td = TensorDict({("forecast", "ensemble"): state}, [])
+    read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 2, time=2.0, factor=True))(td)
+    torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[2.2, 2.0]]))
+    read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 2, time=2.0, factor=True), dims=[1, 1])(td)
+    torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[2.0, 4 * 0.6]]))
+    one = torch.eye(1)
+    with pytest.raises(ValueError, match="no factors"):
+        KalmanFilter(
+            one,
+            one,
+            process_noise=[1.0],
+            noise=[1.0],
+            mean=one[0],
+            cov=one,
+            sensor_error=FadingBias([1.0], 1.0, factor=True),
+        )
+
+
+def residuals(runs, steps, *, std=(2.0, 0.5), time=(10.0, 3.0), white=(0.5, 1.0), seed=0):
+    """AR(1) and white noise, begun in its long run."""
+    rng, decay = np.random.default_rng(seed), np.exp(-1 / np.array(time))
+    bias, rows = np.array(std) * rng.normal(size=(runs, 2)), []
+    for _ in range(steps):
+        rows.append(bias + np.array(white) * rng.normal(size=(runs, 2)))
+        bias = decay * bias + np.array(std) * np.sqrt(1 - decay**2) * rng.normal(size=(runs, 2))
+    return torch.tensor(np.stack(rows, 1))
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_residuals_tell_size_and_time(gaps):
+    """400 runs of 100 steps hold N T / (2 time) = 2,000 and 6,700 draws of the biases apart from each other: their
+
+    variances are known to sqrt(2 / 2000) = 3 %, standard deviations to 1.6 %, and times, a ratio of two such, to about
+    5 %. Allowed are three standard errors; the weak bias has three times its variance in white noise on top of it.
+    """
+    values = residuals(400, 100)
+    if gaps:
+        values[torch.rand(400, 100, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
+    bias, white = FadingBias.from_residuals(values, trainable=False)
+    std, time = bias.std, bias.log_time.exp()
+    assert std.tolist() == pytest.approx([2.0, 0.5], rel=0.06)
+    assert time[0].item() == pytest.approx(10.0, rel=0.15)
+    assert time[1].item() == pytest.approx(3.0, rel=0.2)
+    assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
+
+
+def test_errors_that_outlast_the_runs():
+    values = residuals(400, 30, time=(1e6, 1e6))
+    bias, white = FadingBias.from_residuals(values)
+    assert (bias.log_time.exp() > 30).all()
+    assert bias.std.tolist() == pytest.approx([2.0, 0.5], rel=0.15)  # 400 draws: sqrt(1 / 800) = 3.5 %
+    assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
+
+
+def test_white_residuals_and_few_are_refused():
+    with pytest.raises(ValueError, match="do not last"):
+        FadingBias.from_residuals(torch.randn(50, 100, 1, generator=torch.Generator().manual_seed(1)))
+    with pytest.raises(ValueError, match="it takes 100"):
+        FadingBias.from_residuals(residuals(2, 20))
+    with pytest.raises(ValueError, match=r"\[N, T, K\]"):
+        FadingBias.from_residuals(torch.randn(50, 100))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import NestedKey
@@ -200,19 +201,24 @@ class BlackFrames(ImageDisturbance):
 
 
 class OccludingBox(ImageDisturbance):
-    """Hides a part of the picture behind a black box.
+    """Hides a part of the picture behind a box.
+
+    Append it to a replay, and a sensor learns what it looks like not to see; see
+    :class:`~torch_denkf.modules.Visibility`.
 
     Args:
         size: shares of the frame's height and width; by default 150 x 150 pixels of KITTI's 375 x 1242.
         position: the box's upper left corner as shares of the height and the width, by default row 100 and column 500
             of 375 x 1242, as in the paper's code; what would stick out is cut off. ``None`` draws a place for each
             frame, uniformly over those where the box is whole.
+        fill: what is seen in its place: ``"black"``; ``"blur"``, the mean of the picture about each pixel, a quarter of
+            its width wide; or ``"noise"``, pixels between black and white, each by itself.
         p: probability that a frame is disturbed.
         in_keys: entries of the frame ``[*B, C, H, W]``.
         generator: source of randomness, on the images' device; torch's global one by default.
 
     Raises:
-        ValueError: if a share or ``p`` is not in [0, 1].
+        ValueError: if a share or ``p`` is not in [0, 1], or ``fill`` is none of the three.
 
     Example:
         >>> from tensordict import TensorDict
@@ -226,6 +232,7 @@ class OccludingBox(ImageDisturbance):
         size: tuple[float, float] = (150 / 375, 150 / 1242),
         position: tuple[float, float] | None = (100 / 375, 500 / 1242),
         *,
+        fill: Literal["black", "blur", "noise"] = "black",
         p: float = 1.0,
         in_keys: tuple[NestedKey, ...] = ("pixels",),
         generator: torch.Generator | None = None,
@@ -234,12 +241,24 @@ class OccludingBox(ImageDisturbance):
             good = isinstance(shares, Sequence) and all(isinstance(s, (int, float)) and 0 <= s <= 1 for s in shares)
             if shares is not None and (not good or len(shares) != 2):
                 raise ValueError(f"{name} is a share of the height and one of the width, in [0, 1]; got {shares}.")
+        if fill not in ("black", "blur", "noise"):
+            raise ValueError(f'fill is "black", "blur" or "noise"; got {fill!r}.')
         super().__init__(p, in_keys=in_keys, generator=generator)
-        self.size, self.position = tuple(size), position
+        self.size, self.position, self.fill = tuple(size), position, fill
 
     def _disturb(self, frames: Tensor) -> Tensor:
         rows, columns = (self._side(axis, frames) for axis in (0, 1))
-        return frames.masked_fill((rows[:, :, None] & columns[:, None, :]).unsqueeze(1), 0)
+        box = (rows[:, :, None] & columns[:, None, :]).unsqueeze(1)
+        if self.fill == "black":
+            return frames.masked_fill(box, 0)
+        values = to_float(frames)
+        if self.fill == "blur":
+            side = max(3, 2 * (frames.shape[-1] // 8) + 1)
+            inside = _mean_filter(_mean_filter(values, (side, 1)), (1, side))
+        else:
+            draw = torch.rand(values.shape, generator=self.generator, device=values.device, dtype=values.dtype)
+            inside = draw * scale_of(frames)
+        return torch.where(box, to_dtype(inside, frames), frames)
 
     def _side(self, axis: int, frames: Tensor) -> Tensor:
         """Which rows, or columns, of each frame the box covers, ``[n, H]`` or ``[n, W]``."""

@@ -12,7 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
+from torch_denkf.modules import Visibility
 from torch_denkf.modules._running import check_module, declared
+from torch_denkf.modules.visible import heeding
 
 __all__ = ["GaussianFilter", "GaussianOptions", "refuse_other_beliefs"]
 
@@ -32,6 +34,8 @@ class GaussianOptions(FilterOptions, total=False):
         observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; ``("sensor", "ensemble")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.modules.Visible`. ``None`` by default.
     """
 
     inflation: float
@@ -39,6 +43,7 @@ class GaussianOptions(FilterOptions, total=False):
     reading_space: Space | None
     observation_key: NestedKey
     observed_key: NestedKey
+    visibility: Visibility | None
 
 
 class GaussianFilter(Filter):
@@ -70,6 +75,7 @@ class GaussianFilter(Filter):
         reading_space: Space | None = None,
         observation_key: NestedKey = ("sensor", "ensemble"),
         observed_key: NestedKey = "observed",
+        visibility: Visibility | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
         check_module("noise", noise)
@@ -86,7 +92,9 @@ class GaussianFilter(Filter):
             observed_key=observed_key,
         )
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(noise=noise, transition=transition, analysis=update)
+        if visibility is not None:
+            modules["visibility"] = visibility
+        modules.update(noise=noise, transition=transition, analysis=heeding(visibility, update))
         super().__init__(modules, initial=initial, **kwargs)
 
 

@@ -37,8 +37,9 @@ class BackpropKF(GaussianFilter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
-            :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition where ``control`` is given.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
+            filter takes, see :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition
+            where ``control`` is given.
 
     Reference:
         Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,

@@ -18,15 +18,19 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import (
     DiagonalNoise,
     EnsembleAnalysis,
+    FadingBias,
     GaussianPrior,
     ImageSensor,
     LearnedObservation,
     LearnedTransition,
     NoisyTransition,
     StochasticMLP,
+    Visibility,
     as_process_noise,
 )
-from torch_denkf.modules._running import check_module, declared, in_sequences, writes
+from torch_denkf.modules._running import check_module, declared, reading_of
+from torch_denkf.modules.bias import biased_parts
+from torch_denkf.modules.visible import heeding
 
 __all__ = ["DEnKF"]
 
@@ -58,6 +62,11 @@ class DEnKF(Filter):
         reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default ``analysis`` without a sensor.
         observed_key: its mask ``[*B, 1]`` or ``[*B, O]``, for the default ``analysis``; ``"observed"`` by default.
+        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
+            state, behind its S components, of transition, process noise, observation and initial belief. All these are
+            given for the state alone.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.modules.Visible`.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
@@ -90,12 +99,17 @@ class DEnKF(Filter):
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey | None = None,
+        sensor_error: FadingBias | None = None,
+        visibility: Visibility | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
         check_module("transition", transition)
         check_module("observation", observation)
         check_module("noise", noise)
         check_module("initial", initial)
+        if sensor_error is not None:
+            biased = biased_parts(sensor_error, transition, observation, process_noise, initial)
+            transition, observation, process_noise, initial = biased
         if process_noise is not None:
             q = as_process_noise(process_noise, initial)
             transition = NoisyTransition(transition, q, space=declared(initial).space)
@@ -108,10 +122,7 @@ class DEnKF(Filter):
         if analysis is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or an analysis.")
-            reading = observation_key
-            if sensor is not None and observation_key is None:
-                *_, last = in_sequences(sensor)
-                reading = writes(last)[0]
+            reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
             mask = "observed" if observed_key is None else observed_key
             keys = {"observation_key": reading, "noise_variance_key": noise.out_keys[0], "observed_key": mask}
             analysis = EnsembleAnalysis(
@@ -122,8 +133,10 @@ class DEnKF(Filter):
                 **keys,
             )
         modules = OrderedDict(sensor=sensor) if sensor is not None else OrderedDict()
-        modules.update(noise=noise, transition=transition, observation=observation, analysis=analysis)
-        super().__init__(modules, initial=initial, **kwargs)
+        if visibility is not None:
+            modules["visibility"] = visibility
+        modules.update(noise=noise, transition=transition, observation=observation)
+        super().__init__(modules | {"analysis": heeding(visibility, analysis)}, initial=initial, **kwargs)
 
     @classmethod
     def paper(

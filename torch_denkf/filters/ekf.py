@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.modules._running import declared
+from torch_denkf.modules.bias import FadingBias, biased_parts
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
 from torch_denkf.modules.process_noise import as_process_noise
 
@@ -34,9 +35,12 @@ class EKF(GaussianFilter):
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
+        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
+            state, behind its S components, of transition, process noise, observation and initial belief. All these are
+            given for the state alone.
         stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
-            :class:`GaussianOptions`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
+            filter takes, see :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -70,10 +74,13 @@ class EKF(GaussianFilter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
+        sensor_error: FadingBias | None = None,
         stop_jacobian_gradient: bool = False,
         **options: Unpack[GaussianOptions],
     ):
         q = as_process_noise(process_noise, initial)
+        if sensor_error is not None:
+            transition, observation, q, initial = biased_parts(sensor_error, transition, observation, q, initial)
         space = declared(initial).space
         forecast = EKFTransition(transition, q, stop_jacobian_gradient=stop_jacobian_gradient, space=space)
         super().__init__(sensor, noise, forecast, partial(EKFAnalysis, observation), initial=initial, **options)

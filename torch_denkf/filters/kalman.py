@@ -8,11 +8,12 @@ from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey
+from torch import Tensor, nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
-from torch_denkf.modules import KalmanAnalysis, LinearTransition, MomentPrior
+from torch_denkf.modules import FadingBias, KalmanAnalysis, LinearTransition, MomentPrior
 from torch_denkf.modules._tensors import as_floating, check_dims
 
 __all__ = ["KalmanFilter"]
@@ -35,6 +36,8 @@ class KalmanFilter(Filter):
         cov: of the initial belief, ``[S, S]``.
         control: B, ``[S, A]``, of the action; ``None`` for none.
         angles: components of the observation that are angles in radians.
+        sensor_error: errors of the readings that last, :class:`~torch_denkf.modules.FadingBias`: they become part of
+            the state, behind its S components, as large and as long as they are now.
         observation_key: readings ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
@@ -66,6 +69,7 @@ class KalmanFilter(Filter):
         cov: torch.Tensor,
         control: torch.Tensor | None = None,
         angles: Sequence[int] = (),
+        sensor_error: FadingBias | None = None,
         observation_key: NestedKey = "observation",
         observed_key: NestedKey = "observed",
         **kwargs: Unpack[FilterOptions],
@@ -91,20 +95,38 @@ class KalmanFilter(Filter):
             check_shape("control", b, (size, b.shape[-1] if b.ndim else 0), "[S, A]")
             check_values("control", b)
         check_dims("angles", angles, readings)
+        if sensor_error is not None:
+            f, h, q, m, p = _with_biases(sensor_error, f, h, q, m, p)
+            control = None if control is None else nn.functional.pad(as_floating(control), (0, 0, 0, len(sensor_error)))
         action: dict[str, Any] = {}
         if control is not None:
             action = {"control": control, "action_key": kwargs.get("control_keys", ("action",))[0]}
         modules = OrderedDict(
-            transition=LinearTransition(transition, q.diag() if q.ndim == 1 else q, **action),
+            transition=LinearTransition(f, q.diag() if q.ndim == 1 else q, **action),
             analysis=KalmanAnalysis(
-                observation,
+                h,
                 r,
                 observation_key=observation_key,
                 observed_key=observed_key,
                 angles=angles,
             ),
         )
-        super().__init__(modules, initial=MomentPrior(mean, cov), **kwargs)
+        super().__init__(modules, initial=MomentPrior(m, p), **kwargs)
+
+
+@torch.no_grad()
+def _with_biases(bias: FadingBias, f: Tensor, h: Tensor, q: Tensor, m: Tensor, p: Tensor) -> tuple[Tensor, ...]:
+    """F, H, Q, mean and covariance of the state with the biases behind it."""
+    if bias.factor or len(bias) % len(h):
+        raise ValueError(
+            f"A KalmanFilter takes as many biases for each of the {len(h)} components of the reading, and no factors; "
+            f"sensor_error has {len(bias)}{' factors' if bias.factor else ''}. Take an EKF."
+        )
+    decay, variance, std = (value.to(f.dtype) for value in (bias.decay, bias.variance, bias.std))
+    own = torch.eye(len(h), dtype=f.dtype, device=f.device).repeat(1, len(bias) // len(h))
+    q = torch.block_diag(q.diag() if q.ndim == 1 else q, variance.diag())
+    f, p = torch.block_diag(f, decay.diag()), torch.block_diag(p, std.square().diag())
+    return f, torch.cat([h, own], -1), q, torch.cat([m, torch.zeros_like(decay)]), p
 
 
 def _covariance(name: str, given: dict[str, torch.Tensor], size: int, shape: str) -> torch.Tensor:

@@ -12,9 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.functional.manifolds import Space
-from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, as_process_noise
-from torch_denkf.modules._running import check_module, declared
+from torch_denkf.modules import GaussianLikelihood, NoisyTransition, SubModel, Visibility, as_process_noise
+from torch_denkf.modules._running import check_module, declared, reading_of
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
+from torch_denkf.modules.visible import heeding
 
 __all__ = ["DPF", "PFM", "MixtureParticleFilter", "ParticleFilter"]
 
@@ -53,6 +54,8 @@ class ParticleFilter(Filter):
         reading_space: in which the reading lives, in the place of ``angles``. The initial belief has that of the state.
         observation_key: the reading ``[*B, O]``, for the default likelihood without a sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` that resampling and the default likelihood heed.
+        visibility: a head beside the sensor that says whether it sees, :class:`~torch_denkf.modules.Visibility`; the
+            update heeds it, see :class:`~torch_denkf.modules.Visible`. For a Gaussian likelihood.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite``, ``reject`` and ``prefix`` of :class:`Filter`.
 
@@ -98,6 +101,7 @@ class ParticleFilter(Filter):
         reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         observed_key: NestedKey = "observed",
+        visibility: Visibility | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
         check_module("transition", transition)
@@ -115,7 +119,7 @@ class ParticleFilter(Filter):
         if likelihood is None:
             if observation_key is None and sensor is None:
                 raise ValueError("Without a sensor, say where the reading is: observation_key=..., or a likelihood.")
-            reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
+            reading = reading_of(sensor) if sensor is not None and observation_key is None else observation_key
             keys = {} if noise is None else {"noise_variance_key": noise.out_keys[0]}
             likelihood = GaussianLikelihood(
                 angles=angles, reading_space=reading_space, observation_key=reading, observed_key=observed_key, **keys
@@ -143,11 +147,12 @@ class ParticleFilter(Filter):
             initial = with_weights(initial, ensemble_key=transition.in_keys[0], log_weight_key=transition.in_keys[1])
         modules = OrderedDict(
             sensor=sensor,
+            visibility=visibility,
             noise=noise,
             transition=transition,
             observation=observation,
             likelihood=likelihood,
-            analysis=analysis,
+            analysis=heeding(visibility, analysis),
         )
         super().__init__(
             OrderedDict((name, module) for name, module in modules.items() if module is not None),

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
 from torch_denkf.modules._running import declared
+from torch_denkf.modules.bias import FadingBias, biased_parts
 from torch_denkf.modules.process_noise import as_process_noise
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
 
@@ -33,11 +34,14 @@ class UKF(GaussianFilter):
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief, :class:`~torch_denkf.modules.MomentPrior` or
             :class:`~torch_denkf.modules.GaussianAround`; its covariance may be singular.
+        sensor_error: errors of the sensor that last, :class:`~torch_denkf.modules.FadingBias`: they become part of the
+            state, behind its S components, of transition, process noise, observation and initial belief. All these are
+            given for the state alone.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
         kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
-        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key`` and what every filter takes, see
-            :class:`GaussianOptions`.
+        **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
+            filter takes, see :class:`GaussianOptions`.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.
@@ -67,12 +71,15 @@ class UKF(GaussianFilter):
         *,
         process_noise: TensorDictModuleBase | Sequence[float] | float,
         initial: TensorDictModuleBase,
+        sensor_error: FadingBias | None = None,
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.5,
         **options: Unpack[GaussianOptions],
     ):
         q = as_process_noise(process_noise, initial)
+        if sensor_error is not None:
+            transition, observation, q, initial = biased_parts(sensor_error, transition, observation, q, initial)
         space = declared(initial).space
         forecast = UKFTransition(transition, q, alpha=alpha, beta=beta, kappa=kappa, space=space)
         update = partial(UKFAnalysis, observation, alpha=alpha, beta=beta, kappa=kappa)

@@ -113,6 +113,16 @@ def weighted_innovation(
         >>> print(f"{innovation.item():.1f} {nis.item():.1f}")
         4.0 4.0
     """
+    return scored_innovation(predicted, log_weights, observation, noise, observed=observed)[:2]
+
+
+def scored_innovation(
+    predicted: Tensor, log_weights: Tensor, observation: Tensor, noise: Tensor, *, observed: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`weighted_innovation`, and behind it the log-determinant of the innovation's covariance, ``[*B, 1]``.
+
+    What was not observed adds nothing to it.
+    """
     check_particles(predicted, log_weights, min_size=2)
     size, dim = predicted.shape[-2:]
     check_shape("observation", observation, (*predicted.shape[:-2], dim), "[*B, O]")
@@ -122,8 +132,8 @@ def weighted_innovation(
         innovation, noise = torch.where(observed, innovation, 0), torch.where(observed, noise, 1)
         anomalies = torch.where(observed.unsqueeze(-2), anomalies, 0)
     spread = (anomalies * log_weights.exp().unsqueeze(-1)).mT @ anomalies * (size / (size - 1))
-    _, nis, _ = solve_for_gain(spread + noise.diag_embed(), innovation.unsqueeze(-1), innovation)
-    return innovation, nis
+    _, nis, log_det = solve_for_gain(spread + noise.diag_embed(), innovation.unsqueeze(-1), innovation)
+    return innovation, nis, log_det
 
 
 def crps_weighted(particles: Tensor, log_weights: Tensor, target: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
 from torch_denkf.fusion.sensor import FusedSensor, Wired
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
-from torch_denkf.smoothers.past import LaggedAnalysis
+from torch_denkf.smoothers.past import lagged
 
 __all__ = ["Updates"]
 
@@ -129,7 +129,7 @@ class Updates:
             keys |= {"observation_key": reading, "forecast_prefix": prefix}
             return {name: make(model, ensemble_key=(prefix, "ensemble"), predicted_key=predicted, **keys)}
         update = make(forecast_key=(prefix, "ensemble"), predicted_key=predicted, observation_key=reading, **keys)
-        return {f"{name}_observation": model, name: LaggedAnalysis(update) if self.lag else update}
+        return {f"{name}_observation": model, name: lagged(update) if self.lag else update}
 
 
 def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:

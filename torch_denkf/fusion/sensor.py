@@ -13,7 +13,7 @@ from torch_denkf._arguments import Checked
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import Renamed
 from torch_denkf.modules import ConstantNoise
-from torch_denkf.modules._running import in_sequences, marks_of, writes
+from torch_denkf.modules._running import marks_of, reading_of, writes
 
 __all__ = ["FusedSensor", "Wired", "wire"]
 
@@ -80,8 +80,7 @@ def wire(name: str, sensor: FusedSensor) -> Wired:
     else:
         for key in writes(sensor.sensor):
             names[key] = ("sensor", name, key if isinstance(key, str) else key[-1])
-        *_, last = in_sequences(sensor.sensor)
-        reading = names[writes(last)[0]]
+        reading = names[reading_of(sensor.sensor)]
         modules[f"{name}_sensor"] = Renamed(sensor.sensor, names)
         marks = marks_of(sensor.sensor)
         if observed in marks or any(read not in ("observed", observed, *marks) for read in marks.values()):

@@ -24,6 +24,7 @@ from torch_denkf.modules.sharded_analysis import ShardedEnsembleAnalysis
 from torch_denkf.modules.stochastic import StochasticMLP, deterministic
 from torch_denkf.modules.transition import LearnedTransition
 from torch_denkf.modules.ukf import UKFAnalysis, UKFTransition
+from torch_denkf.modules.visible import Visibility, Visible
 
 __all__ = [
     "SubModel",
@@ -70,4 +71,6 @@ __all__ = [
     "GaussianLikelihood",
     "LearnedLikelihood",
     "NoisyTransition",
+    "Visibility",
+    "Visible",
 ]

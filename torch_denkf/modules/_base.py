@@ -42,6 +42,7 @@ class SubModel(Checked, TensorDictModule):
         source_keys: of what it reads, that of which it makes a reading, where the rest only informs it.
         reads_components: whether each component of a reading counts, and is hidden, by itself.
         joins_readings: whether it looks at several readings together, and has nothing to say without one of them.
+        judges_reading: whether it writes no reading, but what that of the module before it is worth.
         predicted_key: what predicts that reading, ``[*B, E, O]``, which tells how many components it has.
         noise_variance_key: the variances of its reading, which tell how many components that has.
         mask_key: a mask that says whether the frame is observed, of one that takes in no reading itself.
@@ -80,6 +81,7 @@ class SubModel(Checked, TensorDictModule):
     source_keys: Sequence[NestedKey] = ()
     reads_components: bool = False
     joins_readings: bool = False
+    judges_reading: bool = False
     predicted_key: NestedKey = ("forecast", "observation")
     noise_variance_key: NestedKey | None = None
     mask_key: NestedKey | None = None

@@ -22,6 +22,7 @@ __all__ = [
     "marks_of",
     "named_modules_of",
     "random_parts",
+    "reading_of",
     "reads",
     "reads_of",
     "run_module",
@@ -144,6 +145,12 @@ def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]
             yield from in_sequences(part)
     else:
         yield module
+
+
+def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
+    """Where a sensor writes its reading: first what the last of its modules writes that makes one."""
+    *_, last = (part for part in in_sequences(sensor) if not declared(part).judges_reading)
+    return writes(last)[0]
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:

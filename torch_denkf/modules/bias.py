@@ -8,9 +8,9 @@ slower.
 
 .. math:: b_t = \rho \circ b_{t-1} + \eta_t, \quad \rho = e^{-1 / \tau}, \quad \eta_t \sim N(0, \sigma^2 (1 - \rho^2))
 
-Give the transition, the process noise and the observation the same :class:`FadingBias`, and the initial belief S +
-K dimensions: ``FadingBias.std`` for the biases. For a linear system with such "coloured" reading errors the filter
-then is the optimal one: the Kalman filter of the augmented state.
+``sensor_error=FadingBias(...)`` of a filter does it. By hand, give transition, process noise and observation
+the same :class:`FadingBias`, and the initial belief S + K dimensions: ``FadingBias.std`` for the biases. For a linear
+system with such "coloured" reading errors the filter then is the optimal one: the Kalman filter of the augmented state.
 
 Source: Bryson & Henrikson 1968, J. Spacecraft Rockets 5 ("Estimation using sampled data containing sequentially
 correlated noise"); Uhlenbeck & Ornstein 1930.
@@ -18,7 +18,9 @@ correlated noise"); Uhlenbeck & Ornstein 1930.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from tensordict import unravel_key
@@ -26,11 +28,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torch_denkf._checks import check_values
+from torch_denkf.functional import ensemble_mean, ensemble_var
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._running import check_module, reads, run_module
+from torch_denkf.modules._running import check_module, declared, reads, run_module, writes
 from torch_denkf.modules._tensors import as_standard_deviations
+from torch_denkf.modules.process_noise import as_process_noise
 
-__all__ = ["BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias"]
+__all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition", "FadingBias", "biased_parts"]
 
 
 class FadingBias(nn.Module):
@@ -40,6 +44,7 @@ class FadingBias(nn.Module):
         std: standard deviation of each bias in the long run ``[K]``, in the reading's units, before training.
         time: steps in which each bias fades to 1/e, ``[K]`` or one number for all, before training.
         trainable: whether both are parameters; else buffers.
+        factor: whether they are errors of a factor: the reading is :math:`h(x) (1 + b)`, and ``std`` has no unit.
 
     Raises:
         ValueError: if a standard deviation or a time is not positive.
@@ -54,9 +59,15 @@ class FadingBias(nn.Module):
     log_time: Tensor
 
     def __init__(
-        self, std: Sequence[float] | Tensor, time: float | Sequence[float] | Tensor, *, trainable: bool = True
+        self,
+        std: Sequence[float] | Tensor,
+        time: float | Sequence[float] | Tensor,
+        *,
+        trainable: bool = True,
+        factor: bool = False,
     ):
         super().__init__()
+        self.factor = factor
         std = as_standard_deviations("std", std)
         time = torch.as_tensor(time, dtype=std.dtype).expand_as(std)
         check_values("std, a standard deviation,", std, above=0)
@@ -66,6 +77,46 @@ class FadingBias(nn.Module):
                 self.register_parameter(name, nn.Parameter(value.clone()))
             else:
                 self.register_buffer(name, value.clone())
+
+    @classmethod
+    def from_residuals(cls, residuals: Tensor, *, trainable: bool = True) -> tuple[FadingBias, Tensor]:
+        r"""The biases that explain how long a sensor's errors last, and what is left: white noise.
+
+        The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
+        white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
+        by its pairs, up to three times :math:`\tau`. Errors that last longer than the runs are taken for ones that last
+        as long.
+
+        Args:
+            residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
+                was not trained on; NaN where there is none. Their mean is not taken off.
+            trainable: see the class.
+
+        Returns:
+            K biases; and the standard deviations of the white part ``[K]``, for the noise of the reading.
+
+        Raises:
+            ValueError: if the shape is another, a component has fewer than 100 pairs of neighbours, or its errors do
+                not last at all.
+
+        Example:
+            >>> torch.manual_seed(0)
+            <...>
+            >>> true, error, readings = FadingBias([2.0], time=10.0, trainable=False), torch.zeros(500, 1), []
+            >>> for _ in range(150):
+            ...     error = true.decay * error + true.variance.sqrt() * torch.randn(500, 1)
+            ...     readings.append(error + 0.5 * torch.randn(500, 1))
+            >>> bias, white = FadingBias.from_residuals(torch.stack(readings[50:], 1), trainable=False)
+            >>> [round(value.item(), 1) for value in (bias.std, bias.log_time.exp() / 10, white)]
+            [2.0, 1.0, 0.5]
+        """
+        if residuals.ndim != 3 or residuals.shape[1] < 3:
+            raise ValueError(f"residuals must be [N, T, K], T at least 3; got {list(residuals.shape)}")
+        values = residuals.detach().double()
+        known = ~values.isnan()
+        found = [_fit(*_autocovariance(values[..., k], known[..., k]), k) for k in range(values.shape[-1])]
+        std, time, white = (residuals.new_tensor(column) for column in zip(*found, strict=True))
+        return cls(std, time, trainable=trainable), white
 
     def __len__(self) -> int:
         return len(self.log_std)
@@ -204,13 +255,154 @@ class BiasedObservation(SubModel):
         written = run_module(self.module, {**entries, key: state}, call.part("observation"))
         read = written[out_key]
         if self.dims is not None:
-            return {**written, out_key: read.index_add(-1, self.dims, slow)}
+            slow = torch.zeros_like(read).index_add(-1, self.dims, slow)
+            return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
         if len(self.bias) % read.shape[-1]:
             raise ValueError(
                 f"{len(self.bias)} biases are not as many for each of the {read.shape[-1]} components of the reading; "
                 "say in dims which component each belongs to"
             )
-        return {**written, out_key: read + slow.unflatten(-1, (-1, read.shape[-1])).sum(-2)}
+        slow = slow.unflatten(-1, (-1, read.shape[-1])).sum(-2)
+        return {**written, out_key: read * (1 + slow) if self.bias.factor else read + slow}
+
+
+class BiasedBelief(SubModel):
+    """The initial belief of a state, and of the biases behind it: independent, with mean 0 and ``FadingBias.std``.
+
+    Args:
+        initial: of the state: an ensemble, or a mean and a covariance; its keys are kept.
+        bias: shared with the transition.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch_denkf.modules import MomentPrior
+        >>> start = BiasedBelief(MomentPrior(torch.zeros(1), torch.eye(1)), FadingBias([2.0], time=5.0))
+        >>> start(TensorDict({}))["belief", "cov"]
+        tensor([[1., 0.],
+                [0., 4.]], grad_fn=...)
+    """
+
+    def __init__(self, initial: TensorDictModuleBase, bias: FadingBias):
+        check_module("initial", initial)
+        needed, optional = reads(initial)
+        super().__init__(initial, needed, writes(initial), optional_keys=optional)
+        self.bias, told = bias, declared(initial)
+        self.ensemble_size, self.observation_dim = told.ensemble_size, told.observation_dim
+        self.input_dim = told.input_dim or told.state_dim
+        self.state_dim = None if told.state_dim is None else told.state_dim + len(bias)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """The draws of an ensemble's biases."""
+        return ("",) if any(key[-1] == "ensemble" for key in self.out_keys) else ()
+
+    def parts(self):
+        """The initial belief of the state."""
+        return {"initial": self.module}
+
+    def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
+        """Draws standard-normal values ``[*batch_size, E, K]``."""
+        members = self.ensemble_size if members is None else members
+        if members is None:
+            return None
+        return torch.randn((*batch_size, members, len(self.bias)), device=device, dtype=dtype, generator=generator)
+
+    def on_entries(self, entries, call):
+        """The belief of both."""
+        written = dict(run_module(self.module, entries, call.part("initial")))
+        names = {key[-1]: key for key in map(unravel_key, self.out_keys)}
+        std, size = self.bias.std, call.batch_size
+        if "ensemble" in names:
+            ensemble = written[names["ensemble"]]
+            noise = entries.get(("noise", call.place))
+            if noise is None:
+                noise = torch.randn((*ensemble.shape[:-1], len(std)), dtype=ensemble.dtype, device=ensemble.device)
+            ensemble = torch.cat([ensemble, std.to(ensemble.dtype) * noise.to(ensemble.dtype)], -1)
+            mean = ensemble_mean(ensemble)
+            now = {"ensemble": ensemble, "mean": mean, "var": ensemble_var(ensemble, mean)}
+        else:
+            mean, cov = (written[names[name]] for name in ("mean", "cov"))
+            std, count = std.to(mean.dtype), len(std)
+            corner = std.square().diag_embed().expand(*size, count, count)
+            rows = nn.functional.pad(cov, (0, count)), nn.functional.pad(corner, (cov.shape[-1], 0))
+            cov = torch.cat(rows, -2)
+            now = {"mean": nn.functional.pad(mean, (0, count)), "cov": cov, "var": cov.diagonal(dim1=-2, dim2=-1)}
+        return {**written, **{names[name]: value for name, value in now.items() if name in names}}
+
+
+class BiasedParts(NamedTuple):
+    """What a filter is made of whose state holds its sensor's errors, see :func:`biased_parts`."""
+
+    transition: TensorDictModuleBase
+    observation: TensorDictModuleBase
+    process_noise: TensorDictModuleBase
+    initial: TensorDictModuleBase
+
+
+def biased_parts(
+    bias: FadingBias,
+    transition: TensorDictModuleBase,
+    observation: TensorDictModuleBase,
+    process_noise: TensorDictModuleBase | Sequence[float] | float | None,
+    initial: TensorDictModuleBase,
+) -> BiasedParts:
+    """Gives each part of a filter the same biases.
+
+    Args:
+        bias: of the sensor.
+        transition: moves ensembles of the state.
+        observation: observes them.
+        process_noise: of the state; ``None`` for none, where the transition has its own.
+        initial: the belief of the state.
+    """
+    if not isinstance(bias, FadingBias):
+        raise TypeError(f"sensor_error is a FadingBias, or None; got {type(bias).__name__}")
+    if declared(initial).space is not None:
+        raise ValueError(
+            f"sensor_error is for states of plain numbers, not for {declared(initial).space}: put the biases into the "
+            "state, Product(..., Euclidean(K))."
+        )
+    of_state = as_process_noise(
+        torch.zeros_like(bias.std[0]).detach() if process_noise is None else process_noise, initial
+    )
+    return BiasedParts(
+        BiasedTransition(transition, bias),
+        BiasedObservation(observation, bias),
+        BiasedNoise(of_state, bias),
+        BiasedBelief(initial, bias),
+    )
+
+
+def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
+    values, steps = torch.where(known, values, 0), values.shape[1]
+    products, counts = [], []
+    for lag in range(min(steps, 1000)):
+        both = known[:, lag:] & known[:, : steps - lag]
+        products.append((values[:, lag:] * values[:, : steps - lag]).sum())
+        counts.append(both.sum())
+    count = torch.stack(counts)
+    return torch.stack(products) / count.clamp_min(1), count
+
+
+def _fit(covariance: Tensor, count: Tensor, component: int) -> tuple[float, float, float]:
+    """Standard deviation and time of the lasting part, and the standard deviation of the white one."""
+    if count[1] < 100:
+        raise ValueError(f"component {component} has {int(count[1])} pairs of neighbouring residuals; it takes 100")
+    longest = len(covariance)
+    times = torch.logspace(math.log10(0.5), math.log10(100 * longest), 2000, dtype=torch.double)
+    lags, size, last = torch.arange(longest, dtype=torch.double), 0.0, longest
+    for _ in range(3):
+        shape = torch.exp(-lags[1:last] / times.unsqueeze(-1))
+        weight, seen = count[1:last], covariance[1:last]
+        sizes = ((weight * shape * seen).sum(-1) / (weight * shape.square()).sum(-1)).clamp_min(0)
+        best = (weight * (seen - sizes.unsqueeze(-1) * shape).square()).sum(-1).argmin()
+        size, time = float(sizes[best]), float(times[best])
+        last = min(longest, max(4, math.ceil(3 * time) + 1))  # later lags are of chance alone
+    # Within three standard errors of what white noise shows from one step to the next there is nothing to estimate.
+    if not size * math.exp(-1 / time) > 3 * float(covariance[0]) / math.sqrt(float(count[1])):
+        raise ValueError(f"the residuals of component {component} do not last: take them for white noise")
+    return math.sqrt(size), time, math.sqrt(max(float(covariance[0]) - size, 1e-6 * size))
 
 
 def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:

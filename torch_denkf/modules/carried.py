@@ -11,8 +11,17 @@ from tensordict import NestedKey, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.modules._base import SubModel
-from torch_denkf.modules._call import Entries
-from torch_denkf.modules._running import check_module, declared, is_sequence, named_modules_of, reads, run_module
+from torch_denkf.modules._call import Call, Entries
+from torch_denkf.modules._gaussian import GaussianAnalysis
+from torch_denkf.modules._running import (
+    check_module,
+    declared,
+    is_sequence,
+    named_modules_of,
+    reads,
+    run_module,
+    writes,
+)
 
 __all__ = ["AnalysisAround", "Beside", "InPlaceOf", "Stateful", "with_state"]
 
@@ -46,6 +55,14 @@ class AnalysisAround(InPlaceOf):
     def around(self, analysis: SubModel) -> AnalysisAround:
         """The same with another analysis inside."""
         raise TypeError(f"{type(self).__name__} has no around(): write it, so that it can be lagged and delayed.")
+
+    def with_mask(self, entries: Entries, call: Call) -> Entries:
+        """The entries with the mask, where an observation model inside the analysis makes it."""
+        if not isinstance(self.module, GaussianAnalysis) or self.observed_key not in writes(self.module.module):
+            return entries
+        mean = self.required(entries, self.in_keys[0])
+        mask = self.module.mask(entries, mean, call)
+        return entries if mask is None else {**entries, self.observed_key: mask}
 
 
 class Stateful(Protocol):

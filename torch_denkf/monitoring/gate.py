@@ -13,8 +13,6 @@ from torch import Tensor, nn
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries, flat_noise
-from torch_denkf.modules._gaussian import GaussianAnalysis
-from torch_denkf.modules._running import writes
 from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
@@ -64,7 +62,7 @@ class GateOptions(TypedDict, total=False):
 
 def can_be_gated(analysis: nn.Module) -> TypeGuard[SubModel]:
     """Whether a module is an analysis that says where its forecast, its reading and its diagnostics are."""
-    if not isinstance(analysis, SubModel) or analysis.observed_key is None or isinstance(analysis, GatedAnalysis):
+    if not isinstance(analysis, SubModel) or analysis.observed_key is None or isinstance(analysis, AnalysisAround):
         return False
     read = [unravel_key(key) for key in analysis.reading_keys]
     scores = {(analysis.info_prefix, name) for name in ("nis", "innovation")}
@@ -223,7 +221,7 @@ class GatedAnalysis(AnalysisAround):
     def on_entries(self, entries, call):
         """The belief, the diagnostics and the state."""
         terms, shut, log_noise, log_inflation = (self.required(entries, key) for key in self.state_keys)
-        plain = self._with_mask(self._with_noise(entries, call), call)
+        plain = self.with_mask(self._with_noise(entries, call), call)
         if self.of_ensemble:
             plain = self.module.aligned(plain)
         if self.adapt_noise:
@@ -290,14 +288,6 @@ class GatedAnalysis(AnalysisAround):
             values = [self.required(entries, key) for key in self.module.in_keys]
             entries.update(flat_noise(self.module._noise(entries, values, call), call.place))
         return entries
-
-    def _with_mask(self, entries: Entries, call: Call) -> Entries:
-        """The entries with the mask, where an observation model inside the analysis makes it."""
-        if not isinstance(self.module, GaussianAnalysis) or self.observed_key not in writes(self.module.module):
-            return entries
-        mean = self.required(entries, self.in_keys[0])
-        mask = self.module.mask(entries, mean, call)
-        return entries if mask is None else {**entries, self.observed_key: mask}
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised innovations squared ``[*B, K]``, and how many components were observed in each."""

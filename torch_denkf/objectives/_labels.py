@@ -40,6 +40,9 @@ class Keys:
         target_observed: which components of the true observation are known, ``[*B, 1]`` or ``[*B, O]``, bool.
         observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``.
         sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``.
+        visible: probability that the reading is about the state, ``[*B, 1]``, as a head beside the sensor says.
+        target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN where that is not known.
+        visible_observed: where it is known, ``[*B, 1]``, bool; by default its name and ``_observed``.
     """
 
     state: NestedKey = "state"
@@ -48,6 +51,9 @@ class Keys:
     target_observed: NestedKey | None = None
     observed: NestedKey = "observed"
     sensor: NestedKey = ("sensor", "ensemble")
+    visible: NestedKey = ("sensor", "visible")
+    target_visible: NestedKey = "visible"
+    visible_observed: NestedKey | None = None
 
 
 class Labels(NamedTuple):
@@ -179,6 +185,13 @@ class Truth:
         scale, angles = self.loss.observation_scale, self.loss.observation_angles
         return self._labels("target", target, size).scaled("observation_scale", scale, angles)
 
+    def visible(self) -> Labels:
+        """Whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
+        values, mask = self.entry(self.keys.target_visible, given=True), self.data.get(self.keys.observed, None)
+        values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
+        labels = self._labels("visible", values, 1)
+        return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))
+
     def whole_state(self) -> Labels:
         """The true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
 
@@ -247,7 +260,8 @@ class Truth:
         Raises:
             ValueError: if values or mask have another shape, or ``dims`` names components that there are not.
         """
-        key = self.keys.state if name == "state" else self.keys.target_observation
+        keys = self.keys
+        key = {"state": keys.state, "target": keys.target_observation, "visible": keys.target_visible}[name]
         batch, given = list(self.data.batch_size), values.shape[-1] if values.ndim else 0
         if list(values.shape) != [*batch, given] or not given:
             raise ValueError(

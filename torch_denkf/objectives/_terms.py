@@ -132,6 +132,20 @@ class Noise(Term):
         return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
 
 
+class Visible(Term):
+    """The binary cross entropy of whether the sensor sees."""
+
+    name = "visible"
+    of_frames = True
+    needs_state = False
+
+    def forward(self, out, truth):
+        p = truth.entry(truth.keys.visible, "A Visibility beside the sensor writes it. ")
+        labels = truth.visible()
+        target = labels.values.to(p.dtype)
+        return labels.mean(nn.functional.binary_cross_entropy(p, target, reduction="none")), labels.rows
+
+
 class Observation(Term):
     """The squared error of what the observation model reads of the true state."""
 

@@ -331,6 +331,7 @@ class FilterLoss(Checked, LossModule):
         structure = self.filter.structure
         needed = [*structure.needed, *structure.controls]
         supervised = any(term.needs_state for term in self.terms if term.name in self.weights)
+        needed += [self.tensor_keys.target_visible] if "visible" in self.weights else []
         return [*needed, self.tensor_keys.state] if supervised else needed
 
     def _trained(self) -> Iterable[nn.Module] | None:

@@ -83,6 +83,8 @@ class SensorLoss(FilterLoss):
     ``loss_sensor``           score of the sensor's samples against the true observation, the term of that name in
                               :class:`~torch_denkf.objectives.DEnKFLoss`
     ``loss_noise``            negative log-likelihood of the true observation under N(mean of the samples, R), nats
+    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+                              :class:`~torch_denkf.modules.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames
@@ -95,6 +97,7 @@ class SensorLoss(FilterLoss):
             first two are its absolute error, and the length of its error: the scores of a point.
         sensor: weight of ``loss_sensor``.
         noise: weight of ``loss_noise``. R must follow from frames alone.
+        visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         **options: ``observation_scale``, ``observation_angles`` and ``reduction``, see :class:`ReadingsOptions`.
 
     Raises:
@@ -138,17 +141,21 @@ class SensorLoss(FilterLoss):
         score: Literal["crps", "energy", "mse"] = "crps",
         sensor: float = 1.0,
         noise: float = 0.0,
+        visible: float = 0.0,
         **options: Unpack[ReadingsOptions],
     ):
-        super().__init__(filter, [_terms.Sensor(sensor), _terms.Noise(noise)], score=score, **options)
+        own = [_terms.Sensor(sensor), _terms.Noise(noise), _terms.Visible(visible)]
+        super().__init__(filter, own, score=score, **options)
 
     def _trained(self):
         return [module for _, module in self._placed()]
 
     def _placed(self):
-        """The modules that read frames alone and lead to what is scored: the sensor, and R where its weight is set."""
-        wanted = {unravel_key(self.tensor_keys.sensor)}
-        wanted |= {unravel_key(self.tensor_keys.noise)} if "noise" in self.weights else set()
+        """The modules that read frames alone and lead to what is scored: the sensor; R and a head where they are."""
+        keys = self.tensor_keys
+        wanted = {unravel_key(keys.sensor)}
+        wanted |= {unravel_key(keys.noise)} if "noise" in self.weights else set()
+        wanted |= {unravel_key(keys.visible)} if "visible" in self.weights else set()
         placed = []
         for place, module in reversed(self.filter.structure.frames):
             if not wanted.isdisjoint(map(unravel_key, module.out_keys)):
@@ -160,7 +167,10 @@ class SensorLoss(FilterLoss):
         """What the modules read, and the true observation, or the state that it follows from."""
         model, keys = _terms.observation_model(self.filter), self.tensor_keys
         unknown = model is None or _terms.learns(model)
-        return [*reads_of(self._trained())[0], keys.target_observation if unknown else keys.state]
+        needed = list(reads_of(self._trained())[0])
+        if {"sensor", "noise"} & set(self.weights):
+            needed.append(keys.target_observation if unknown else keys.state)
+        return [*needed, keys.target_visible] if "visible" in self.weights else needed
 
     def _run(self, tensordict):
         size, out = tensordict.batch_size, tensordict.copy()

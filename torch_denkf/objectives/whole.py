@@ -32,6 +32,8 @@ class DEnKFLoss(FilterLoss):
     ``loss_sensor``           score of the sensor's samples against the true observation (:math:`L_{s_\xi}`)
     ``loss_observation``      squared error of :math:`h_\psi(x_t)` against the true observation
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
+    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+                              :class:`~torch_denkf.modules.Visibility`
     ``loss_smoothed``         score of the smoothed belief of each time, given what came later, against :math:`x_t`
     ``loss_kl``               KL divergence of flipout weights from their prior, nats
     ========================  =====================================================================================
@@ -50,6 +52,7 @@ class DEnKFLoss(FilterLoss):
             ``set_keys(sensor=...)`` names them), else the term is left out.
         observation: weight of ``loss_observation``.
         nll: weight of ``loss_nll``.
+        visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         kl: weight of ``loss_kl``.
         smoothed: weight of ``loss_smoothed``.
         smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
@@ -104,6 +107,7 @@ class DEnKFLoss(FilterLoss):
         sensor: float | None = None,
         observation: float = 0.0,
         nll: float = 0.0,
+        visible: float = 0.0,
         kl: float = 0.0,
         smoothed: float = 0.0,
         smoother: Callable[[Filter], Smoother] | None = None,
@@ -115,6 +119,7 @@ class DEnKFLoss(FilterLoss):
         own: list[Term] = [_terms.Members("state", "belief", state)]
         own += [_terms.Members("transition", "forecast", transition)]
         own += [_terms.Sensor(sensor), _terms.Observation(observation), _terms.Likelihood(nll), _terms.Divergence(kl)]
+        own += [_terms.Visible(visible)]
         own += [_terms.Members("smoothed", "smoothed", smoothed)]
         super().__init__(filter, [*own, *terms], score=score, **options)
         made = smoother if smoother is None or isinstance(smoother, Smoother) else smoother(filter)
@@ -178,6 +183,8 @@ class GaussianLoss(FilterLoss):
     ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
                               error of one sample or one reading; squared error of their mean with ``score="mse"``
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
+    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+                              :class:`~torch_denkf.modules.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Only
@@ -192,6 +199,7 @@ class GaussianLoss(FilterLoss):
         sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
             ``set_keys(sensor=...)`` names them), else the term is left out.
         nll: weight of ``loss_nll``.
+        visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         terms: terms of your own beside these, see :class:`Term`.
         **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
@@ -227,12 +235,13 @@ class GaussianLoss(FilterLoss):
         transition: float = 1.0,
         sensor: float | None = None,
         nll: float = 0.0,
+        visible: float = 0.0,
         terms: Sequence[Term] = (),
         **options: Unpack[SequenceOptions],
     ):
         own: list[Term] = [_terms.Moments("state", "belief", state)]
         own += [_terms.Moments("transition", "forecast", transition)]
-        own += [_terms.Sensor(sensor), _terms.Likelihood(nll)]
+        own += [_terms.Sensor(sensor), _terms.Likelihood(nll), _terms.Visible(visible)]
         super().__init__(filter, [*own, *terms], score=score, **options)
 
 
@@ -251,6 +260,8 @@ class MixtureLoss(FilterLoss):
     ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
                               error of one sample or one reading
     ``loss_nll``              negative log-likelihood of the reading, nats; needs no true state
+    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+                              :class:`~torch_denkf.modules.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
@@ -268,6 +279,7 @@ class MixtureLoss(FilterLoss):
         mean: weight of ``loss_mean``.
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
+        visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         terms: terms of your own beside these, see :class:`Term`.
         **options: ``dims``, scales, angles, ``space``, ``detach_every`` and ``reduction``, see
             :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
@@ -313,12 +325,18 @@ class MixtureLoss(FilterLoss):
         mean: float = 0.0,
         sensor: float = 0.0,
         nll: float = 0.0,
+        visible: float = 0.0,
         terms: Sequence[Term] = (),
         **options: Unpack[SequenceOptions],
     ):
         own: list[Term] = [_terms.Particles("state", "belief", state)]
         own += [_terms.Particles("transition", "forecast", transition)]
-        own += [_terms.Mean("mean", "belief", mean), _terms.Sensor(sensor), _terms.Likelihood(nll)]
+        own += [
+            _terms.Mean("mean", "belief", mean),
+            _terms.Sensor(sensor),
+            _terms.Likelihood(nll),
+            _terms.Visible(visible),
+        ]
         super().__init__(filter, [*own, *terms], score=score, **options)
         self.register_buffer("component_std", as_floating(component_std, "component_std"))
         if not ((self.component_std > 0) & self.component_std.isfinite()).all():

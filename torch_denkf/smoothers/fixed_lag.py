@@ -9,9 +9,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torch_denkf.filters import Filter
 from torch_denkf.modules._running import declared, is_sequence, named_modules_of
-from torch_denkf.modules.carried import AnalysisAround
 from torch_denkf.modules.particles import ResampledTransition
-from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedAnalysis, LaggedBelief, with_past
+from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, lagged, with_past
 from torch_denkf.smoothers.past_moments import MOMENTS_PAST, CrossTransition, LaggedMoments, MomentsPast
 
 __all__ = ["FixedLag", "kind_of", "rebuilt"]
@@ -158,18 +157,16 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
     """
     found = False
 
-    def lagged(module: TensorDictModuleBase) -> TensorDictModuleBase:
+    def changed(module: TensorDictModuleBase) -> TensorDictModuleBase:
         nonlocal found
         if is_sequence(module):
-            return TensorDictSequential(OrderedDict((name, lagged(part)) for name, part in named_modules_of(module)))
-        if isinstance(module, AnalysisAround):
-            return module.around(lagged(module.module))
+            return TensorDictSequential(OrderedDict((name, changed(part)) for name, part in named_modules_of(module)))
         if declared(module).info_prefix is not None:
             found = True
-            return LaggedAnalysis(module)  # which refuses what it cannot wrap
+            return lagged(module)  # which refuses what it cannot wrap
         return module
 
-    out = OrderedDict((name, lagged(module)) for name, module in modules.items())
+    out = OrderedDict((name, changed(module)) for name, module in modules.items())
     if not found:
         raise TypeError("There is no EnsembleAnalysis among the filter's modules, so a lag has nothing to learn from.")
     return out

@@ -26,9 +26,9 @@ from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 from torch_denkf.modules._running import declared
 from torch_denkf.modules._spaces import moments_on
-from torch_denkf.modules.carried import Beside, InPlaceOf
+from torch_denkf.modules.carried import AnalysisAround, Beside, InPlaceOf
 
-__all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "with_past"]
+__all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 
 
 class Past(NamedTuple):
@@ -205,6 +205,17 @@ class LaggedAnalysis(InPlaceOf):
         read, analysis = (predicted, observation, variance, observed), self.module
         out = analysis.by_key(analysis.compute(forecast, *read, **({"noise": noise} if analysis.draws else {})))
         return *out.values(), analysis.move_past(past, *read, noise=noise)
+
+
+def lagged(analysis: SubModel) -> SubModel:
+    """The analysis, which corrects the past, too; inside of what goes around it, such as a gate.
+
+    Raises:
+        TypeError: if it does not say what it does to other states.
+    """
+    if isinstance(analysis, AnalysisAround):
+        return analysis.around(lagged(analysis.module))
+    return LaggedAnalysis(analysis)
 
 
 class LaggedBelief(SubModel):

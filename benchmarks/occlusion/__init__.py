@@ -1,0 +1,1 @@
+"""What does a filter believe of a ball behind a pillar?"""
