@@ -1,0 +1,89 @@
+"""Simulated sensors against the true motion, differentiated."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torch_denkf.applications.legged import (
+    QUADRUPED,
+    LeggedEnv,
+    LeggedErrors,
+    LegKinematics,
+    legged_space,
+    quadruped_env,
+    trot,
+)
+from torch_denkf.functional.inertial import move_inertially
+from torch_denkf.functional.manifolds import SE3, SO3, rotate
+
+PERFECT = LeggedErrors(*[0.0] * 9)
+
+
+def trotting(env, steps):
+    td, rows = env.reset(), []
+    for step in range(steps):
+        td["action"] = min(1.0, step * env.dt) * trot(step * env.dt)
+        td = env.step(td)["next"]
+        rows.append(td.clone())
+    return torch.stack(rows)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return trotting(quadruped_env(PERFECT), 300).double()
+
+
+def test_specs():
+    check_env_specs(quadruped_env())
+
+
+def test_the_sensors_read_how_their_place_moves():
+    """Its place is beside the base's origin, turned. With the simulator's own steps: contacts are short."""
+    env = LeggedEnv(quadruped_env().model, **QUADRUPED, dt=0.0025, errors=PERFECT)
+    log = trotting(env, 800).double()
+    sensor = LegKinematics(env.model, QUADRUPED["feet"], QUADRUPED["imu"]).base.double()
+    assert sensor[4:].norm() > 0.1
+    turn = SO3().compose(log["true", "orientation"], sensor[:4].expand(800, 4))
+    place = log["true", "position"] + rotate(log["true", "orientation"], sensor[4:])
+    velocity = (place[1:] - place[:-1]) / env.dt
+    imu = log["imu"]
+    turned = SO3().minus(turn[1:], turn[:-1]) / env.dt
+    assert (turned - imu[1:, :3]).abs().max() < 0.02
+    # What is read in a step leads to the velocity after it, but for damping that the simulator takes in implicitly.
+    world = rotate(turn, imu[..., 3:]) - torch.tensor([0, 0, 9.81]).double()
+    change = (velocity[1:] - velocity[:-1]) / env.dt
+    assert (change - world[2:]).square().mean().sqrt() < 0.2 * change.square().mean().sqrt()
+
+
+def test_integrated_readings_lead_where_the_base_is(log):
+    env = quadruped_env(PERFECT)
+    sensor = LegKinematics(env.model, QUADRUPED["feet"], QUADRUPED["imu"]).base.double()
+    turn = SO3().compose(log["true", "orientation"], sensor[:4].expand(300, 4))
+    place = log["true", "position"] + rotate(log["true", "orientation"], sensor[4:])
+    first = (place[1] - place[0]) / env.dt
+    pose = torch.cat([turn[1], first, place[1]])
+    for row in range(2, 102):
+        pose = move_inertially(pose, log["imu"][row, :3], log["imu"][row, 3:], env.dt)
+    assert SO3().distance(pose[:4], turn[101]) < 0.01
+    # The velocity at the start is half a step old: a quarter of a metre in a second at 50 m/s^2 and .005 s.
+    assert (pose[7:] - place[101]).norm() < 0.1
+
+
+def test_feet_that_stand_press_the_floor_and_carry_the_robot(log):
+    weight = quadruped_env().model.body_mass.sum() * 9.81
+    assert log["force"].sum(-1).mean() == pytest.approx(weight, rel=0.1)
+    assert ((log["force"] > 150) <= log["contact"]).all()
+    assert 0.3 < log["contact"].float().mean() < 0.95
+    assert (log["true", "position"][-1, :2] - log["true", "position"][0, :2]).norm() > 0.3
+
+
+def test_seeds_repeat_and_errors_are_there():
+    one, same, other = (trotting(quadruped_env(seed=seed), 20) for seed in (1, 1, 2))
+    assert torch.equal(one["imu"], same["imu"])
+    assert torch.equal(one["true", "position"], other["true", "position"])
+    assert (one["joints"] - other["joints"]).abs().mean() == pytest.approx(0.01, rel=0.5)
+
+
+def test_the_space_is_that_of_its_feet():
+    assert (legged_space(4).point_dim, legged_space(4).tangent_dim) == (28, 27)
+    assert SE3().point_dim == 7

@@ -1,0 +1,42 @@
+"""Which feet stand, by the forces under them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_denkf._checks import check_number
+
+__all__ = ["contacts"]
+
+
+def contacts(force: Tensor, on: float, off: float | None = None, *, before: Tensor | None = None) -> Tensor:
+    """Where feet stand: from when the force exceeds ``on`` until it falls below ``off``.
+
+    Two thresholds keep noise about one of them from lifting a foot that stands.
+
+    Args:
+        force: upwards, ``[*B, T, F]``, time before feet; in N.
+        on: above it a foot stands.
+        off: below it a foot is in the air; between both it does what it did. ``None`` for half of ``on``.
+        before: which feet stood before the first row, ``[*B, F]`` bool; ``None`` where that is told by ``on`` alone.
+
+    Returns:
+        ``[*B, T, F]`` bool.
+
+    Raises:
+        ValueError: if ``off`` exceeds ``on``.
+
+    Example:
+        >>> contacts(torch.tensor([[10.0], [70.0], [50.0], [20.0], [50.0]]), 60.0, 30.0).flatten()
+        tensor([False,  True,  True, False, False])
+    """
+    off = on / 2 if off is None else off
+    check_number("off", off, most=on, cure="It is not above the threshold on")
+    above, keeps = force > on, force > off
+    stands = torch.zeros_like(above[..., 0, :]) if before is None else before
+    found = []
+    for row in range(force.shape[-2]):
+        stands = above[..., row, :] | (stands & keeps[..., row, :])
+        found.append(stands)
+    return torch.stack(found, -2)

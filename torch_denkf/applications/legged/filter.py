@@ -1,0 +1,117 @@
+"""A filter of a legged robot's base, for any robot that MuJoCo can load."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
+
+import mujoco
+import torch
+from tensordict import NestedKey
+
+from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, legged_space
+from torch_denkf.applications.legged.noises import LeggedNoises
+from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
+from torch_denkf.applications.legged.velocity import BaseVelocity, StartEnsemble, StartMoments
+from torch_denkf.filters import Filter
+from torch_denkf.fusion import FusedFilter, FusedSensor
+from torch_denkf.modules import EKFTransition, EnsembleAnalysis, NoisyTransition, UKFTransition
+from torch_denkf.modules._running import named_modules_of
+
+__all__ = ["legged_filter"]
+
+_FAR = 0.1  # m: how far a foot may be at the start from where its joints say; its first reading tells
+
+
+def legged_filter(
+    model: mujoco.MjModel,
+    *,
+    feet: Sequence[str],
+    imu: str,
+    joints: Sequence[str] | None = None,
+    dt: float | NestedKey,
+    kind: Literal["DEnKF", "EKF", "UKF"] = "DEnKF",
+    ensemble_size: int = 64,
+    threshold: float | None = 2.0,
+    noises: LeggedNoises | None = None,
+    gravity: float = 9.81,
+    imu_key: NestedKey = "imu",
+    joints_key: NestedKey = "joints",
+    rates_key: NestedKey | None = "joint_rates",
+    contact_key: NestedKey = "contact",
+    **options: Any,
+) -> Filter:
+    r"""A filter of the base of a legged robot, from its inertial sensor, its joints, and which feet stand.
+
+    ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
+    ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's
+    orientation, velocity and position in the world, its biases, and the feet, see
+    :func:`~torch_denkf.applications.legged.legged_space`. The world's origin is where the base starts, its heading is
+    zero there. The robot must stand still at the start.
+
+    The sensor drives the motion, see :class:`~torch_denkf.applications.legged.LeggedMotion`: what it reads at a step is
+    the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles, and, with
+    ``rates_key``, how fast by their rates.
+
+    Args:
+        model: of the robot, from MJCF or URDF.
+        feet: names of sites or bodies, F.
+        imu: name of the site or body at which the sensor sits.
+        joints: names of the joints in the order of the readings; ``None`` for all hinges and slides of the model.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``.
+        kind: the belief: an ensemble, or a mean and a covariance.
+        ensemble_size: E.
+        threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
+            believe all correlations.
+        noises: of the sensors and feet.
+        gravity: in m/s^2.
+        imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
+        joints_key: angles ``[*B, J]`` in rad.
+        rates_key: their rates ``[*B, J]`` in rad/s; ``None`` to read none.
+        contact_key: which feet stand, ``[*B, F]`` bool.
+        **options: of :class:`~torch_denkf.filters.Filter`.
+
+    Raises:
+        KeyError: if the model lacks a name.
+        ValueError: on an unknown ``kind``.
+
+    Source:
+        Bloesch et al. 2012, RSS VIII (feet in the state). Errors are turns and steps in the sensor's axes; the
+        right-invariant filter of Hartley et al. 2020, IJRR 39, has them in the world's.
+    """
+    if kind not in ("DEnKF", "EKF", "UKF"):
+        raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
+    n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
+    count, space = len(kinematics.feet), legged_space(len(kinematics.feet))
+    readings = LegReadings(
+        kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
+    )
+    motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key)
+    process = LeggedMotionNoise(count, dt, n, contact_key=contact_key)
+    tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
+    around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
+    std = torch.tensor([*tangent, *[_FAR] * 3 * count])
+    analysis = None
+    if kind == "DEnKF":
+        initial = StartEnsemble(std, n.velocity, ensemble_size=ensemble_size, **around)
+        more: dict[str, Any] = {} if threshold is None else {"localisation": "significance", "threshold": threshold}
+        analysis = partial(EnsembleAnalysis, "etkf", **more)
+        transition = NoisyTransition(motion, process, space=space)
+    else:
+        initial = StartMoments(std, n.velocity, **around)
+        transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
+    mask: dict[str, Any] = {"observed_key": ("legs", "observed")}
+    sensors = {
+        "feet": FusedSensor(FeetInBody(space), [n.kinematics] * 3 * count, observation_key=("legs", "feet"), **mask)
+    }
+    if rates_key is not None:
+        rates = FeetRates(space, imu_key=imu_key)
+        sensors["rates"] = FusedSensor(rates, [n.rate] * 3 * count, observation_key=("legs", "rates"), **mask)
+    fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
+    per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
+    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
+    modules = OrderedDict(legs=readings, **dict(named_modules_of(fused)), velocity=velocity)
+    return Filter(modules, initial=initial, **options)

@@ -1,0 +1,99 @@
+"""How a legged robot moves, by an inertial sensor and by which feet stand."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from torch_denkf.applications.legged.noises import LeggedNoises
+from torch_denkf.functional.manifolds import SE23, Euclidean, Product, rotate
+from torch_denkf.modules import SubModel
+from torch_denkf.motions import InertialMotion
+from torch_denkf.motions.motion import Motion
+
+__all__ = ["LeggedMotion", "LeggedMotionNoise", "legged_space"]
+
+
+def legged_space(feet: int) -> Product:
+    """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
+
+    A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
+    the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m. A tangent has 15 + 3 F.
+    """
+    return Product(SE23(), Euclidean(3), Euclidean(3), Euclidean(3 * feet))
+
+
+class LeggedMotion(Motion):
+    r"""Moves the base as its inertial sensor says; a foot that stands stays, one in the air goes where its joints say.
+
+    A foot in the air is :math:`p + R k`, with the sensor's pose R, p and the foot's place k by the joints. That is the
+    limit of a foot that stays and has boundless process noise, once its reading is taken in; and members of an
+    ensemble, whose feet in the air would show large correlations by chance, keep those that are due.
+
+    Args:
+        feet: F.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``.
+        gravity: in m/s^2.
+        imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
+        feet_key: places of the feet by the joints ``[*B, 3 F]`` in m, in the sensor's axes.
+        contact_key: which of them stand, ``[*B, F]`` bool.
+    """
+
+    def __init__(
+        self,
+        feet: int,
+        dt: float | NestedKey,
+        *,
+        gravity: float = 9.81,
+        imu_key: NestedKey = "imu",
+        feet_key: NestedKey = ("legs", "feet"),
+        contact_key: NestedKey = "contact",
+    ):
+        actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
+        super().__init__(legged_space(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
+        self.inertial = InertialMotion(dt, gravity=gravity)
+
+    def move(self, state, imu, feet, contact, *, dt):
+        """The states one step later."""
+        base = self.inertial.move(state[..., :16], imu, dt=dt)
+        turn, place = base[..., None, :4], base[..., None, 7:10]
+        by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
+        stands = contact.unsqueeze(-1) > 0
+        moved = torch.where(stands, state[..., 16:].unflatten(-1, (-1, 3)), by_joints)
+        return torch.cat([base, moved.flatten(-2)], -1)
+
+
+class LeggedMotionNoise(SubModel):
+    """Variances ``[*B, 15 + 3 F]`` that a step of :class:`LeggedMotion` adds, by which feet stand.
+
+    A foot that stands slips a little; one in the air is where its joints say but for their error.
+
+    Args:
+        feet: F.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``.
+        noises: of sensors and feet.
+        contact_key: which feet stand, ``[*B, F]`` bool.
+    """
+
+    base: Tensor
+    powers: Tensor
+    slip: Tensor
+    air: Tensor
+
+    def __init__(self, feet: int, dt: float | NestedKey, noises: LeggedNoises, *, contact_key: NestedKey = "contact"):
+        self.dt = dt
+        timed = [] if isinstance(dt, (int, float)) else [dt]
+        super().__init__(nn.Identity(), [contact_key, *timed], [("forecast", "noise")])
+        n = noises
+        densities = [n.gyro, n.accelerometer, n.accelerometer / 3**0.5, n.gyro_walk, n.accelerometer_walk]
+        self.register_buffer("base", torch.tensor(densities).square().repeat_interleave(3))
+        self.register_buffer("powers", torch.tensor([1.0, 1.0, 3.0, 1.0, 1.0]).repeat_interleave(3))
+        self.register_buffer("slip", torch.tensor(n.slip**2))
+        self.register_buffer("air", torch.tensor(n.kinematics**2))
+
+    def compute(self, contact, dt=None):
+        """The variances."""
+        dt = self.slip.new_tensor(self.dt) if dt is None else dt.to(self.slip.dtype)
+        base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
+        return torch.cat([base, torch.where(contact, self.slip * dt, self.air).repeat_interleave(3, -1)], -1)

@@ -1,0 +1,123 @@
+"""What the joints of a legged robot say: where its feet are, how fast, and how the robot stands at the start."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.functional.manifolds import SO3, Space, quaternion_product, rotate
+from torch_denkf.modules import SubModel
+
+__all__ = ["FeetInBody", "FeetRates", "LegReadings"]
+
+
+class LegReadings(SubModel):
+    """Writes what the filter reads of the joints, and the state in which a robot starts that stands still.
+
+    That state is upright as the accelerometer says, at the origin, with heading zero.
+
+    Args:
+        kinematics: of the robot's legs.
+        imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
+        joints_key: angles ``[*B, J]`` in rad.
+        rates_key: their rates ``[*B, J]`` in rad/s; ``None`` where nothing reads them.
+        contact_key: which feet stand, ``[*B, F]`` bool.
+        prefix: of what is written: ``feet`` ``[*B, 3 F]`` in m, ``observed`` ``[*B, 3 F]`` bool, ``start``
+            ``[*B, 16 + 3 F]``, and ``rates`` ``[*B, 3 F]`` in m/s if there is ``rates_key``.
+    """
+
+    def __init__(
+        self,
+        kinematics: LegKinematics,
+        *,
+        imu_key: NestedKey = "imu",
+        joints_key: NestedKey = "joints",
+        rates_key: NestedKey | None = None,
+        contact_key: NestedKey = "contact",
+        prefix: str = "legs",
+    ):
+        rates = [] if rates_key is None else [rates_key]
+        names = ["feet", "observed", "start", *(["rates"] if rates else [])]
+        super().__init__(kinematics, [imu_key, joints_key, contact_key, *rates], [(prefix, name) for name in names])
+
+    def compute(self, imu, joints, contact, rates=None):
+        """The feet, which of them stand, the start, and the feet's rates."""
+        feet = self.module(joints.to(self.module.base.dtype))
+        out = feet.flatten(-2), contact.repeat_interleave(3, -1), self._start(imu[..., 3:].to(feet.dtype), feet)
+        return out if rates is None else (*out, self.module.velocities(joints, rates).flatten(-2))
+
+    def _start(self, force: Tensor, feet: Tensor) -> Tensor:
+        sensor = self.module.base
+        up = rotate(sensor[:4], force)
+        up = up / torch.linalg.vector_norm(up, dim=-1, keepdim=True)
+        x, y, z = up.split(1, -1)
+        turn = torch.cat([1 + z, y, -x, torch.zeros_like(z)], -1)  # the shortest from there to the world's z
+        turn = SO3().compose(turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True), sensor[:4].expand_as(turn))
+        place = rotate(quaternion_product(turn, SO3().inverse(sensor[:4]).expand_as(turn)), sensor[4:])
+        standing = place.unsqueeze(-2) + rotate(turn.unsqueeze(-2), feet)
+        still = torch.zeros_like(place)
+        return torch.cat([turn, still, place, still, still, standing.flatten(-2)], -1)
+
+
+class FeetInBody(SubModel):
+    r"""Where the feet are in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
+
+    Args:
+        space: of the states, :func:`legged_space`.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 3 F]`` in m.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        *,
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(nn.Identity(), [in_key], [out_key])
+        self.observed_space = space
+
+    def compute(self, state):
+        """The predicted readings."""
+        self.observed_space.check(point=state)
+        return _feet(state).flatten(-2)
+
+
+class FeetRates(SubModel):
+    r"""How fast standing feet move in the sensor's axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
+
+    It is told by the joints' rates, and says the base's velocity at once.
+
+    Args:
+        space: of the states, :func:`legged_space`.
+        imu_key: entry ``[*B, 6]``, of which the gyro is read, in rad/s.
+        in_key: states to observe ``[*B, E, P]``.
+        out_key: predicted readings ``[*B, E, 3 F]`` in m/s.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        *,
+        imu_key: NestedKey = "imu",
+        in_key: NestedKey = ("forecast", "ensemble"),
+        out_key: NestedKey = ("forecast", "observation"),
+    ):
+        super().__init__(nn.Identity(), [in_key, imu_key], [out_key])
+        self.observed_space = space
+
+    def compute(self, state, imu):
+        """The predicted readings."""
+        self.observed_space.check(point=state)
+        turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
+        velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
+        return (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
+
+
+def _feet(state: Tensor) -> Tensor:
+    """Of the feet in the sensor's axes, ``[*, F, 3]``."""
+    away = state[..., 16:].unflatten(-1, (-1, 3)) - state[..., None, 7:10]
+    return rotate(SO3().inverse(state[..., None, :4]), away)

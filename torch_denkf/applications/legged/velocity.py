@@ -1,0 +1,115 @@
+"""The velocity of a robot's base in its own axes, of a belief about its inertial sensor."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_denkf.functional.manifolds import SO3, rotate, rotation_matrix, skew
+from torch_denkf.functional.moments import ensemble_mean, ensemble_var
+from torch_denkf.modules import AroundState, GaussianAround, SubModel
+
+__all__ = ["BaseVelocity", "StartEnsemble", "StartMoments", "base_velocity", "base_velocity_of_moments"]
+
+_KEYS = [("belief", "velocity"), ("belief", "velocity_var")]
+
+
+def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
+    r"""The velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
+
+    Args:
+        state: of the sensor ``[*, 16 + 3 F]``, see :func:`~torch_denkf.applications.legged.legged_space`.
+        gyro: what it reads, in rad/s, ``[*, 3]``.
+        sensor: the sensor's pose S, r on the base ``[7]``.
+
+    Returns:
+        ``[*, 3]`` in m/s.
+    """
+    seen = rotate(SO3().inverse(state[..., :4]), state[..., 4:7])
+    turn = rotate(sensor[:4], gyro - state[..., 10:13])
+    return rotate(sensor[:4], seen) - torch.linalg.cross(turn, sensor[4:].expand_as(turn))
+
+
+def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean ``[*, 3]`` and variances ``[*, 3]`` of :func:`base_velocity`, to first order.
+
+    Args:
+        mean: ``[*, 16 + 3 F]``.
+        cov: of the tangents there ``[*, 15 + 3 F, 15 + 3 F]``.
+        gyro: ``[*, 3]`` in rad/s.
+        sensor: ``[7]``.
+    """
+    axes = rotation_matrix(sensor[:4])
+    seen = rotate(SO3().inverse(mean[..., :4]), mean[..., 4:7])
+    lever = (-skew(sensor[4:]) @ axes).expand(*mean.shape[:-1], 3, 3)
+    part = torch.cat([axes @ skew(seen), axes.expand_as(lever), lever], -1)  # by orientation, velocity, gyro's bias
+    rows = [*range(6), 9, 10, 11]
+    var = (part @ cov[..., rows, :][..., rows] * part).sum(-1)
+    return base_velocity(mean, gyro, sensor), var
+
+
+class BaseVelocity(SubModel):
+    """Writes ``("belief", "velocity")`` and ``("belief", "velocity_var")``, ``[*B, 3]``: the base's, in its own axes.
+
+    The velocity of the base is the sensor's, less what the base's turn adds between both: what the gyro reads in that
+    moment counts, too.
+
+    Args:
+        sensor: the sensor's pose on the base, ``[7]``.
+        gyro_std: of the gyro's white noise in one reading, in rad/s.
+        ensemble: whether the belief is an ensemble, or a mean and a covariance.
+        imu_key: entry ``[*B, 6]``, of which the gyro is read.
+    """
+
+    sensor: Tensor
+    jitter: Tensor
+
+    def __init__(self, sensor: Tensor, gyro_std: float, *, ensemble: bool, imu_key="imu"):
+        belief = [("belief", "ensemble")] if ensemble else [("belief", "mean"), ("belief", "cov")]
+        super().__init__(nn.Identity(), [imu_key, *belief], _KEYS)
+        self.register_buffer("sensor", sensor.clone(), persistent=False)
+        self.register_buffer("jitter", gyro_std**2 * skew(sensor[4:]).square().sum(-1), persistent=False)
+
+    def compute(self, imu, belief, cov=None):
+        """Velocity and variances."""
+        gyro = imu[..., :3].to(belief.dtype)
+        if cov is not None:
+            velocity, var = base_velocity_of_moments(belief, cov, gyro, self.sensor)
+        else:
+            members = base_velocity(belief, gyro.unsqueeze(-2), self.sensor)
+            velocity, var = ensemble_mean(members), ensemble_var(members)
+        return velocity, var + self.jitter
+
+
+class StartEnsemble(AroundState):
+    """Members around where a robot starts that stands still, with the base's velocity beside them."""
+
+    def __init__(self, std, velocity_std, **options):
+        keys = [("belief", name) for name in ("ensemble", "mean", "var")]
+        super().__init__(std, out_keys=[*keys, *_KEYS], **options)
+        self.velocity_std = velocity_std
+
+    def compute(self, state, *, noise, batch_size):
+        """The belief, and the velocity."""
+        ensemble, mean, var = super().compute(state, noise=noise, batch_size=batch_size)
+        return ensemble, mean, var, *_still(mean, self.velocity_std)
+
+
+class StartMoments(GaussianAround):
+    """A mean and a covariance around where a robot starts that stands still, with the base's velocity beside them."""
+
+    def __init__(self, std, velocity_std, **options):
+        super().__init__(std, **options)
+        keys = [("belief", name) for name in ("mean", "cov", "var")]
+        self.out_keys = [*keys, *_KEYS]
+        self.velocity_std = velocity_std
+
+    def compute(self, state):
+        """The belief, and the velocity."""
+        mean, cov, var = super().compute(state)
+        return mean, cov, var, *_still(mean, self.velocity_std)
+
+
+def _still(mean: Tensor, std: float) -> tuple[Tensor, Tensor]:
+    velocity = torch.zeros_like(mean[..., :3])
+    return velocity, torch.full_like(velocity, std**2)
