@@ -235,12 +235,13 @@ def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int =
     return noise.requires_grad_(False)
 
 
-def picture(data: TensorDict, learned: SubModel, pull: float, path: Path) -> None:
-    """Roll and pitch of iCub's walk, by the extended filter with learned noise and by Mahony's."""
-    orientation, cov, _ = run(attitude_filter("EKF", GYRO_NOISES["iCub"], learned), prepared(data))
+def picture(data: TensorDict, pull: float, path: Path) -> None:
+    """Roll and pitch of iCub's walk: by an extended filter that reads the standing foot, and by Mahony's."""
+    model = inertial_filter("EKF", GYRO_NOISES["iCub"], REST_NOISES[0], feet=True)
+    orientation, cov, _ = run(model, prepared(data))
     log = [data[key].double().numpy() for key in ("gyro", "accelerometer", "dt", "orientation")]
     other = torch.as_tensor(mahony(*log[:3], log[3][:, 0], proportional=pull, integral=pull / 20))
-    draw(data[0], orientation[0], cov[0], other[0], path, name="EKF, learned noise", level=LEVEL)
+    draw(data[0], orientation[0], cov[0], other[0], path, name="EKF with the standing foot", level=LEVEL)
 
 
 def page(rows: list[dict], study: Study) -> str:
@@ -306,5 +307,5 @@ def main() -> None:
         if "iCub" in logs:
             mahonys = [row for row in rows if row["data"] == "simulated" and row["filter"].startswith("Mahony")]
             pull = min(mahonys, key=lambda row: row["tilt"])["setting"]
-            picture(logs["iCub"][0], learned, pull, study.out / "attitude.png")
+            picture(logs["iCub"][0], pull, study.out / "attitude.png")
     write_page(page(rows, study), None if study.out is None else study.out / "attitude.md")

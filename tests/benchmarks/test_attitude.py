@@ -152,14 +152,18 @@ def test_what_a_standing_leg_tells_is_the_velocity_of_the_walk():
 
 
 def test_filters_of_the_library_know_how_wrong_they_are():
-    """Where the noise is white, as filters take it for."""
+    """Where the noise is white, and the start and the bias as wrong, as filters take them for."""
     runs, rows, std = 100, 300, 0.1
+    start = attitude_filter("EKF", 0.01, std).initial
     truth = SO3().exp(torch.randn(runs, 3)).unsqueeze(1).expand(runs, rows, 4)
-    data = TensorDict({"orientation": truth, "gyro": torch.zeros(runs, rows, 3)}, [runs, rows])
+    wrong = start.space.perturb(torch.cat([truth[:, 0], torch.zeros(runs, 3)], -1), start.std, torch.randn(runs, 6))
+    data = TensorDict({"orientation": truth}, [runs, rows])
+    data["gyro"] = -wrong[:, None, 4:] + 0.01 / DT**0.5 * torch.randn(runs, rows, 3)  # starts from no bias
     up = Gravity(SO3(), gravity=1.0).observe(truth)
     data["accelerometer"] = GRAVITY * (up + std * torch.randn(runs, rows, 3))
     data["dt"] = torch.full((runs, rows, 1), DT)
     data = prepared(data)
+    data["attitude"][..., :4] = wrong[:, None, :4]
     for kind, options in (("EKF", {}), ("etkf", {"members": 32, "localisation": "significance"})):
         orientation, cov, _ = run(attitude_filter(kind, 0.01, std, **options), data)
         found = scores(orientation, data, slice(100, None), cov)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_denkf.applications.car.metrics._paths import check_paths, relative_pose_error, step_lengths
+from torch_denkf.functional.manifolds import SE3, SO3
 
 __all__ = ["DevkitError", "kitti_devkit_error"]
 
@@ -42,12 +43,12 @@ def kitti_devkit_error(
 
     As KITTI's development kit does: a segment begins at every tenth frame and ends with the first frame that lies more
     than its length further along the true path; the estimate is laid on the truth at its start; its error is divided by
-    the nominal length. The mean is over segments, so long drives and short lengths have more weight. Unlike the
-    development kit's it is planar: it leaves out height, roll and pitch, and is a little smaller than the
-    leaderboard's figure for the same filter.
+    the nominal length. The mean is over segments, so long drives and short lengths have more weight. Of points of
+    :class:`~torch_denkf.functional.manifolds.SE3` it is the development kit's. Of planar poses it leaves out height,
+    roll and pitch, and is a little smaller than the leaderboard's figure for the same filter.
 
     Args:
-        estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``.
+        estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``, or (quaternion, position in m), ``[*B, T, 7]``.
         truth: the true poses, of the same shape.
         lengths: of the segments, in m; where the path is too short, those that fit count.
         step: frames between the starts of segments.
@@ -56,8 +57,8 @@ def kitti_devkit_error(
         A :class:`DevkitError`.
 
     Raises:
-        ValueError: if the shapes are not ``[*B, T, 3]`` or differ, if a length or ``step`` is not positive, or if no
-            segment of any length fits in a path.
+        ValueError: if the shapes are not ``[*B, T, 3]`` or ``[*B, T, 7]``, or differ, if a length or ``step`` is not
+            positive, or if no segment of any length fits in a path.
 
     Source:
         Geiger, Lenz & Urtasun 2012, CVPR; the odometry development kit, ``evaluate_odometry.cpp``.
@@ -71,12 +72,15 @@ def kitti_devkit_error(
         >>> round(error.translation.item(), 3), error.segments.tolist()
         (10.1, [5, 0, 0, 0, 0, 0, 0, 0])
     """
-    check_paths(estimated, truth)
+    spatial = truth.shape[-1] == 7 and estimated.shape == truth.shape
+    if not spatial:
+        check_paths(estimated, truth)
     if step < 1 or not lengths or min(lengths) <= 0:
         raise ValueError(f"step and lengths must be positive, got step={step} and lengths={list(lengths)}")
     rows = truth.shape[-2]
     # Sums over thousands of steps: float32 would move the ends of segments.
-    travelled = torch.nn.functional.pad(step_lengths(truth.double()).cumsum(-1), (1, 0))
+    way = truth[..., 4:].double().diff(dim=-2).norm(dim=-1) if spatial else step_lengths(truth.double())
+    travelled = torch.nn.functional.pad(way.cumsum(-1), (1, 0))
     first = torch.arange(0, rows, step, device=truth.device)
     metres = torch.tensor(lengths, dtype=travelled.dtype, device=truth.device)
     target = travelled[..., first, None] + metres  # [*B, F, L]
@@ -89,9 +93,10 @@ def kitti_devkit_error(
             f"a path has no segment of {list(lengths)} m; the shortest path is {shortest:.1f} m long; "
             "leave such paths out, or pass smaller lengths"
         )
-    start, start_true = (path[..., first, None, :].expand(*last.shape, 3) for path in (estimated, truth))
+    start, start_true = (path[..., first, None, :].expand(*last.shape, truth.shape[-1]) for path in (estimated, truth))
     end, end_true = (_rows(path, last.clamp_max(rows - 1)) for path in (estimated, truth))
-    distance, angle = relative_pose_error(start, end, start_true, end_true)
+    of = _spatial_error if spatial else relative_pose_error
+    distance, angle = of(start, end, start_true, end_true)
     nominal = torch.where(fits, metres, torch.nan).to(distance.dtype)
     translation, rotation = 100 * distance / nominal, torch.rad2deg(angle) / nominal
     return DevkitError(
@@ -103,7 +108,15 @@ def kitti_devkit_error(
     )
 
 
+def _spatial_error(start: Tensor, end: Tensor, start_true: Tensor, end_true: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance in m, and angle in rad, of what is left between the moves of both paths; points of SE3 ``[*, 7]``."""
+    space = SE3()
+    moved, moved_true = (space.compose(space.inverse(a), b) for a, b in ((start, end), (start_true, end_true)))
+    left = space.compose(space.inverse(moved), moved_true)
+    return left[..., 4:].norm(dim=-1), SO3().log(left[..., :4]).norm(dim=-1)
+
+
 def _rows(path: Tensor, index: Tensor) -> Tensor:
-    """Rows ``[*B, F, L]`` of a path ``[*B, T, 3]``, each path its own."""
-    flat = index.flatten(-2).unsqueeze(-1).expand(*index.shape[:-2], -1, 3)
-    return path.gather(-2, flat).reshape(*index.shape, 3)
+    """Rows ``[*B, F, L]`` of a path ``[*B, T, N]``, each path its own."""
+    flat = index.flatten(-2).unsqueeze(-1).expand(*index.shape[:-2], -1, path.shape[-1])
+    return path.gather(-2, flat).reshape(*index.shape, path.shape[-1])

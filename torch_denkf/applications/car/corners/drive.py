@@ -1,0 +1,97 @@
+"""Files of tracked stereo corners and turn rates, as rows of a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.applications.car.corners.camera import StereoCamera
+from torch_denkf.data import Episode, EpisodeReplay
+
+__all__ = ["corner_replay", "read_corner_drive"]
+
+
+def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[TensorDict, StereoCamera]:
+    """Rows of a drive: the corners that each row shares with the row before, and its turn rates.
+
+    A row *repeats* the one before where all shared corners are in the same places to the bit: the tracker has found
+    new corners there and followed none. Such a row says nothing of the motion since the row before, and is not
+    observed. Standing still is not a repeat: then the corners tremble.
+
+    Args:
+        file: npz with ``features`` ``[4, M, T]`` (u left, v left, u right, v right in pixels, -1 where a corner is not
+            seen), ``K``, ``b``, ``cam_T_imu``, ``rotational_velocity`` ``[3, T]`` and ``time_stamps`` ``[1, T]``.
+        rows: how many to read; all by default.
+
+    Returns:
+        The rows ``[T]`` in float64, and the camera:
+
+        ===================== ============ =======================================================================
+        key                   shape        content
+        ===================== ============ =======================================================================
+        ``corners``           [T,N,2,4]    in the row before and in this one, pixels; zero where there are fewer
+        ``seen``              [T,N]        bool: which there are
+        ``motion_observed``   [T,1]        bool: there are corners, and the row repeats none
+        ``gyro``              [T,3]        rad/s about the camera's axes
+        ``gyro_observed``     [T,1]        bool: True
+        ``dt``                [T,1]        s since the row before; the first row has the second one's
+        ``time``              [T,1]        s since the first row
+        ``step``              [T,1]        int64
+        ===================== ============ =======================================================================
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        KeyError: if an entry is missing in it.
+    """
+    with np.load(file) as stored:
+        names = ("features", "K", "b", "cam_T_imu", "rotational_velocity", "time_stamps")
+        missing = [name for name in names if name not in stored.files]
+        if missing:
+            raise KeyError(f"{file} has no {missing}; it has {stored.files}. It should hold {list(names)}")
+        features, matrix, baseline, to_camera, rates, stamps = (np.asarray(stored[name], np.float64) for name in names)
+    count = features.shape[-1] if rows is None else rows
+    features = features[..., :count]
+    corners, seen, repeats = _pairs(features)
+    time = torch.as_tensor(stamps[0, :count] - stamps[0, 0]).unsqueeze(-1)
+    steps = time.diff(dim=0)
+    gyro = torch.as_tensor(rates[:, :count].T @ to_camera[:3, :3].T)
+    data = TensorDict({"corners": corners, "seen": seen, "gyro": gyro, "time": time}, [count])
+    data["motion_observed"] = seen.any(-1, keepdim=True) & ~repeats.unsqueeze(-1)
+    data["gyro_observed"] = torch.ones(count, 1, dtype=torch.bool)
+    data["dt"] = torch.cat([steps[:1], steps])
+    data["step"] = torch.arange(count).unsqueeze(-1)
+    return data, StereoCamera(float(matrix[0, 0]), (float(matrix[0, 2]), float(matrix[1, 2])), float(baseline))
+
+
+def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
+    """Drives as episodes of one data set, which :class:`~torch_denkf.envs.ReplayEnv` replays; nothing is for tests.
+
+    Args:
+        drives: rows ``[T]`` by the name of the drive, with what a filter is to read.
+        **options: of :class:`~torch_denkf.data.EpisodeReplay`.
+    """
+    episodes, begin = [], 0
+    for name, rows in drives.items():
+        episodes.append(Episode(name, begin, len(rows)))
+        begin += len(rows)
+    rows = torch.cat(list(drives.values()))
+    return EpisodeReplay(rows, episodes, for_tests=lambda episode: False, **options)
+
+
+def _pairs(features: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    """Corners of neighbouring rows side by side ``[T, N, 2, 4]``, which there are ``[T, N]``, and repeats ``[T]``."""
+    there = (features != -1).all(0)
+    both = there[:, 1:] & there[:, :-1]
+    most, count = max(int(both.sum(0).max()), 1), features.shape[-1]
+    corners, seen = np.zeros((count, most, 2, 4)), np.zeros((count, most), bool)
+    repeats = np.zeros(count, bool)
+    for row in range(1, count):
+        which = np.flatnonzero(both[:, row - 1])
+        pair = features[:, which, row - 1 : row + 1].transpose(1, 2, 0)
+        corners[row, : len(which)], seen[row, : len(which)] = pair, True
+        repeats[row] = len(which) > 0 and bool((pair[:, 0] == pair[:, 1]).all())
+    return torch.as_tensor(corners), torch.as_tensor(seen), torch.as_tensor(repeats)

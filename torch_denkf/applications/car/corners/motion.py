@@ -1,0 +1,171 @@
+"""The motion of a stereo camera between two rows, from the corners that both see, with its covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_denkf.applications.car.corners.camera import StereoCamera
+from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, rotation_matrix, skew
+
+__all__ = ["CornerMotion", "CornerNoise", "corner_motion", "started_by_ransac"]
+
+
+@dataclass(frozen=True)
+class CornerNoise:
+    """How far corners are off, in pixels: standard deviations.
+
+    Attributes:
+        pixel: of a corner's place in the left image, between two rows.
+        pixel_per_flow: what a pixel of flow between the rows adds to it.
+        disparity: of the disparity, in each row.
+        disparity_per_flow: what a pixel of flow adds to it.
+        stereo: of the disparity's error that stays with a corner: its right image shows not quite the same point.
+        stereo_per_offset: what a pixel of difference between the heights in both images adds to it.
+        freedom: degrees of freedom of Student's t, by which outliers count less.
+    """
+
+    pixel: float = 0.06
+    pixel_per_flow: float = 0.0042
+    disparity: float = 0.05
+    disparity_per_flow: float = 0.003
+    stereo: float = 0.45
+    stereo_per_offset: float = 0.8
+    freedom: float = 1.4
+
+
+class CornerMotion(NamedTuple):
+    """What :func:`corner_motion` returns.
+
+    Attributes:
+        motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
+        cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
+        log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
+        weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
+    """
+
+    motion: Tensor
+    cov: Tensor
+    log_likelihood: Tensor
+    weight: Tensor
+
+
+def corner_motion(
+    before: Tensor,
+    after: Tensor,
+    seen: Tensor,
+    camera: StereoCamera,
+    noise: CornerNoise | None = None,
+    *,
+    offset: Tensor | None = None,
+    start: Tensor | None = None,
+    steps: int = 12,
+) -> CornerMotion:
+    """The most likely motion by Gauss-Newton, on the corners' places and disparities.
+
+    Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
+    what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
+    weights a corner by what is left of it.
+
+    Args:
+        before: corners (u, v, disparity) of the earlier row, ``[*B, N, 3]`` in pixels.
+        after: the same corners in the later row.
+        seen: ``[*B, N]`` bool: which there are. Others may hold any finite number.
+        camera: of both rows.
+        noise: of the corners.
+        offset: difference of each corner's heights in both images, ``[*B, N]`` in pixels; zero by default.
+        start: motions to start from, ``[*B, 7]``; by default none moved.
+        steps: of Gauss-Newton.
+
+    Returns:
+        A :class:`CornerMotion`; where fewer than four corners are seen, the covariance means nothing.
+    """
+    noise = CornerNoise() if noise is None else noise
+    seen = seen & (before[..., 2] > 0.5) & (after[..., 2] > 0.5)
+    before = torch.where(seen.unsqueeze(-1), before, before.new_tensor([*camera.center, 10.0]))
+    after = torch.where(seen.unsqueeze(-1), after, before)
+    points, of_corner = camera.points(before), camera.jacobian_of_points(before)
+    stays = noise.stereo**2 + (0.0 if offset is None else (noise.stereo_per_offset * offset).square())
+    pose = SE3().neutral(before).expand(*before.shape[:-2], 7) if start is None else start
+    ridge = 1e-6 * torch.eye(6).to(before)
+    for step in range(steps + 1):
+        turn, moved = rotation_matrix(pose[..., :4]).unsqueeze(-3), points - pose[..., None, 4:]
+        moved = rotate(SO3().inverse(pose[..., None, :4]), moved)
+        ahead = seen & (moved[..., 2] > 1.0)
+        moved = torch.where(ahead.unsqueeze(-1), moved, moved.new_tensor([0.0, 0.0, 10.0]))
+        shown, slope = camera.project(moved), camera.jacobian(moved)
+        left = torch.where(ahead.unsqueeze(-1), after - shown, 0.0)
+        through = slope @ turn.mT @ of_corner
+        cov = _covariance(through[..., 2], (shown - before)[..., :2].square().sum(-1), stays, noise)
+        inverse = torch.linalg.inv(cov)
+        nis = (left.unsqueeze(-2) @ inverse @ left.unsqueeze(-1))[..., 0, 0]
+        weight = torch.where(ahead, (noise.freedom + 3) / (noise.freedom + nis), 0.0)
+        jacobian = slope @ torch.cat([skew(moved), -torch.eye(3).to(moved).expand_as(slope)], -1)
+        weighted = weight[..., None, None] * jacobian.mT @ inverse
+        information = (weighted @ jacobian).sum(-3) + ridge
+        if step < steps:
+            change = torch.linalg.solve(information, (weighted @ left.unsqueeze(-1)).sum(-3)).squeeze(-1)
+            pose = SE3().plus(pose, change.clamp(-1, 1))
+    density = -0.5 * torch.logdet(cov) - 0.5 * (noise.freedom + 3) * torch.log1p(nis / noise.freedom)
+    constant = math.lgamma((noise.freedom + 3) / 2) - math.lgamma(noise.freedom / 2)
+    density = density + constant - 1.5 * math.log(noise.freedom * math.pi)
+    mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
+    return CornerMotion(pose, torch.linalg.inv(information), mean, weight)
+
+
+def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
+    """Of what the later row shows, ``[*, 3, 3]``.
+
+    Args:
+        by_disparity: by how much it changes with the disparity of the earlier row, ``[*, 3]``.
+        flow2: square of the flow ``[*]``.
+        stays: variance of the disparity's error that is the same in both rows, ``[*]``.
+        noise: of the corners.
+    """
+    own = torch.tensor([0.0, 0.0, 1.0]).to(by_disparity)
+    same = own - by_disparity
+    place = noise.pixel**2 + noise.pixel_per_flow**2 * flow2
+    disparity = noise.disparity**2 + noise.disparity_per_flow**2 * flow2
+    cov = torch.diag_embed(torch.stack([place, place, disparity], -1))
+    stays = torch.as_tensor(stays).to(place).expand_as(place)
+    for vector, variance in ((same, stays), (by_disparity, torch.full_like(place, noise.disparity**2))):
+        cov = cov + variance[..., None, None] * vector.unsqueeze(-1) * vector.unsqueeze(-2)
+    return cov
+
+
+def started_by_ransac(
+    before: Tensor, after: Tensor, seen: Tensor, camera: StereoCamera, *, pixels: float = 1.5
+) -> tuple[Tensor, Tensor]:
+    """Motions of rows one by one, by OpenCV's random samples of corners.
+
+    Args:
+        before: corners of the earlier rows ``[T, N, 3]``.
+        after: of the later rows.
+        seen: ``[T, N]`` bool.
+        camera: of both rows.
+        pixels: how far off a corner may be.
+
+    Returns:
+        Points of SE3 ``[T, 7]``, that of no motion where none was found; and how many corners fit, ``[T]`` int64.
+    """
+    matrix = np.array([[camera.focal, 0, camera.center[0]], [0, camera.focal, camera.center[1]], [0, 0, 1.0]])
+    poses = SE3().neutral(before).repeat(len(before), 1)
+    fits = torch.zeros(len(before), dtype=torch.int64)
+    for row in range(len(before)):
+        use = seen[row] & (before[row, :, 2] > 1) & (after[row, :, 2] > 1)
+        if use.sum() < 6:
+            continue
+        points, places = camera.points(before[row, use]).numpy(), after[row, use, :2].contiguous().numpy()
+        cv2.setRNGSeed(0)
+        found, turn, move, inliers = cv2.solvePnPRansac(points, places, matrix, None, reprojectionError=pixels)
+        if found and inliers is not None:
+            to_later = torch.as_tensor(cv2.Rodrigues(turn)[0])
+            pose = torch.cat([quaternion_of(to_later.mT), -(to_later.mT @ torch.as_tensor(move)).squeeze(-1)])
+            poses[row], fits[row] = pose.to(poses), len(inliers)
+    return poses, fits
