@@ -26,7 +26,21 @@ from torch import Tensor
 from torch_denkf._checks import check_count
 from torch_denkf.functional.angles import wrap_angle
 
-__all__ = ["SE2", "SE3", "SE23", "SO3", "Circle", "Euclidean", "Product", "Space"]
+__all__ = [
+    "SE2",
+    "SE3",
+    "SE23",
+    "SO3",
+    "Circle",
+    "Euclidean",
+    "Product",
+    "Space",
+    "quaternion_of",
+    "quaternion_product",
+    "rotate",
+    "rotation_matrix",
+    "skew",
+]
 
 _SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # angles squared below which a series is as exact as the formula
 _NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # likewise, of the series of the arc tangent
