@@ -13,9 +13,9 @@ __all__ = ["LeggedNoises"]
 class LeggedNoises:
     """All that a filter of a legged robot's base is told about errors.
 
-    The defaults are those with which an extended Kalman filter of :func:`~torch_denkf.applications.legged.quadruped_env`
-    knows how wrong its velocities are: on trots of four robots the 90 % intervals hold 91 %. A standing leg bends and
-    slips, so that a foot is less sure than encoders.
+    With the defaults an extended Kalman filter knows how wrong its velocities are of
+    :func:`~torch_denkf.applications.legged.quadruped_env`: on trots of four robots the 90 % intervals hold 91 %. A
+    standing leg bends and slips, so that a foot is less sure than encoders.
 
     Attributes:
         gyro: density of its white noise, in rad/s/sqrt(Hz).
