@@ -4,15 +4,10 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from torch_denkf.applications.legged import (
-    QUADRUPED,
-    LeggedEnv,
-    LeggedErrors,
-    LegKinematics,
-    legged_space,
-    quadruped_env,
-    trot,
-)
+from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_env, trot
+from torch_denkf.applications.legged.environment import LeggedEnv
+from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.applications.legged.motion import legged_space
 from torch_denkf.functional.inertial import move_inertially
 from torch_denkf.functional.manifolds import SE3, SO3, rotate
 

@@ -6,15 +6,9 @@ from torchrl.envs import TransformedEnv
 
 from tests.applications.legged.test_environment import trotting
 from tests.real_data import SHARED
-from torch_denkf.applications.legged import (
-    ICUB,
-    QUADRUPED,
-    LegKinematics,
-    icub_log,
-    icub_model,
-    legged_filter,
-    quadruped_env,
-)
+from torch_denkf.applications.legged import QUADRUPED, legged_filter, quadruped_env
+from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
+from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 from torch_denkf.transforms import DEnKFTransform
 

@@ -49,11 +49,11 @@ def legged_filter(
     ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
     ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's
     orientation, velocity and position in the world, its biases, and the feet, see
-    :func:`~torch_denkf.applications.legged.legged_space`. The world's origin is where the base starts, its heading is
-    zero there. The robot must stand still at the start.
+    :func:`~torch_denkf.applications.legged.motion.legged_space`. The world's origin is where the base starts, its
+    heading is zero there. The robot must stand still at the start.
 
-    The sensor drives the motion, see :class:`~torch_denkf.applications.legged.LeggedMotion`: what it reads at a step is
-    the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles, and, with
+    The sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: what it reads at a
+    step is the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles, and, with
     ``rates_key``, how fast by their rates.
 
     Args:

@@ -18,7 +18,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
     r"""The velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
 
     Args:
-        state: of the sensor ``[*, 16 + 3 F]``, see :func:`~torch_denkf.applications.legged.legged_space`.
+        state: of the sensor ``[*, 16 + 3 F]``, see :func:`~torch_denkf.applications.legged.motion.legged_space`.
         gyro: what it reads, in rad/s, ``[*, 3]``.
         sensor: the sensor's pose S, r on the base ``[7]``.
 
