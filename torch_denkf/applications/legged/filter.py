@@ -53,8 +53,8 @@ def legged_filter(
     heading is zero there. The robot must stand still at the start.
 
     The sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: what it reads at a
-    step is the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles, and, with
-    ``rates_key``, how fast by their rates.
+    step is the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles,
+    and, with ``rates_key``, how fast by their rates.
 
     Args:
         model: of the robot, from MJCF or URDF.
