@@ -76,23 +76,23 @@ class LegKinematics(nn.Module):
         self._keep("zero", torch.tensor([[step[3] for step in row] for row in rows]))
         self.register_buffer("column", torch.tensor([[step[4] for step in row] for row in rows]), persistent=False)
 
-    def forward(self, angles: Tensor) -> Tensor:
+    def forward(self, positions: Tensor) -> Tensor:
         """Positions ``[*, F, 3]`` in m, by angles ``[*, J]`` in rad (slides in m)."""
-        return self._along(angles)[0]
+        return self._along(positions)[0]
 
-    def velocities(self, angles: Tensor, rates: Tensor) -> Tensor:
+    def velocities(self, positions: Tensor, rates: Tensor) -> Tensor:
         """Velocities ``[*, F, 3]`` in m/s as seen from the base, by angles and rates ``[*, J]``."""
-        return (self.jacobian(angles) * rates[..., self.column].unsqueeze(-1)).sum(-2)
+        return (self.jacobian(positions) * rates[..., self.column].unsqueeze(-1)).sum(-2)
 
-    def jacobian(self, angles: Tensor) -> Tensor:
+    def jacobian(self, positions: Tensor) -> Tensor:
         """Derivatives ``[*, F, K, 3]`` of the positions by the K joints of each foot, zero where it has fewer."""
-        end, axes, slides, places = self._along(angles)
+        end, axes, slides, places = self._along(positions)
         lever = end.unsqueeze(-2) - places
         return torch.linalg.cross(axes, lever) + slides
 
-    def _along(self, angles: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _along(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The feet, and of each joint its axis of turn, its direction of slide, and its place."""
-        moved = angles[..., self.column] - self.zero
+        moved = positions[..., self.column] - self.zero
         length = self.zero.shape[-1]
         turn = self.fixed[:, 0, :4].expand(*moved.shape[:-1], 4)
         place = self.fixed[:, 0, 4:].expand(*moved.shape[:-1], 3)
