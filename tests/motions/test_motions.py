@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.motions.steps_for_tests import MOTIONS, frame, random_points, step
@@ -125,7 +126,7 @@ def test_wrong_shapes_are_named(make):
         (lambda: InertialMotion(0.1, gyro_key="gyro"), "accelerometer_key"),
         (lambda: AttitudeMotion(0.1, gyro_noise=math.nan), "gyro_noise"),
         (lambda: PlanarMotion(0.1, damping=-1.0), "damping"),
-        (lambda: InertialMotion("dt", gyro_noise=1.0).process_noise, r"noise_of_step\(dt\)"),
+        (lambda: InertialMotion("dt").process_noise, "given no noise"),
         (lambda: InertialMotion(0.1).process_noise, "given no noise"),
     ],
 )
@@ -151,6 +152,17 @@ def test_noise_of_a_second_is_the_density_whatever_the_step():
     attitude = AttitudeMotion(0.01, gyro_noise=1e-3, gyro_walk=1e-5).process_noise
     assert attitude == pytest.approx([1e-4] * 3 + [1e-6] * 3)
     assert ConstantTwist(SE3(), "dt", twist_noise=0.3).noise_of_step(3.0)[6:] == pytest.approx([0.3 * 3**0.5] * 6)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda dt: ConstantTwist(SE3(), dt, twist_noise=0.3), lambda dt: PlanarMotion(dt, speed_noise=0.2)]
+)
+def test_noise_of_steps_that_differ(float64, make):
+    """A module writes what ``noise_of_step`` says of each step; a step of no length adds none."""
+    steps = torch.tensor([[0.0], [0.01], [3.0]])
+    found = make("dt").process_noise(TensorDict({"dt": steps}, [3]))["forecast", "noise"]
+    expected = torch.tensor([make(1.0).noise_of_step(dt) for dt in steps.flatten().tolist()])
+    assert_close(found, expected.square())
 
 
 @pytest.mark.parametrize("make", [InertialMotion, PlanarMotion], ids=["inertial", "wheels"])

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.functional.manifolds import Space
 from torch_denkf.fusion.parts import JoinedObservation, JoinedReading, StateObservation
-from torch_denkf.fusion.sensor import FusedSensor, Wired
+from torch_denkf.fusion.sensor import FusedSensor, Wired, noise_key_of
 from torch_denkf.fusion.sensor_weights import SensorWeights, WeightedNoise
 from torch_denkf.smoothers.past import lagged
 
@@ -148,6 +148,8 @@ def _joint_angles(sensors: Mapping[str, FusedSensor]) -> list[int]:
 
 def _observation_dim(sensor: FusedSensor) -> int | None:
     noise = sensor.noise
+    if noise_key_of(sensor) is not None:
+        return None
     if isinstance(noise, TensorDictModuleBase):
         return getattr(noise, "observation_dim", getattr(noise, "dim", None))
     return len(noise)

@@ -15,7 +15,7 @@ from torch_denkf.fusion.parts import Renamed
 from torch_denkf.modules import ConstantNoise
 from torch_denkf.modules._running import marks_of, reading_of, writes
 
-__all__ = ["FusedSensor", "Wired", "wire"]
+__all__ = ["FusedSensor", "Wired", "noise_key_of", "wire"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class FusedSensor(Checked):
     Attributes:
         observation: h, what the sensor would read in a state: :class:`~torch_denkf.modules.Select`,
             :class:`~torch_denkf.modules.LinearObservation`, :class:`~torch_denkf.modules.LearnedObservation`.
-        noise: R: standard deviations ``[O]``, or a module that writes variances ``[*B, O]``.
+        noise: R: standard deviations ``[O]``; a module that writes variances ``[*B, O]``; or the key of an entry of the
+            data with the variances of each reading, or, for a mean and a covariance, its covariance ``[*B, O, O]``.
         sensor: a module that reads frames and writes the reading, such as an image sensor; ``None`` where the reading
             is in the data.
         observation_key: its key in the data, ``[*B, O]``; by default the sensor's name.
@@ -46,7 +47,7 @@ class FusedSensor(Checked):
     """
 
     observation: TensorDictModuleBase
-    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor
+    noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | NestedKey
     sensor: TensorDictModuleBase | None = None
     observation_key: NestedKey | None = None
     observed_key: NestedKey | None = None
@@ -67,6 +68,13 @@ class Wired:
     noise: NestedKey
     observed: NestedKey
     features: NestedKey | None
+
+
+def noise_key_of(sensor: FusedSensor) -> NestedKey | None:
+    """The key under which the data have the noise of each reading; ``None`` where they do not."""
+    noise = sensor.noise
+    named = isinstance(noise, str) or (isinstance(noise, tuple) and all(isinstance(part, str) for part in noise))
+    return unravel_key(noise) if named else None
 
 
 def wire(name: str, sensor: FusedSensor) -> Wired:
@@ -90,9 +98,11 @@ def wire(name: str, sensor: FusedSensor) -> Wired:
                 f"'{name}_observed'; leave observed_key of the module that makes the mask at its default."
             )
         observed = next((names[key] for key in marks), observed)
-    own = ("sensor", name, "noise")
-    noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
-    names[writes(noise)[0]] = own
-    modules[f"{name}_noise"] = Renamed(noise, names)
+    own = noise_key_of(sensor)
+    if own is None:
+        own = ("sensor", name, "noise")
+        noise = sensor.noise if isinstance(sensor.noise, TensorDictModuleBase) else ConstantNoise(sensor.noise)
+        names[writes(noise)[0]] = own
+        modules[f"{name}_noise"] = Renamed(noise, names)
     features = None if sensor.features_key is None else unravel_key(sensor.features_key)
     return Wired(modules, reading, own, observed, names.get(features, features))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -55,29 +54,29 @@ class Motion(SubModel):
         """
         raise NotImplementedError
 
-    def noise_of_step(self, dt: float) -> list[float]:
-        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents."""
+    def noise_of_step(self, dt: Any) -> list:
+        """The standard deviations ``[D]`` that a step of ``dt`` seconds adds, in the space's tangents.
+
+        They are numbers, or tensors of the shape of ``dt``, if that is a tensor.
+        """
         raise NotImplementedError
 
     @property
-    def process_noise(self) -> list[float]:
-        """The standard deviations ``[D]`` that a step adds, in the space's tangents: the noise to give to a filter.
+    def process_noise(self) -> list[float] | SubModel:
+        """What a step adds, in the space's tangents: the noise to give to a filter.
+
+        Standard deviations ``[D]``; where the motion reads the length of each step, a module that writes the variances
+        of that step.
 
         Raises:
-            ValueError: if steps differ in length, or no noise was given.
+            ValueError: if no noise was given.
         """
-        name = type(self).__name__
-        if not isinstance(self.dt, (int, float)):
+        if not any(self.noise_of_step(1.0)):
             raise ValueError(
-                f"{name} reads the length of its steps from {self.dt!r}, so that each has a noise of its own. Give the "
-                "filter noise_of_step(dt), with the seconds of a typical step."
+                f"{type(self).__name__} was given no noise, so that a filter would trust it blindly: pass its "
+                "arguments ..._noise."
             )
-        noise = self.noise_of_step(self.dt)
-        if not any(noise):
-            raise ValueError(
-                f"{name} was given no noise, so that a filter would trust it blindly: pass its arguments ..._noise."
-            )
-        return noise
+        return self.noise_of_step(self.dt) if isinstance(self.dt, (int, float)) else NoiseOfStep(self)
 
     def compute(self, ensemble, *others):
         """The forecast ensemble."""
@@ -94,6 +93,24 @@ class Motion(SubModel):
         return self.move(ensemble, *actions, dt=for_members(dt))
 
 
+class NoiseOfStep(SubModel):
+    """Process noise of a motion whose steps differ in length: the variances of each step, ``[*B, D]``.
+
+    Args:
+        motion: reads its time step from an entry.
+        out_key: the variances.
+    """
+
+    def __init__(self, motion: Motion, out_key: NestedKey = ("forecast", "noise")):
+        super().__init__(nn.Identity(), keys_of_dt(motion.dt), [out_key])
+        self.noise_of_step = motion.noise_of_step
+
+    def compute(self, dt):
+        """The variances of the step."""
+        dt = dt.squeeze(-1)
+        return torch.stack([torch.zeros_like(dt) + each for each in self.noise_of_step(dt)], -1).square()
+
+
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:
     """Noise densities, one for each of ``size`` numbers, of one for all or of one for each.
 
@@ -106,15 +123,15 @@ def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> 
     return vector.tolist()
 
 
-def walked(density: Sequence[float], dt: float) -> list[float]:
+def walked(density: Sequence[float], dt: Any) -> list:
     """The standard deviations of a random walk after ``dt`` seconds."""
-    return [each * math.sqrt(dt) for each in density]
+    return [each * dt**0.5 for each in density]
 
 
-def integrated(density: Sequence[float], dt: float) -> list[float]:
+def integrated(density: Sequence[float], dt: Any) -> list:
     """The standard deviations of a random walk's integral after ``dt`` seconds.
 
     They are correlated with those of the walk by .87. In a filter, where the next step moves by what this one has
     drawn, all but the last step's correlation is there.
     """
-    return [each * math.sqrt(dt**3 / 3) for each in density]
+    return [each * (dt**3 / 3) ** 0.5 for each in density]

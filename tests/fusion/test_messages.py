@@ -1,0 +1,212 @@
+"""Oracles: a Kalman filter in numpy that goes from message to message; integrals in closed form; a regular clock."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from torch_denkf import FusedFilter, FusedSensor
+from torch_denkf.functional.manifolds import SE3
+from torch_denkf.fusion import message_rows
+from torch_denkf.modules import (
+    AroundState,
+    ContinuousMotion,
+    ContinuousNoise,
+    EKFTransition,
+    GaussianAround,
+    MomentPrior,
+    Select,
+)
+from torch_denkf.motions import AttitudeMotion, ConstantTwist, Gravity, PoseOf
+
+
+def glider(**options) -> FusedFilter:
+    """Position and speed in continuous time; both read at once, or the speed alone."""
+    motion = ContinuousMotion(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
+    sensors = {
+        "both": FusedSensor(Select([0, 1]), "both_noise", **options),
+        "speed": FusedSensor(Select([1]), "speed_noise"),
+    }
+    move = EKFTransition(motion, ContinuousNoise(motion, torch.diag(torch.tensor([0.0, 0.3]))))
+    return FusedFilter(move, sensors, initial=MomentPrior(torch.zeros(2), torch.eye(2)))
+
+
+def irregular_log(seed: int = 0, count: int = 40) -> list[tuple]:
+    """Messages in no order, each with a noise of its own; some share a time, and two a time and a sensor."""
+    random, log = np.random.default_rng(seed), []
+    for stamp in random.uniform(0.1, 8.0, count):
+        root = random.normal(size=(2, 2))
+        log.append((stamp, "both", random.normal(size=2), root @ root.T + 0.1 * np.eye(2)))
+        if random.random() < 0.5:
+            log.append((stamp if random.random() < 0.5 else stamp + 0.03, "speed", [random.normal()], [0.5]))
+    log.append((log[0][0], "both", random.normal(size=2), np.eye(2)))
+    return [log[place] for place in random.permutation(len(log))]
+
+
+def kalman(log: list[tuple], start: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance behind the last message, from one message to the next."""
+    mean, cov, now = np.zeros(2), np.eye(2), start
+    for stamp, name, value, noise in sorted(log, key=lambda message: message[0]):
+        dt, now = stamp - now, stamp
+        move = np.array([[1, dt], [0, 1]])
+        mean = move @ mean
+        cov = move @ cov @ move.T + 0.3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        model = np.eye(2) if name == "both" else np.array([[0.0, 1.0]])
+        noise = np.asarray(noise) if name == "both" else np.diag(noise)
+        gain = cov @ model.T @ np.linalg.inv(model @ cov @ model.T + noise)
+        mean, cov = mean + gain @ (np.asarray(value) - model @ mean), cov - gain @ model @ cov
+    return mean, cov
+
+
+def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float64):
+    log = irregular_log()
+    rows = message_rows(log, start=0.0)
+    assert rows["both_observed"].sum() == 41  # none is lost
+    out = glider().sequence(rows)
+    mean, cov = kalman(log, 0.0)
+    assert_close(out["belief", "mean"][-1].numpy(), mean, rtol=1e-9, atol=1e-11)
+    assert_close(out["belief", "cov"][-1].numpy(), cov, rtol=1e-9, atol=1e-11)
+
+
+def test_compiled(float64):
+    rows = message_rows(irregular_log(), start=0.0)
+    eager, compiled = (
+        each.sequence(rows.copy()) for each in (glider(), glider().compile(chunk=2, backend="aot_eager"))
+    )
+    assert_close(compiled["belief", "cov"], eager["belief", "cov"], rtol=1e-9, atol=1e-11)
+
+
+def test_delays_in_seconds_put_messages_where_they_belong(float64):
+    log = irregular_log()
+    late = [(stamp + 0.45 * (name == "speed"), name, *rest) for stamp, name, *rest in log]
+    rows = message_rows(late, delays={"speed": 0.45}, start=0.0)
+    assert_close(glider().sequence(rows)["belief", "mean"][-1].numpy(), kalman(log, 0.0)[0], rtol=1e-9, atol=1e-11)
+
+
+def test_start(float64):
+    """By default the first reading's time; what was read before a start is left out."""
+    log = irregular_log()
+    rows = message_rows(log)
+    assert rows["stamp"][0] == rows["stamp"][1] == min(message[0] for message in log)
+    assert not rows["both_observed"][0]
+    assert rows["dt"][1] == 0
+    after = message_rows(log, start=4.0)
+    later = [message for message in log if message[0] >= 4.0]
+    assert after["both_observed"].sum() + after["speed_observed"].sum() == len(later)
+    assert_close(glider().sequence(after)["belief", "mean"][-1].numpy(), kalman(later, 4.0)[0], rtol=1e-9, atol=1e-11)
+
+
+def test_what_drives_is_the_mean_since_the_row_before(float64):
+    """Of a parabola that is sampled finely: its integral. Beyond the samples it stays."""
+    stamps = np.linspace(1.0, 3.0, 2001)
+    log = [(stamp, "imu", [stamp**2, 1.0]) for stamp in stamps] + [(stamp, "gps", [0.0]) for stamp in (0.5, 3.5)]
+    log += [(2.0003, "imu", [np.nan, 0.0])]
+    rows = message_rows(log, driving=["imu"])
+    end = rows["stamp"][:, 0]
+    begin = end - rows["dt"][:, 0]
+    inside = (begin >= 1.0) & (end <= 3.0) & (end > begin)
+    assert inside.sum() == 2000
+    mean = (end**3 - begin**3)[inside] / (3 * (end - begin)[inside])
+    assert_close(rows["imu"][inside, 0], mean, rtol=0, atol=1e-6)  # straight lines between samples 1 ms apart
+    assert_close(rows["imu"][:, 1], torch.ones(len(rows)))
+    assert rows["imu"][0, 0] == 1.0
+    assert rows["imu"][-1, 0] == pytest.approx(9.0)
+    coarse = message_rows([(0.0, "imu", [0.0]), (1.0, "imu", [2.0]), (0.25, "gps", [0.0])], driving=["imu"])
+    assert coarse["imu"].flatten().tolist() == [0.0, 0.0, 0.25, 1.25]
+    with pytest.raises(ValueError, match="no message that is finite"):
+        message_rows([(0.0, "imu", [np.nan]), (1.0, "gps", [0.0])], driving=["imu"])
+
+
+def test_a_sensor_that_says_two_things_at_once():
+    rows = message_rows([(1.0, "gps", [1.0]), (1.0, "gps", [2.0]), (1.0, "wheel", [3.0]), (2.0, "gps", [4.0])])
+    assert rows["gps"].flatten().tolist() == [0.0, 1.0, 2.0, 4.0]
+    assert rows["dt"].flatten().tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert rows["wheel_observed"].flatten().tolist() == [False, True, False, False]
+    assert rows["gps"].dtype == torch.float32
+    assert rows["stamp"].dtype == torch.float64
+
+
+def test_stamps_of_a_clock_that_counts_from_1970_keep_their_steps():
+    log = [(1.7e9 + 0.01 * row, "gps", [0.0]) for row in range(101)]
+    assert_close(message_rows(log)["dt"][2:], torch.full((100, 1), 0.01), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("log", "options", "message"),
+    [
+        ([], {}, "no message"),
+        ([(0.0, "gps")], {}, "Message 0 is no"),
+        ([(0.0, [1.0], "gps")], {}, "Message 0 is no"),
+        ([(float("nan"), "gps", [1.0])], {}, "Message 0, of 'gps', has the stamp nan"),
+        ([(0.0, "gps", [[1.0]])], {}, r"value of \[1, 1\]"),
+        ([(0.0, "gps", [1.0, 2.0], [[1.0, 2.0]])], {}, r"noise of \[1, 2\]"),
+        ([(0.0, "gps", [1.0]), (1.0, "gps", [1.0, 2.0])], {}, "'gps' differ in size"),
+        ([(0.0, "gps", [1.0]), (1.0, "gps", [1.0], [2.0])], {}, "'gps' differ in size"),
+        ([(0.0, "gps", [1.0])], {"driving": ["imu"]}, r"driving names \['imu'\]"),
+        ([(0.0, "gps", [1.0])], {"delays": {"imu": 0.1}}, r"delays names \['imu'\]"),
+        ([(0.0, "gps", [1.0])], {"delays": {"gps": float("nan")}}, "delay of 'gps'"),
+    ],
+)
+def test_a_log_that_makes_no_sense_is_refused(log, options, message):
+    with pytest.raises((ValueError, KeyError), match=message):
+        message_rows(log, **options)
+
+
+def test_a_regular_log_is_a_regular_filter(float64):
+    """A motion that reads its steps, with the noise of each step, does what one of fixed steps does."""
+    torch.manual_seed(0)
+    gyro, up = 0.3 * torch.randn(50, 3), torch.randn(50, 3)
+    log = [(0.02 * row, "gyro", value) for row, value in enumerate(gyro.tolist())]
+    log += [(0.02 * row, "up", value) for row, value in enumerate(up.tolist())]
+    rows = message_rows(log, driving=["gyro"])[1:]  # the first message stands where the filter starts
+
+    def attitude(dt):
+        motion = AttitudeMotion(dt, gyro_noise=1e-2, gyro_walk=1e-3)
+        start = GaussianAround([0.3] * 3 + [0.02] * 3, state_key="start", space=motion.space)
+        sensors = {"up": FusedSensor(Gravity(motion.space), [0.5] * 3)}
+        return FusedFilter(motion, sensors, initial=start, process_noise=motion.process_noise)
+
+    rows["start"] = attitude(0.1).initial.space.neutral(gyro).expand(len(rows), 7)
+    fixed, read = attitude(0.02).sequence(rows.copy()), attitude("dt").sequence(rows.copy())
+    assert_close(read["belief", "mean"], fixed["belief", "mean"], rtol=0, atol=1e-8)
+    assert_close(read["belief", "cov"], fixed["belief", "cov"], rtol=1e-6, atol=1e-10)
+
+
+def pose_log(covariance: bool) -> TensorDict:
+    """Poses at times of their own, each with the noise of its tangent."""
+    random, log = np.random.default_rng(0), []
+    for row in range(12):
+        root = 0.1 * random.normal(size=(6, 6))
+        noise = root @ root.T + 0.01 * np.eye(6)
+        pose = SE3().perturb(SE3().neutral(), torch.tensor(0.3), torch.randn(6)).tolist()
+        log.append((0.1 * row + 0.02 * random.random(), "pose", pose, noise if covariance else noise.diagonal()))
+    return message_rows(log)
+
+
+def pose_filter(covariance: bool) -> FusedFilter:
+    """An extended Kalman filter takes covariances, an ensemble variances."""
+    motion = ConstantTwist(SE3(), "dt", twist_noise=0.5)
+    around = {"state_key": "start", "space": motion.space}
+    start = GaussianAround([0.3] * 12, **around) if covariance else AroundState([0.3] * 12, ensemble_size=16, **around)
+    sensor = FusedSensor(PoseOf(motion.space), "pose_noise", reading_space=SE3())
+    return FusedFilter(motion, {"pose": sensor}, initial=start, process_noise=motion.process_noise)
+
+
+@pytest.mark.parametrize("covariance", [True, False], ids=["EKF", "ensemble"])
+def test_noise_of_each_reading_in_every_way_to_run(float64, covariance):
+    """A sequence, its steps, and a step whose reading is left out."""
+    torch.manual_seed(1)
+    filter, rows = pose_filter(covariance), pose_log(covariance)
+    rows["start"] = filter.initial.space.neutral(rows["pose"]).expand(len(rows), 13)
+    torch.manual_seed(2)
+    rows = filter.draw_noise(rows)
+    whole = filter.sequence(rows.copy())
+    belief = filter.initialise(rows[0].copy())
+    for row in rows[1:]:
+        belief = filter.step(belief.update(row))
+    assert_close(belief["belief", "mean"], whole["belief", "mean"][-1], rtol=0, atol=1e-10)
+    left_out = rows[1].exclude("pose", "pose_noise", "pose_observed")
+    without = filter.step(filter.initialise(rows[0].copy()).update(left_out), without=["pose"])
+    assert not without["info", "nis"].any()
+    assert whole["info", "nis"][1] > 0
