@@ -2,17 +2,20 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.applications.car.odometry.test_tracking import calibration_of, frames_of
-from torch_denkf.applications.car import track
+from torch_denkf.applications.car import read_kitti_drive, track, write_drives
 from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive, usual_failures
 from torch_denkf.applications.car.odometry.failures import CameraFailure, fail_frames
+from torch_denkf.applications.car.odometry.paths import read_path
 from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.motion import image_motion
+from torch_denkf.cli.main import main
 from torch_denkf.envs import OccludingBox
 from torch_denkf.pretrained import from_pretrained
 
@@ -22,14 +25,46 @@ def test_black_frames_are_missing_frames(checkpoint, drive):
     lost = list(track(car, fail_frames(images, [CameraFailure("missing", 5, 6)]), calibration))
     black = [*fail_frames(images, [CameraFailure("black", 5, 6)])]
     black[5][0, 0] = 255  # a hot pixel
-    known = list(track(car, black, calibration, black_level=8))
+    known = list(track(car, black, calibration))
     assert [belief.observed for belief in known] == [n not in (0, 5, 6) for n in range(16)]
     for one, other in zip(lost, known, strict=True):
         assert torch.equal(one.ensemble, other.ensemble)
-    unknown = list(track(car, black, calibration))
+    unknown = list(track(car, black, calibration, black_level=None))
     assert all(belief.observed for belief in unknown[1:])
     with pytest.raises(ValueError, match="black_level must be finite, at least 0 and at most 255; got 300"):
         track(car, black, calibration, black_level=300)
+
+
+def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, capsys):
+    """The share that is told is the box's; pairs without it are read as ever."""
+    write_drives(tmp_path, ["town"], frames=14, size=(100, 300))
+    drive = read_kitti_drive(tmp_path, "town", size=(100, 300), cache=None)
+    images, calibration = frames_of(drive), calibration_of(drive)
+    covered = [*fail_frames(images, [CameraFailure("box", 5, 9)])]
+    box = np.mean(covered[6] != images[6])
+    car = from_pretrained("car-odometry")
+    clean, plain, repaired = (
+        list(track(car, frames, calibration, repair=repair))
+        for frames, repair in ((images, True), (covered, False), (covered, True))
+    )
+    assert not any(belief.hidden for belief in clean)
+    for beliefs in (plain, repaired):
+        shares = np.array([belief.hidden for belief in beliefs])
+        assert np.flatnonzero(shares).tolist() == [6, 7, 8, 9]  # both pictures of a pair show it
+        assert shares[6:10] == pytest.approx(box, rel=0.3)
+    assert torch.equal(plain[4].reading, repaired[4].reading)
+    assert not torch.equal(plain[7].reading, repaired[7].reading)
+    assert torch.equal(plain[12].reading, repaired[12].reading)
+
+    (tmp_path / "covered").mkdir()
+    for number, frame in enumerate(covered):
+        cv2.imwrite(str(tmp_path / f"covered/{number}.png"), frame)
+    words = ["--calibration", str(tmp_path / "sequences/town/calib.txt"), "--camera", "image_2", "--fps", "9.7"]
+    words += ["--out", str(tmp_path / "out"), "--no-pictures"]
+    assert main(["odometry", str(tmp_path / "covered"), *words]) == 0
+    assert "Something stands still before the camera in 4 frames, 6 to 9" in capsys.readouterr().out
+    path = read_path(tmp_path / "out/path.csv")
+    assert path["hidden"].flatten().numpy() == pytest.approx(shares, rel=1e-6)
 
 
 def test_readings_are_velocities(checkpoint, drive):

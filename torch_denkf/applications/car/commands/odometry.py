@@ -48,7 +48,8 @@ class Odometry(Command):
     height: float = KITTI_HEIGHT  # of the camera over the road, m: it scales the path
     pitch: float = 0.0  # how far the camera looks up from the road, rad
     seed: int = 0  # of the filter's noise
-    black_level: int | None = None  # frames none of whose pixels is brighter, of 255, count as missing
+    black_level: int | None = 8  # frames none of whose pixels is brighter, of 255, count as missing
+    repair: bool = True  # leave the flow as it is where something stands still before the moving camera
     pictures: bool = True  # leave the pictures out
     threads: int = 1  # of torch and OpenCV
 
@@ -88,6 +89,7 @@ class Odometry(Command):
             height=self.height,
             pitch=self.pitch,
             black_level=self.black_level,
+            repair=self.repair,
             seed=self.seed,
         )
         with alone_in(self.out):
@@ -101,11 +103,13 @@ def _leave(beliefs, out: Path, *, pictures: bool) -> None:
     from torch_denkf.applications.car.kitti.trajectories import write_trajectory
     from torch_denkf.applications.car.odometry.paths import write_path
 
-    means, seconds, blind, doubt = [], [], -1, 0.0  # the first belief has no reading
+    means, seconds, blind, doubt, hidden = [], [], -1, 0.0, {}  # the first belief has no reading
     for belief in write_path(beliefs, out / "path.csv"):
         means.append(belief.mean)
         seconds.append(belief.time)
         blind += not belief.observed
+        if belief.hidden:
+            hidden[belief.frame] = belief.hidden
         doubt = float(belief.var[:2].sum().sqrt())
     states = torch.stack(means)
     write_trajectory(out / "path_kitti.txt", states, layout="kitti")
@@ -116,6 +120,12 @@ def _leave(beliefs, out: Path, *, pictures: bool) -> None:
         f"at the end x {float(states[-1, 0]):.1f} m, y {float(states[-1, 1]):.1f} m, heading "
         f"{math.degrees(float(states[-1, 2])):.1f} deg, uncertain by {doubt:.1f} m (one standard deviation)"
     )
+    if hidden:
+        say(
+            f"Something stands still before the camera in {len(hidden)} frames, {min(hidden)} to {max(hidden)}: dirt, "
+            f"or a box. It hides at most {100 * max(hidden.values()):.0f} % of the picture; see the column hidden of "
+            "path.csv."
+        )
     files = ["path.csv", "path_kitti.txt", "path_tum.txt"]
     if pictures:
         try:

@@ -17,6 +17,7 @@ from torch_denkf.applications.car.vision.epipolar import two_view_motion
 from torch_denkf.applications.car.vision.expansion import focus_of_expansion
 from torch_denkf.applications.car.vision.motion import image_motion
 from torch_denkf.applications.car.vision.shapes import ROAD_PITCHES, ROAD_SHIFTS
+from torch_denkf.applications.car.vision.signs import static_region
 
 __all__ = ["CarCamera", "check_frame"]
 
@@ -50,6 +51,7 @@ class CarCamera:
         pitch: how far the camera looks up from the road, in rad.
         focal: focal length of the training images in pixels; ``None`` leaves images as they are.
         two_view: whether corners are tracked, too.
+        repair: whether the flow is continued over what stands still.
 
     Raises:
         ValueError: if the principal point does not belong to images of this size.
@@ -63,6 +65,7 @@ class CarCamera:
         pitch: float,
         focal: float | None,
         two_view: bool = False,
+        repair: bool = False,
     ):
         fx, fy, cx, cy = calibration
         rows, columns = frame.shape[:2]
@@ -77,7 +80,7 @@ class CarCamera:
         # Pixel centres are at whole numbers.
         self.calibration = [fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5]
         self.calibration[3] += pitch * self.calibration[1]
-        self.height, self.two_view, self.watch = height, two_view, _Watch(pitch)
+        self.height, self.two_view, self.repair, self.watch = height, two_view, repair, _Watch(pitch)
         # What the sensor looks at, against what the camera shows: to the sides and down to the near road.
         canonical = CanonicalCamera(240.0)
         wanted = [side / 2 / canonical.focal for side in (canonical.width, canonical.height)]
@@ -97,15 +100,20 @@ class CarCamera:
         grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
-    def motion(self, previous: np.ndarray, current: np.ndarray) -> dict[str, Tensor]:
-        """Flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked."""
-        arrays = image_motion(previous, current, self.calibration, height=self.height)
+    def motion(self, previous: np.ndarray, current: np.ndarray) -> tuple[dict[str, Tensor], float]:
+        """Flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
+
+        Beside it the share of the picture that stands still.
+        """
+        static = static_region(previous, current)
+        hidden = {"hidden": static} if self.repair and static.any() else {}
+        arrays = image_motion(previous, current, self.calibration, height=self.height, **hidden)
         flow, road = (torch.from_numpy(array).half().float() for array in arrays)
         self.watch(flow, road)
         reading = {"flow": flow, "road": road}
         if self.two_view:
-            reading["two_view"] = torch.from_numpy(two_view_motion(previous, current, self.calibration))
-        return reading
+            reading["two_view"] = torch.from_numpy(two_view_motion(previous, current, self.calibration, **hidden))
+        return reading, float(static.mean())
 
 
 class _Watch:

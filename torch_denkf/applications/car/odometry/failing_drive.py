@@ -40,6 +40,7 @@ def track_failing_drive(
     *,
     height: float = KITTI_HEIGHT,
     black_level: int | None = 8,
+    repair: bool = True,
     seed: int = 0,
     progress: Callable[[int], object] | None = None,
 ) -> TensorDict:
@@ -52,6 +53,7 @@ def track_failing_drive(
         failures: what happens when.
         height: of the camera over the road, in m.
         black_level: see :func:`torch_denkf.applications.car.track`.
+        repair: likewise.
         seed: of the filter's noise.
         progress: called with the number of frames since the last call.
 
@@ -85,6 +87,7 @@ def track_failing_drive(
             fps=1 / dt,
             height=height,
             black_level=black_level,
+            repair=repair,
             seed=seed,
         )
     )

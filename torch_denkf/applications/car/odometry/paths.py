@@ -20,8 +20,9 @@ from torch_denkf.functional.moments import ensemble_cov
 __all__ = ["PATH_COLUMNS", "read_path", "write_path"]
 
 _STATE = ("x_m", "y_m", "theta_rad", "v_m_per_s", "theta_dot_rad_per_s")
-#: Of path.csv; ``std_`` are standard deviations, ``cov_xy_m2`` is the covariance of x and y.
-PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name in _STATE), "cov_xy_m2")
+#: Of path.csv; ``std_`` are standard deviations, ``cov_xy_m2`` is the covariance of x and y; ``hidden`` is the share of
+#: the picture that stands still before the moving camera.
+PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name in _STATE), "cov_xy_m2", "hidden")
 
 
 def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
@@ -73,7 +74,7 @@ def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[T
 
 def _row(belief: TrackedBelief) -> list[Any]:
     covariance = float(ensemble_cov(belief.ensemble[:, :2])[0, 1])
-    numbers = [*belief.mean.tolist(), *belief.var.sqrt().tolist(), covariance]
+    numbers = [*belief.mean.tolist(), *belief.var.sqrt().tolist(), covariance, belief.hidden]
     return [belief.frame, f"{belief.time:.9g}", int(belief.observed), *(f"{value:.9g}" for value in numbers)]
 
 
@@ -85,8 +86,8 @@ def read_path(file: str | Path) -> TensorDict:
 
     Returns:
         ``[T]``, float64: ``("belief", "mean")`` and ``("belief", "var")`` ``[T, 5]``, ``("belief", "cov")``
-        ``[T, 5, 5]`` (of x and y; all else is diagonal), ``"time"`` ``[T, 1]``, ``"frame"`` and ``"observed"``
-        ``[T, 1]``.
+        ``[T, 5, 5]`` (of x and y; all else is diagonal), ``"time"`` ``[T, 1]``, ``"frame"``, ``"observed"`` and
+        ``"hidden"`` ``[T, 1]``.
 
     Raises:
         FileNotFoundError: without the file.
@@ -110,9 +111,9 @@ def read_path(file: str | Path) -> TensorDict:
     if not rows:
         raise ValueError(f"{file} has no rows")
     table = torch.tensor(rows, dtype=torch.float64)
-    frame, time, observed, mean, std, cov = table.split([1, 1, 1, 5, 5, 1], -1)
+    frame, time, observed, mean, std, cov, hidden = table.split([1, 1, 1, 5, 5, 1, 1], -1)
     belief = TensorDict({"mean": mean, "var": std.square(), "cov": _cov(std, cov)}, [len(rows)])
-    entries = {"belief": belief, "time": time, "frame": frame.long(), "observed": observed.bool()}
+    entries = {"belief": belief, "time": time, "frame": frame.long(), "observed": observed.bool(), "hidden": hidden}
     return TensorDict(entries, [len(rows)])
 
 

@@ -36,6 +36,7 @@ class TrackedBelief(NamedTuple):
         ensemble: members, ``[E, 5]``.
         reading: mean (v m/s, theta_dot rad/s) that the sensor reads of the steps since the frame before, ``[2]``;
             ``None`` where it could not compare.
+        hidden: share of the picture that stands still before the moving camera, 0 to 1: dirt, or a box.
     """
 
     frame: int
@@ -45,6 +46,7 @@ class TrackedBelief(NamedTuple):
     var: Tensor
     ensemble: Tensor
     reading: Tensor | None = None
+    hidden: float = 0.0
 
 
 def track(
@@ -56,7 +58,8 @@ def track(
     fps: float | None = None,
     height: float = KITTI_HEIGHT,
     pitch: float = 0.0,
-    black_level: int | None = None,
+    black_level: int | None = 8,
+    repair: bool = True,
     seed: int = 0,
 ) -> Iterator[TrackedBelief]:
     """Follows a car by its camera's images, one at a time, in a memory that does not grow.
@@ -82,6 +85,8 @@ def track(
         pitch: how far the camera looks up from the road, in rad; -0.04 to 0.02 are found out without.
         black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter
             than this grey value, of 255. No street looks like that, not even at night. ``None`` checks nothing.
+        repair: whether the flow is continued over what stands still before the moving camera, see
+            :func:`torch_denkf.applications.car.vision.static_region`.
         seed: of the filter's noise.
 
     Returns:
@@ -111,7 +116,7 @@ def track(
         check_number("fps", fps, above=0, cure="It is the number of frames in a second")
     if black_level is not None:
         check_number("black_level", black_level, least=0, most=255, cure="It is a grey value")
-    return _track(car, _seen(frames, black_level), calibration, times, fps, height, pitch, seed)
+    return _track(car, _seen(frames, black_level), calibration, times, fps, height, pitch, repair, seed)
 
 
 def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Iterator[np.ndarray | None]:
@@ -127,7 +132,7 @@ def _is_black(frame: np.ndarray, level: int) -> bool:
     return float((frame > level).mean()) <= 1e-3
 
 
-def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterator[TrackedBelief]:
+def _track(car, frames, calibration, times, fps, height, pitch, repair, seed) -> Iterator[TrackedBelief]:
     settings, run, camera, done = car.settings, None, None, 0
     clock, stamps = _clock(times, fps, settings.dt)
     last: _Seen | None = None
@@ -138,12 +143,12 @@ def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterato
         step = clock(time)
         if step is None:
             continue
-        image, reading, between = None, None, 0
+        image, reading, between, hidden = None, None, 0, 0.0
         if frame is not None:
-            camera = camera or CarCamera(frame, calibration, height, pitch, settings.focal, settings.two_view)
+            camera = camera or CarCamera(frame, calibration, height, pitch, settings.focal, settings.two_view, repair)
             image = camera.image(frame, number)
             if last is not None and step - last.step <= settings.longest:
-                reading, between = camera.motion(last.image, image), step - last.step
+                (reading, hidden), between = camera.motion(last.image, image), step - last.step
                 if run is None:
                     run, done = _Run(car, reading, between, settings.dt / clock.step, seed), last.step
                     yield run.belief(last.number, last.time, False)
@@ -159,7 +164,7 @@ def _track(car, frames, calibration, times, fps, height, pitch, seed) -> Iterato
             run.step(None, 0)
         run.step(reading, between)
         done = step
-        yield run.belief(number, clock.time, reading is not None, between)
+        yield run.belief(number, clock.time, reading is not None, between)._replace(hidden=hidden)
     if run is None:
         raise ValueError(f"there are no two frames at most {settings.longest} steps apart, which a path needs")
 

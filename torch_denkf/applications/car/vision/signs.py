@@ -22,6 +22,7 @@ FLOW_SIGNS = ("plane", "road")
 
 _CELLS = 60  # across a picture
 _LEAST_CELLS = 3  # sides of the smallest region that counts
+_LEAST_SIDE = 3  # pixels of a cell: fewer stay the same by chance
 _BELOW = 0.08  # tangents below the camera's axis: the road, up to 20 m ahead of KITTI's camera
 _STANDING = 0.05  # m: added to distances, so that a car that stands has a ratio
 _WHITE, _BLACK = 250, 5  # grey levels at which a pixel counts as too bright, or too dark
@@ -58,7 +59,7 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
     if previous.shape != current.shape or previous.ndim != 2:
         raise ValueError(f"pictures are grey and of one shape [H, W]; got {previous.shape} and {current.shape}")
     previous, current = (cv2.medianBlur(np.ascontiguousarray(image), 3) for image in (previous, current))
-    side = max(previous.shape[1] // cells, 1)
+    side = max(previous.shape[1] // cells, _LEAST_SIDE)
     change = _largest(cv2.absdiff(previous, current), side)
     same = change <= noise
     if np.median(change) <= noise:

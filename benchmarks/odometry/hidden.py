@@ -1,0 +1,50 @@
+"""A car's path with a box before its camera for ten seconds: ``python -m benchmarks.odometry.hidden --root KITTI``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.common.arguments import command, parse
+from benchmarks.common.tables import head, line
+from torch_denkf import from_pretrained
+from torch_denkf.applications.car import read_kitti_drive
+from torch_denkf.applications.car.kitti.drive import list_kitti_drives
+from torch_denkf.applications.car.odometry.failing_drive import drive_scores, track_failing_drive
+from torch_denkf.applications.car.odometry.failures import CameraFailure
+from torch_denkf.metrics import interval_coverage
+
+FIRST, STEPS = 60, 97  # ten seconds
+RUNS = {"no box": (False, True), "a box, not looked for": (True, False), "a box, looked for": (True, True)}
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """The shipped filter on drives whose camera looks past a box, with and without a look for what stands still."""
+
+    root: Path  # folder with sequences and poses
+    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+
+
+def main() -> None:
+    """Prints the table."""
+    study = parse(Hidden)
+    print(f"`{command('odometry.hidden')}`\n")
+    columns = "drive", "camera", "off at the end, m", "off on average, m", "v, while hidden, m/s", "v held, %"
+    print("\n".join(head(*columns)))
+    for name in list_kitti_drives(study.root):
+        drive = read_kitti_drive(study.root, name, size=(100, 300), cache=None)
+        if len(drive) <= FIRST + STEPS:
+            continue
+        for label, (box, repair) in RUNS.items():
+            failures = [CameraFailure("box", FIRST, FIRST + STEPS - 1)] if box else []
+            tracked = track_failing_drive(from_pretrained(study.checkpoint), drive, failures, repair=repair)
+            scores, during = drive_scores(tracked), tracked[FIRST : FIRST + STEPS]
+            mean, var, true = (during[key][:, 3:4] for key in (("belief", "mean"), ("belief", "var"), "state"))
+            off, held = (mean - true).square().mean().sqrt(), interval_coverage(mean, var, true, level=0.9)
+            ends = [f"{scores[f'filter_{key}_m']:.1f}" for key in ("end", "mean")]
+            print(line(name, label, *ends, f"{off.item():.2f}", f"{100 * held.item():.0f}"), flush=True)
+
+
+if __name__ == "__main__":
+    main()
