@@ -354,6 +354,7 @@ def test_a_turned_world_turns_what_is_smoothed(kind):
     filter, data, turn = make(kind), log(), SO3().exp(torch.tensor([2.0, -1.0, 0.5]))
     smoothers = [FixedLag(filter, lag=3)] + ([RTSSmoother(filter)] if kind in ("EKF", "UKF") else [])
     smoothers += [EnRTS(filter), EnKS(filter, lag=4)] if kind == "etkf" else []
+    smoothers += [ParticleSmoother(filter)] if kind == "particles" else []
     data = with_noise(filter, data)
     other = data.clone()
     for key in ("start", "pose"):
@@ -479,8 +480,6 @@ def test_what_does_not_fit_is_refused():
         MomentPrior(torch.zeros(3), torch.eye(3), space=SO3())
     with pytest.raises(ValueError, match="says what is an angle"):
         make("EKF", angles=[0])
-    with pytest.raises(TypeError, match="FixedLag is"):
-        ParticleSmoother(make("particles"))
     with pytest.raises(ValueError, match="put the biases into the state"):
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
     with pytest.raises(TypeError, match="EKFAnalysis is on a space"):

@@ -30,10 +30,10 @@ def linear():
     return LearnedTransition(move, residual=False), None, Select([0, 1, 2])
 
 
-def readings(seed=0):
-    """Data of both."""
-    torch.manual_seed(seed)
-    tangents, observed = SMALL * torch.randn(B, T, 3), torch.rand(B, T, 1) < 0.8
+def readings(spread=1.0):
+    """Data of both; readings lie ``spread`` times a thousandth of a rad from the neutral rotation."""
+    torch.manual_seed(0)
+    tangents, observed = SMALL * spread * torch.randn(B, T, 3), torch.rand(B, T, 1) < 0.8
     data = TensorDict({"pose": SO3().exp(tangents), "action": torch.zeros(B, T, 3), "observed": observed}, [B, T])
     data["start"] = SPACE.neutral(tangents).expand(B, T, 7).clone()
     flat = TensorDict({"pose": tangents, "start": torch.zeros(B, T, 6), "observed": observed}, [B, T])

@@ -7,12 +7,14 @@ from torch import nn
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import stepwise
-from tests.filters.test_spaces import SPACE, B, T, log, make
+from tests.filters.test_spaces import DT, SPACE, B, Orientation, T, log, make
 from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differences, linear, noise, readings, rotating
-from torch_denkf.filters import EKF, UKF
+from torch_denkf.filters import EKF, UKF, ParticleFilter
+from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.manifolds import SO3, Euclidean
-from torch_denkf.modules import ConstantNoise, GaussianAround, LearnedTransition, Select
-from torch_denkf.smoothers import FixedLag, RTSSmoother
+from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, LearnedTransition, Select, SubModel
+from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers.particles import log_density_of_pairs
 
 GAUSSIAN = {"EKF": EKF, "UKF": UKF}
 SMOOTHED = [("smoothed", "mean"), ("smoothed", "var")]
@@ -76,3 +78,71 @@ def test_steps_and_compiled_steps_are_the_sequence(kind):
     close(stepwise(filter, data.clone()), out, filter.belief_keys, atol=1e-10)
     filter.compile(chunk=2, backend="aot_eager")
     close(filter.sequence(data.clone()), out, [*filter.belief_keys, *SMOOTHED], atol=1e-10)
+
+
+class GyroTurn(SubModel):
+    """Turns by what a gyro reads."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
+
+    def compute(self, state, gyro):
+        return SO3().plus(state, DT * gyro.unsqueeze(-2))
+
+
+def particles(parts, own, std, q, size, space=None, reading_space=None, **options):
+    start = AroundState(std, ensemble_size=size, state_key="start", space=space)
+    known = {"process_noise": q, "observation_key": "pose", "reading_space": reading_space}
+    return ParticleFilter(*parts, noise=own, initial=start, **known, **options)
+
+
+def test_particles_of_numbers_as_a_space_are_plain_ones():
+    data, parts, own = numbers()
+    outs = []
+    for space in (None, Euclidean(2)):
+        filter = particles(parts, own, [0.5, 0.6], [0.1, 0.2], 40, space=space, reading_space=space)
+        data = data if outs else filter.draw_noise(data)
+        outs.append(ParticleSmoother(filter, 3)(data.clone()))
+    close(*outs, [*SMOOTHED, ("smoothed", "log_weight"), ("smoothed", "ensemble")], atol=1e-10)
+
+
+def test_particles_of_small_angles_are_plain_ones():
+    """With the same noise, and none drawn again: weights multiply small differences up over all readings."""
+    data, flat = readings(0.1)
+    plain = particles(linear(), noise(), STARTS, PROCESS, 30, resampling=None)
+    flat = plain.draw_noise(flat)
+    data["noise"] = flat["noise"]
+    options = {"space": SPACE, "reading_space": SO3(), "resampling": None}
+    out = ParticleSmoother(particles(rotating(), noise(), STARTS, PROCESS, 30, **options))(data.clone())
+    assert_small_differences(out, ParticleSmoother(plain)(flat), "smoothed", data["start"], var=0.05)
+
+
+def test_particles_are_the_smoother_of_moments():
+    """Within 3.5 standard errors of as many draws as the fewest particles that ever counted; of orientations alone."""
+    data, size, std, q = log(steps=6, hidden=False), 600, [0.2] * 3, [0.1] * 3
+    data["start"], turn = data["state"][:, :1, :4].expand(B, 6, 4).contiguous(), GyroTurn()
+    known = {"process_noise": q, "observation_key": "pose", "reading_space": SO3()}
+    start, own = GaussianAround(std, state_key="start", space=SO3()), ConstantNoise([0.1] * 3, in_key="pose")
+    expected = RTSSmoother(EKF(turn, None, Orientation(), own, initial=start, **known))(data.clone())
+    torch.manual_seed(1)
+    with torch.no_grad():
+        filter = particles((turn, None, Orientation()), own, std, q, size, space=SO3(), reading_space=SO3())
+        out = ParticleSmoother(filter)(data.clone())
+    ess = out["info", "ess"]
+    fewest, std = torch.where(ess > 0, ess, size).amin(1, keepdim=True), expected["smoothed", "var"].sqrt()
+    away, before = (SO3().minus(out[key, "mean"], expected["smoothed", "mean"]) / std for key in ("smoothed", "belief"))
+    assert (away.abs() < 3.5 / fewest.sqrt()).all()
+    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 3.5 * (2 / fewest).sqrt()).all()
+    assert away.square().mean().sqrt() < 0.15 < 0.3 < before.square().mean().sqrt()
+
+
+def test_densities_of_pairs_are_those_of_their_tangents():
+    values, means = (SPACE.exp(torch.randn(B, 4, 6)) for _ in range(2))
+    root = torch.randn(B, 6, 6)
+    cov = root @ root.mT + torch.eye(6)
+    found = log_density_of_pairs(values, means, cov, SPACE)
+    for i in range(4):
+        for j in range(4):
+            away = SPACE.minus(values[:, j], means[:, i])
+            due = gaussian_log_prob(away, torch.zeros_like(away), cov)
+            torch.testing.assert_close(found[:, i, j], due.reshape(found[:, i, j].shape))
