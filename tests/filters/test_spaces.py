@@ -378,6 +378,17 @@ def test_step_and_sequence_agree(kind):
     close(stepwise(filter, data.clone()), filter.sequence(data.clone()), [*filter.belief_keys], atol=1e-10)
 
 
+@pytest.mark.parametrize("kind", [*KINDS, "lagged", "gated EKF"])
+def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
+    filter = FixedLag(make("EKF"), 2) if kind == "lagged" else make(kind.split()[-1])
+    filter = Gated(filter, response="student", window=1, rate=1e-2) if kind == "gated EKF" else filter
+    start = filter.initialise(with_noise(filter, log(steps=3))[:, 1].clone())
+    start["observed"][:] = False
+    out = filter.predict(start.exclude("pose", "observed").copy())
+    assert out[MEAN].isfinite().all()
+    close(out, filter.step(start.copy()), filter.belief_keys, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles"])
 def test_the_transform_says_what_a_sequence_says(kind):
     filter, data = make(kind), log()
