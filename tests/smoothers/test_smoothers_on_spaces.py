@@ -7,13 +7,13 @@ from torch import nn
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import stepwise
-from tests.filters.test_spaces import DT, SPACE, B, Orientation, T, log, make
+from tests.filters.test_spaces import DT, SPACE, STD, B, Orientation, Q, R, T, Turning, log, make, turned
 from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differences, linear, noise, readings, rotating
 from torch_denkf.filters import EKF, UKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
 from torch_denkf.functional.manifolds import SO3, Euclidean
 from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, LearnedTransition, Select, SubModel
-from torch_denkf.smoothers import FixedLag, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers import FixedLag, IEnKS, ParticleSmoother, RTSSmoother
 from torch_denkf.smoothers.particles import log_density_of_pairs
 
 GAUSSIAN = {"EKF": EKF, "UKF": UKF}
@@ -146,3 +146,87 @@ def test_densities_of_pairs_are_those_of_their_tangents():
             away = SPACE.minus(values[:, j], means[:, i])
             due = gaussian_log_prob(away, torch.zeros_like(away), cov)
             torch.testing.assert_close(found[:, i, j], due.reshape(found[:, i, j].shape))
+
+
+def iterated(parts, own, std, q, space=None, reading_space=None, size=8, key="pose", **options):
+    start = AroundState(std, ensemble_size=size, state_key="start", space=space)
+    known = {"initial": start, "observation_key": key, "reading_space": reading_space}
+    return IEnKS(*parts, own, process_noise=q, **known, **options)
+
+
+def test_the_iterated_smoother_of_numbers_as_a_space_is_the_plain_one():
+    data, parts, own = numbers()
+    outs = []
+    for space in (None, Euclidean(2)):
+        filter = iterated(parts, own, [0.5, 0.6], [0.1, 0.2], space, space, inflation=1.1, rotate=True)
+        data = data if outs else filter.draw_noise(data)
+        outs.append(filter.sequence(data.clone()))
+    infos = [("info", name) for name in ("nis", "log_likelihood", "innovation")]
+    close(*outs, [*SMOOTHED, ("smoothed", "ensemble"), ("belief", "ensemble"), ("belief", "var"), *infos], atol=1e-9)
+
+
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_the_iterated_smoother_of_small_angles_is_the_plain_one(iterations):
+    data, flat = readings()
+    plain = iterated(linear(), noise(), STARTS, PROCESS, iterations=iterations)
+    flat = plain.draw_noise(flat)
+    data["noise"] = flat["noise"]
+    on_space = iterated(rotating(), noise(), STARTS, PROCESS, SPACE, SO3(), iterations=iterations)
+    out, expected = on_space.sequence(data.clone()), plain.sequence(flat)
+    for key in ("belief", "smoothed"):
+        assert_small_differences(out, expected, key, data["start"])
+
+
+def orientations_iterated(size=8, **options):
+    parts, own = (Turning(), None, Orientation()), ConstantNoise(R, in_key="pose")
+    return iterated(parts, own, STD, Q, SPACE, SO3(), size, **options)
+
+
+def test_the_iterated_smoother_of_many_members_is_that_of_moments():
+    """An extended Kalman filter is as good as exact here. The bound is ten standard errors of so many members."""
+    data, size = log(), 400
+    expected = FixedLag(make("EKF"), 1).sequence(data.clone())
+    torch.manual_seed(0)
+    with torch.no_grad():
+        out = orientations_iterated(size, iterations=3).sequence(data.clone())
+    for key in ("belief", "smoothed"):
+        std = expected[key, "var"].sqrt()
+        assert (SPACE.minus(out[key, "mean"], expected[key, "mean"]).abs() < 10 * std / size**0.5).all()
+        assert ((out[key, "var"] / std.square() - 1).abs() < 5 * (2 / size) ** 0.5).all()
+
+
+@pytest.mark.parametrize("turn", [[2.0, -1.0, 0.5], [torch.pi, 0.0, 0.0]])
+def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
+    filter, turn = orientations_iterated(inflation=1.1, rotate=True), SO3().exp(torch.tensor(turn))
+    data = filter.draw_noise(log())
+    other = data.clone()
+    for key in ("start", "pose"):
+        other[key] = turned(turn, data[key])
+    here, there = filter.sequence(data), filter.sequence(other)
+    for key in ("belief", "smoothed"):
+        assert SPACE.minus(there[key, "mean"], turned(turn, here[key, "mean"])).abs().max() < 1e-8
+        close(there[key], here[key], ["var"], atol=1e-8)
+    close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)
+
+
+def test_iterated_steps_are_the_sequence_and_gradients_are_finite():
+    filter, data = orientations_iterated(), log()
+    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
+    data = filter.draw_noise(data)
+    data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
+    data["start"].requires_grad_()
+    out = filter.sequence(data.clone())
+    close(stepwise(filter, data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-9)
+    (out["smoothed", "var"].sum() + SPACE.minus(out["belief", "mean"], data["state"]).square().sum()).backward()
+    assert data["start"].grad.isfinite().all()
+
+
+def test_the_iterated_smoother_takes_the_mean_of_samples_that_are_points():
+    data, parts, options = log(hidden=False), (Turning(), None, Orientation()), (STD, Q, SPACE, SO3())
+    filter = iterated(parts, ConstantNoise(R, in_key="pose"), *options)
+    data = filter.draw_noise(data)
+    expected = filter.sequence(data.clone())
+    away, sampled = 0.1 * torch.randn(B, T, 1, 3), ("poses", "ensemble")
+    data[sampled] = SO3().plus(data["pose"].unsqueeze(-2), torch.cat([away, -away] * 4, -2))
+    out = iterated(parts, ConstantNoise(R, in_key=sampled), *options, key=sampled).sequence(data)
+    close(out, expected, [("belief", "ensemble"), *SMOOTHED], atol=1e-9)
