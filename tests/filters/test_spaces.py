@@ -13,7 +13,7 @@ from tests.filters.beliefs_for_tests import close
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import stepwise
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
+from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
@@ -491,6 +491,10 @@ def test_what_does_not_fit_is_refused():
         MomentPrior(torch.zeros(3), torch.eye(3), space=SO3())
     with pytest.raises(ValueError, match="says what is an angle"):
         make("EKF", angles=[0])
+    matrices = (torch.eye(7), None, torch.eye(4, 7), ConstantNoise([0.1] * 4, in_key="pose"))
+    start = GaussianAround(STD, state_key="start", space=SPACE)
+    with pytest.raises(ValueError, match="Give the same sensor and noise to an EKF"):
+        BackpropKF(*matrices, process_noise_cov=torch.eye(7), initial=start, observation_key="pose")
     with pytest.raises(ValueError, match="put the biases into the state"):
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
     with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
