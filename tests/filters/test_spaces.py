@@ -13,7 +13,7 @@ from tests.filters.beliefs_for_tests import close
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import stepwise
 from torch_denkf.deployment import export_step, load_step
-from torch_denkf.filters import EKF, UKF, DEnKF, ParticleFilter
+from torch_denkf.filters import EKF, UKF, BackpropKF, DEnKF, ParticleFilter
 from torch_denkf.functional.manifolds import SO3, Circle, Euclidean, Product
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import (
@@ -352,8 +352,9 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles"])
 def test_a_turned_world_turns_what_is_smoothed(kind):
     filter, data, turn = make(kind), log(), SO3().exp(torch.tensor([2.0, -1.0, 0.5]))
-    smoothers = [RTSSmoother(filter)] if kind in ("EKF", "UKF") else [FixedLag(filter, lag=3)]
+    smoothers = [FixedLag(filter, lag=3)] + ([RTSSmoother(filter)] if kind in ("EKF", "UKF") else [])
     smoothers += [EnRTS(filter), EnKS(filter, lag=4)] if kind == "etkf" else []
+    smoothers += [ParticleSmoother(filter)] if kind == "particles" else []
     data = with_noise(filter, data)
     other = data.clone()
     for key in ("start", "pose"):
@@ -375,6 +376,17 @@ def test_step_and_sequence_agree(kind):
     data["is_init"] = torch.arange(T).reshape(T, 1).expand(B, T, 1) == 0
     data = with_noise(filter, data)
     close(stepwise(filter, data.clone()), filter.sequence(data.clone()), [*filter.belief_keys], atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "lagged", "gated EKF"])
+def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
+    filter = FixedLag(make("EKF"), 2) if kind == "lagged" else make(kind.split()[-1])
+    filter = Gated(filter, response="student", window=1, rate=1e-2) if kind == "gated EKF" else filter
+    start = filter.initialise(with_noise(filter, log(steps=3))[:, 1].clone())
+    start["observed"][:] = False
+    out = filter.predict(start.exclude("pose", "observed").copy())
+    assert out[MEAN].isfinite().all()
+    close(out, filter.step(start.copy()), filter.belief_keys, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles"])
@@ -479,15 +491,11 @@ def test_what_does_not_fit_is_refused():
         MomentPrior(torch.zeros(3), torch.eye(3), space=SO3())
     with pytest.raises(ValueError, match="says what is an angle"):
         make("EKF", angles=[0])
-    with pytest.raises(TypeError, match="use RTSSmoother"):
-        FixedLag(make("EKF"), lag=2)
-    with pytest.raises(TypeError, match="FixedLag is"):
-        ParticleSmoother(make("particles"))
+    matrices = (torch.eye(7), None, torch.eye(4, 7), ConstantNoise([0.1] * 4, in_key="pose"))
+    start = GaussianAround(STD, state_key="start", space=SPACE)
+    with pytest.raises(ValueError, match="Give the same sensor and noise to an EKF"):
+        BackpropKF(*matrices, process_noise_cov=torch.eye(7), initial=start, observation_key="pose")
     with pytest.raises(ValueError, match="put the biases into the state"):
         make("EKF", sensor_error=FadingBias([0.1], time=10.0))
     with pytest.raises(TypeError, match="EKFAnalysis is on a space"):
         make("EKF", visibility=Visibility(3, encoding_key="pose"))
-    sensor = FusedSensor(Orientation(), R, reading_space=SO3(), delay=2)
-    start = GaussianAround(STD, state_key="start", space=SPACE)
-    with pytest.raises(ValueError, match="plain numbers"):
-        FusedFilter(Turning(), {"pose": sensor}, initial=start, process_noise=Q)

@@ -11,6 +11,7 @@ from torch import nn
 
 from torch_denkf._checks import check_covariance, check_one_dtype, check_shape, check_square, check_values
 from torch_denkf.filters._gaussian import GaussianFilter, GaussianOptions
+from torch_denkf.modules._running import declared
 from torch_denkf.modules._tensors import as_floating
 from torch_denkf.modules.kalman import KalmanAnalysis, LinearTransition
 
@@ -22,7 +23,8 @@ class BackpropKF(GaussianFilter):
 
     A sensor network reads :math:`z_t` from the frame and a noise network :math:`R_t`; both are trained through the
     filter's recursion. For a nonlinear motion, such as a vehicle's, give an :class:`~torch_denkf.filters.EKF` the
-    same sensor and noise modules. The belief is that of :class:`~torch_denkf.filters.KalmanFilter`.
+    same sensor and noise modules; so for an orientation, which no matrix moves. The belief is that of
+    :class:`~torch_denkf.filters.KalmanFilter`.
 
     Args:
         transition: A, ``[S, S]``.
@@ -40,6 +42,9 @@ class BackpropKF(GaussianFilter):
         **options: ``inflation``, ``angles``, ``observation_key``, ``observed_key``, ``visibility`` and what every
             filter takes, see :class:`GaussianOptions`. Of ``control_keys`` the first drives the transition
             where ``control`` is given.
+
+    Raises:
+        ValueError: if the shapes do not fit, or the state or the reading lives in a space.
 
     Reference:
         Haarnoja, Ajay, Levine, Abbeel, "Backprop KF: learning discriminative deterministic state estimators", 2016,
@@ -73,6 +78,12 @@ class BackpropKF(GaussianFilter):
         check_square("transition", a)
         check_shape("observation", c, (len(c) if c.ndim else 0, len(a)), "[O, S]")
         check_one_dtype(transition=a, observation=c)
+        spaces = [one for one in (declared(initial).space, options.get("reading_space")) if one is not None]
+        if spaces:
+            raise ValueError(
+                f"BackpropKF moves and observes plain numbers by matrices, and there are points of {spaces[0]}. Give "
+                "the same sensor and noise to an EKF, with a motion and an observation model of points."
+            )
         check_values("transition", a)
         check_values("observation", c)
         if not isinstance(process_noise_cov, nn.Module):

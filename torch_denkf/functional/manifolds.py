@@ -543,6 +543,77 @@ class Product(Space):
         return torch.cat([function(*own) for own in zip(self.parts, *values, strict=True)], -1)
 
 
+@dataclass(frozen=True)
+class Repeated(Space):
+    """N points of one space side by side: ``Product(space, space, ...)``, worked out for all at once.
+
+    Args:
+        part: the space.
+        count: N.
+
+    Example:
+        >>> Repeated(SO3(), 4).point_dim, Repeated(SO3(), 4).tangent_dim
+        (16, 12)
+    """
+
+    part: Space
+    count: int
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """N P."""
+        return self.count * self.part.point_dim
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """N D."""
+        return self.count * self.part.tangent_dim
+
+    def compose(self, first, second):
+        """Point by point."""
+        return self._each(self.part.compose, first, second)
+
+    def inverse(self, point):
+        """Point by point."""
+        return self._each(self.part.inverse, point)
+
+    def exp(self, tangent):
+        """Point by point."""
+        return self._each(self.part.exp, tangent)
+
+    def log(self, point):
+        """Point by point."""
+        return self._each(self.part.log, point)
+
+    def right_jacobian(self, tangent):
+        """Blocks on the diagonal."""
+        return self._diagonal(self.part.right_jacobian, tangent)
+
+    def adjoint(self, point):
+        """Blocks on the diagonal."""
+        return self._diagonal(self.part.adjoint, point)
+
+    def neutral(self, like=None):
+        """N times the same."""
+        return self.part.neutral(like).repeat(self.count)
+
+    def normalise(self, point):
+        """Point by point."""
+        return self._each(self.part.normalise, point)
+
+    def near(self, points, weights=None):
+        """Point by point."""
+        apart = points.unflatten(-1, (self.count, -1)).movedim(-2, -3)
+        return self.part.near(apart, None if weights is None else weights.unsqueeze(-2)).flatten(-2)
+
+    def _each(self, function: Callable[..., Tensor], *values: Tensor) -> Tensor:
+        return function(*(value.unflatten(-1, (self.count, -1)) for value in values)).flatten(-2)
+
+    def _diagonal(self, function: Callable[[Tensor], Tensor], value: Tensor) -> Tensor:
+        blocks = function(value.unflatten(-1, (self.count, -1)))
+        return (_eye(value, self.count)[..., None, :, None] * blocks.unsqueeze(-2)).flatten(-2).flatten(-3, -2)
+
+
 class Place(NamedTuple):
     """A part of a product, and where it stands.
 

@@ -84,6 +84,10 @@ class Updates:
 
     def weighted(self, prefix, sensors, wired, weights):
         """The sensors' weights, and their noise after them."""
+        spaces = {name: sensor.reading_space for name, sensor in sensors.items() if sensor.reading_space is not None}
+        if spaces or (self.gaussian and self.space is not None):
+            on = f"{self.space}, a mean and a covariance" if not spaces else f"readings {spaces}"
+            raise ValueError(f"weights= compares plain numbers, and there are points, of {on}: leave weights= away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
         modules = {
             "weights": SensorWeights(

@@ -14,7 +14,7 @@ from torch_denkf._checks import check_count
 from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.fusion._updates import Updates
-from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint
+from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
 from torch_denkf.fusion.sensor import FusedSensor, wire
 from torch_denkf.modules import (
     EKFAnalysis,
@@ -127,8 +127,6 @@ class FusedFilter(Filter):
         age = -1 if kwargs.get("update_at_reset") else 0
         space = declared(initial).space
         size = (declared(initial).state_dim if space is None else space.point_dim) or 0
-        if gaussian and lag and space is not None:
-            raise ValueError(f"Late readings of a mean and a covariance are for plain numbers, not for {space}.")
         if lag and not size:
             raise ValueError(f"{type(initial).__name__} does not say its state_dim, which a delay needs.")
         prefix = "forecast"
@@ -141,7 +139,7 @@ class FusedFilter(Filter):
         else:
             modules["transition"] = transition
         made = _analysis_for(transition, gaussian) if analysis is None else analysis
-        build = Updates(gaussian, lag, size, made, space)
+        build = Updates(gaussian, lag, size, made, joint_space(space, lag) if gaussian else space)
         if weights is not None:
             modules.update(build.weighted(prefix, sensors, wired, weights))
         last = "fused" if gaussian and lag else "belief"
@@ -149,7 +147,7 @@ class FusedFilter(Filter):
         _refuse_inflation(updates, any(sensor.delay for sensor in sensors.values()), gaussian and lag > 0)
         modules.update(updates)
         if lag:
-            modules["smoothed"] = PresentOfJoint(size, last) if gaussian else LaggedBelief(space=space)
+            modules["smoothed"] = PresentOfJoint(lag + 1, last) if gaussian else LaggedBelief(space=space)
         super().__init__(modules, initial=initial, **kwargs)
         self.sensors, self.lag = tuple(sensors), lag
 

@@ -14,7 +14,8 @@ def joint_forecast(
     """Moves a joint Gaussian of L + 1 states on by one step; its oldest state is forgotten.
 
     The past enters the forecast through the last state alone: its covariance with an earlier state is G^T times that of
-    the last state with it, with the smoother's gain G (Särkkä 2013, section 8.2).
+    the last state with it, with the smoother's gain G (Särkkä 2013, section 8.2). Means may be points of a space;
+    covariances are then of their tangents.
 
     Args:
         mean: of the forecast, ``[*B, S]``, in the state's units.
@@ -36,8 +37,8 @@ def joint_forecast(
         tensor([[3., 1.],
                 [1., 1.]])
     """
-    size = mean.shape[-1]
-    past_mean, past_cov = joint_mean[..., :-size], joint_cov[..., :-size, :-size]
+    size = cov.shape[-1]
+    past_mean, past_cov = joint_mean[..., : -mean.shape[-1]], joint_cov[..., :-size, :-size]
     last = past_cov[..., :size, :size]
     start = None if unmoved is None else unmoved.unsqueeze(-1)
     cross = (cross if start is None else torch.where(start, last, cross)).mT

@@ -11,12 +11,13 @@ import torch
 from tensordict import NestedKey
 from torch import nn
 
+from torch_denkf.functional.manifolds import Repeated, Space
 from torch_denkf.fusion.joint_forecast import joint_forecast
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
 from torch_denkf.smoothers.past import Past
 
-__all__ = ["JOINT_PAST", "JointForecast", "PresentOfJoint"]
+__all__ = ["JOINT_PAST", "JointForecast", "PresentOfJoint", "joint_space"]
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
@@ -25,19 +26,29 @@ def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
     return [mean.repeat(*ones, count), cov.repeat(*ones, count, count)]
 
 
-def _present_and_oldest(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
-    mean, cov = entries[prefix, "joint_mean"], entries[prefix, "joint_cov"]
-    size = mean.shape[-1] // (lag + 1)
-    return *_part(mean, cov, slice(None, size)), *_part(mean, cov, slice(-size, None))
+def _present_and_oldest(
+    prefix: str, lag: int, entries: Entries, *, space: Space | None = None
+) -> tuple[torch.Tensor, ...]:
+    return _ends(entries[prefix, "joint_mean"], entries[prefix, "joint_cov"], lag + 1)
 
 
-def _part(mean: torch.Tensor, cov: torch.Tensor, part: slice) -> tuple[torch.Tensor, ...]:
-    """Mean, covariance and variance of one of the states in a joint one."""
-    return mean[..., part], cov[..., part, part], cov[..., part, part].diagonal(dim1=-2, dim2=-1)
+def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
+    """Mean, covariance and variance of the first and of the last of ``count`` states in a joint one."""
+    out: list[torch.Tensor] = []
+    points, tangents = mean.shape[-1] // count, cov.shape[-1] // count
+    for own, at in ((slice(points), slice(tangents)), (slice(-points, None), slice(-tangents, None))):
+        out += [mean[..., own], cov[..., at, at], cov[..., at, at].diagonal(dim1=-2, dim2=-1)]
+    return tuple(out)
+
+
+def joint_space(space: Space | None, lag: int) -> Space | None:
+    """That of the present and the last L states; ``None`` for plain numbers."""
+    return None if space is None else Repeated(space, lag + 1)
 
 
 _MOMENTS = ("mean", "cov", "var")
-#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the past states, the latest first.
+#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the past states, the latest first; on a space, points and
+#: the covariance of all their tangents.
 JOINT_PAST = Past(("joint_mean", "joint_cov"), _MOMENTS, _copies, _present_and_oldest, present=_MOMENTS)
 
 
@@ -63,18 +74,17 @@ class PresentOfJoint(SubModel):
     """The belief of the present state and of the state L steps ago, from the joint state after all readings.
 
     Args:
-        size: S.
+        count: L + 1.
         joint_key: prefix of ``mean`` ``[*B, (L + 1) S]`` and ``cov``.
     """
 
-    def __init__(self, size: int, joint_key: str = "joint"):
+    def __init__(self, count: int, joint_key: str = "joint"):
         out_keys: list[NestedKey] = [("belief", name) for name in ("mean", "cov", "var", "joint_mean", "joint_cov")]
         out_keys += [("smoothed", name) for name in (*_MOMENTS, "age")]
         super().__init__(nn.Identity(), [(joint_key, "mean"), (joint_key, "cov"), ("smoothed", "age")], out_keys)
-        self.size = size
+        self.count = count
 
     def compute(self, mean, cov, age):
         """The beliefs."""
-        size = self.size
-        present, oldest = (_part(mean, cov, part) for part in (slice(None, size), slice(-size, None)))
-        return *present, mean, cov, *oldest, (age + 1).clamp(max=mean.shape[-1] // size - 1)
+        ends = _ends(mean, cov, self.count)
+        return *ends[:3], mean, cov, *ends[3:], (age + 1).clamp(max=self.count - 1)

@@ -165,11 +165,14 @@ class SubModel(Checked, TensorDictModule):
     def reading_dims(self, entries: Entries, call: Call) -> Sequence[int]:
         """How many numbers each of ``reading_keys`` has, where it is missing and zeros behind a mask stand for it.
 
-        By default O: ``observation_dim``, or what :attr:`predicted_key` holds.
+        By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the noise is of tangents.
 
         Raises:
             KeyError: if that is not known.
         """
+        if self.reading_space is not None:
+            others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
+            return [self.reading_space.point_dim, *others]
         dim, predicted = self.observation_dim, entries.get(self.predicted_key)
         if predicted is not None:
             dim = predicted.shape[-1]

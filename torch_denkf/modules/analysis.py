@@ -127,7 +127,8 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     def noise_sizes(self, forecast, predicted, *_):
         """E and O, from the ensemble and its predicted observations."""
-        return {"members": forecast.shape[-2], "observation_dim": predicted.shape[-1]}
+        size = predicted.shape[-1] if self.reading_space is None else self.reading_space.tangent_dim
+        return {"members": forecast.shape[-2], "observation_dim": size}
 
     def compute(self, forecast, predicted, observation, variance, observed=None, *, noise):
         """The belief and the diagnostics."""

@@ -184,6 +184,7 @@ class GatedAnalysis(AnalysisAround):
         self.gate_prefix, self.info_prefix = gate_prefix, analysis.info_prefix
         self.reading_keys = [key for key in analysis.reading_keys if key in in_keys]
         self.observed_key, self.reads_components = analysis.observed_key, analysis.reads_components
+        self.reading_space = analysis.reading_space
         self.noise_variance_key = unravel_key(analysis.in_keys[3])
         self.observation_dim, self.parts_count = observation_dim, observation_dim if by_component else 1
         self.register_buffer("tables", IDENTITY.repeat(self.parts_count, 1, 1))

@@ -63,10 +63,11 @@ class StateOptions(TypedDict, total=False):
         angles: state dimensions that are angles in radians, counted in the whole state; their errors are wrapped to
             [-pi, pi).
         space: the space whose points the states are, such as ``Product(SO3(), Euclidean(3))``, in place of ``angles``.
-            Errors are then tangents ``[D]``, whose components ``dims`` and ``state_scale`` count; the belief's
-            covariance is one of tangents at its mean. A part of the space has a label where all of its numbers have.
-            Scores of members compare tangents at the members' mean, which makes them proper; a Gaussian's density is
-            that of the tangent from its mean to the truth, in the units of tangents.
+            Without both it is that of the filter's initial belief. Errors are then tangents ``[D]``, whose components
+            ``dims`` and ``state_scale`` count; the belief's covariance is one of tangents at its mean. A part of the
+            space has a label where all of its numbers have. Scores of members compare tangents at the members' mean,
+            which makes them proper; a Gaussian's density is that of the tangent from its mean to the truth, in the
+            units of tangents.
     """
 
     dims: Sequence[int] | None
@@ -178,8 +179,8 @@ class FilterLoss(Checked, LossModule):
             dimension with infinite scale does not count: means are taken over the others.
         observation_scale: ``[O]``, what errors of observations are divided by.
         angles: state dimensions that are angles in radians; their errors are wrapped to [-pi, pi).
-        space: whose points the states are, in place of ``angles``; ``dims`` and ``state_scale`` are then those of
-            tangents, see :class:`StateOptions`.
+        space: whose points the states are, in place of ``angles``; without both that of the filter's initial belief.
+            ``dims`` and ``state_scale`` are then those of tangents, see :class:`StateOptions`.
         observation_angles: dimensions of observations that are angles in radians.
         detach_every: truncated back-propagation: steps after which the belief is detached.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B]``, zero where an element does not count).
@@ -239,6 +240,8 @@ class FilterLoss(Checked, LossModule):
             if not len(dims):
                 raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
         check_space(space, angles)
+        if space is None and not len(angles):
+            space = filter.structure.space
         if space is not None and dims is not None and max(dims) >= space.tangent_dim:
             raise ValueError(
                 f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."

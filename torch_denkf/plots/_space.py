@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torch_denkf.functional.manifolds import Place, Space, places_of
+from torch_denkf.functional.manifolds import Place, Space, places_of, whole_parts
 from torch_denkf.plots._belief import Belief
 
-__all__ = ["angles_of", "in_components", "names_of"]
+__all__ = ["angles_of", "in_components", "in_tangents", "names_of"]
 
 
 def in_components(read: Belief, space: Space) -> Belief:
@@ -39,17 +39,38 @@ def in_components(read: Belief, space: Space) -> Belief:
     return read._replace(mean=mean, var=var, cov=None, ensemble=ensemble, truth=truth)
 
 
+def in_tangents(read: Belief, space: Space) -> Belief:
+    """The belief as tangents at its mean, ``[*, D]``: the mean is zero, and the truth is how far it lies from it.
+
+    Args:
+        read: points ``[*, P]``, variances of tangents.
+        space: whose points they are.
+
+    Returns:
+        A belief ``[*, D]``. Its truth has the parts that the given one has, with NaN where a part is not known.
+    """
+    mean, truth, ensemble = read.mean, read.truth, read.ensemble
+    if truth is not None:
+        given = torch.arange(space.point_dim) < truth.shape[-1]
+        whole = space.neutral(mean).expand(mean.shape).clone()
+        whole[..., given] = truth[..., : space.point_dim]
+        known = whole_parts(space, ~whole.isnan())[1]
+        truth = torch.where(known, space.minus(whole, mean), torch.nan)[..., : int(whole_parts(space, given)[1].sum())]
+    if ensemble is not None:
+        ensemble = space.minus(ensemble, mean.unsqueeze(-2))
+    return read._replace(mean=torch.zeros_like(space.minus(mean, mean)), truth=truth, ensemble=ensemble)
+
+
 def angles_of(space: Space) -> list[int]:
     """Which of the D numbers are angles."""
     return [index for place in places_of(space) for index in range(place.rotation.start, place.rotation.stop)]
 
 
-def names_of(space: Space) -> list[str]:
-    """A label for each of the D numbers, with degrees for angles."""
+def names_of(space: Space, turns: tuple[str, ...] = ("roll, deg", "pitch, deg", "yaw, deg")) -> list[str]:
+    """A label for each of the D numbers, with degrees for angles; ``turns`` are those of a rotation."""
     names = [f"state {index}" for index in range(space.tangent_dim)]
     for place in places_of(space):
-        turns = ("roll, deg", "pitch, deg", "yaw, deg") if _turns(place) == 3 else ("heading, deg",) * _turns(place)
-        names[place.rotation] = turns
+        names[place.rotation] = turns if _turns(place) == 3 else ("heading, deg",) * _turns(place)
     return names
 
 

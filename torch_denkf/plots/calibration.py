@@ -10,10 +10,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics import pit
 from torch_denkf.metrics.calibration import histogram_band, rank_histogram
 from torch_denkf.plots._axes import FILL, TRUTH, axes_for, label_below, labels_for, legend_above
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
+from torch_denkf.plots._space import in_tangents, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,6 +35,7 @@ def plot_calibration(
     every: int = 1,
     level: float = 0.99,
     angles: Sequence[int] = (),
+    space: Space | None = None,
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> list[Axes]:
@@ -55,6 +58,8 @@ def plot_calibration(
         every: use every n-th step of time. Errors of successive steps are alike, which moves bars out of the band.
         level: probability of the band, for all bars of an Axes together.
         angles: dimensions of the state that are angles in rad, whose errors are wrapped.
+        space: whose points the states are, in place of ``angles``. Components are then those of the tangent from the
+            mean to the truth: a rotation has three, about the body's axes.
         legend: whether to add one above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
@@ -76,8 +81,13 @@ def plot_calibration(
         >>> [round(float(bar.get_height()), 1) for bar in axes.containers[0]]
         [10.2, 10.2, 10.8, 9.7, 10.2, 10.2, 11.4, 9.2, 8.8, 9.3]
     """
-    read = read_belief(run, truth, belief=belief)
+    check_space(space, angles)
+    read = read_belief(run, truth, belief=belief, space=space)
+    if space is not None:
+        read = in_tangents(read, space)
     chosen = dims_of(read, dims)
+    if names is None and space is not None:
+        names = [names_of(space, ("about x", "about y", "about z"))[dim] for dim in chosen]
     if every < 1 or bins < 2:
         raise ValueError(f"every must be at least 1 and bins at least 2; got {every} and {bins}")
     ranks = kind == "rank" or (kind == "auto" and read.ensemble is not None)

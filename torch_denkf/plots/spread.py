@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import pi
 from typing import TYPE_CHECKING
 
 from tensordict import NestedKey, TensorDictBase
 
+from torch_denkf.functional.manifolds import Space, check_space
 from torch_denkf.metrics.calibration import spread_error
 from torch_denkf.plots._axes import BELIEF, MARKERS, OTHERS, TRUTH, axes_for, labels_for, legend_above, one_each
 from torch_denkf.plots._belief import Truth, dims_of, read_belief, turns_of, with_truth
+from torch_denkf.plots._space import angles_of, in_tangents, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +30,7 @@ def plot_spread_error(
     factors: Sequence[float] | None = None,
     bins: int = 8,
     angles: Sequence[int] = (),
+    space: Space | None = None,
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
@@ -44,6 +48,8 @@ def plot_spread_error(
         factors: what each is multiplied with, such as ``180 / pi`` for degrees.
         bins: points of a line, each for as many states.
         angles: dimensions of the state that are angles in rad, whose errors are wrapped.
+        space: whose points the states are, in place of ``angles``. Components are then those of the tangent from the
+            mean to the truth: a rotation has three, about the body's axes, in degrees.
         legend: whether to add one above the Axes.
         ax: to draw into; ``None`` makes a figure.
 
@@ -65,8 +71,13 @@ def plot_spread_error(
         >>> [line.get_label() for line in axes.get_lines()]
         ['x, m', 'spread = error']
     """
-    read = read_belief(run, truth, belief=belief)
-    chosen = dims_of(read, dims)
+    check_space(space, angles)
+    read = read_belief(run, truth, belief=belief, space=space)
+    if space is not None:
+        read = in_tangents(read, space)
+    chosen, turned = dims_of(read, dims), [] if space is None else angles_of(space)
+    if names is None and space is not None:
+        names = [names_of(space, ("about x, deg", "about y, deg", "about z, deg"))[dim] for dim in chosen]
     if read.var is None:
         raise ValueError('the spread is missing: the belief needs "var", "cov" or "ensemble"')
     turns = turns_of(read, chosen, angles)
@@ -79,7 +90,8 @@ def plot_spread_error(
         angles=turns,
     )
     (axes,) = axes_for(ax, 1, (6.4, 6.8))
-    labels, scales = labels_for(names, chosen), one_each("factors", factors, [1.0] * len(chosen))
+    usual = [180 / pi if dim in turned else 1.0 for dim in chosen]
+    labels, scales = labels_for(names, chosen), one_each("factors", factors, usual)
     highest = 0.0
     for column, (label, scale) in enumerate(zip(labels, scales, strict=True)):
         spread, error = scale * points.spread[column].numpy(), scale * points.error[column].numpy()

@@ -70,14 +70,10 @@ class FixedLag(Filter):
         place = names.index(filter.structure.transition[0])
         space = filter.structure.space
         if kind == "moments":
-            if space is not None:
-                raise TypeError(
-                    f"FixedLag of a mean and a covariance is for plain numbers, not for {space}: use RTSSmoother."
-                )
             forecast = filter.structure.forecast_of[prefix, "mean"][0]
             modules[names[place]] = CrossTransition(modules[names[place]], cross_key=(forecast, "cross"))
             past = MomentsPast(belief_prefix=prefix, forecast_prefix=forecast)
-            last = LaggedMoments(belief_prefix=prefix, forecast_prefix=forecast)
+            last = LaggedMoments(belief_prefix=prefix, forecast_prefix=forecast, space=space)
             initial = with_past(filter.initial, lag, MOMENTS_PAST, age=age, belief_prefix=prefix)
         else:
             initial = with_past(filter.initial, lag, ENSEMBLE_PAST, age=age, belief_prefix=prefix)

@@ -11,8 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from torch_denkf.filters import Filter
 from torch_denkf.filters.options import FilterOptions
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.modules import NoisyTransition, as_process_noise
-from torch_denkf.modules._running import check_module
+from torch_denkf.modules._running import check_module, declared
 from torch_denkf.smoothers.iterated_analysis import IteratedAnalysis, with_smoothed
 
 __all__ = ["IEnKS"]
@@ -37,6 +38,7 @@ class IEnKS(Filter):
         rotate: random mean-preserving rotation of them.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q, see
             :mod:`torch_denkf.modules.process_noise`. ``None``: the motion is exact.
+        reading_space: in which the reading lives; ``None`` for plain numbers. The initial belief has that of the state.
         observation_key: the reading; the sensor's by default.
         **kwargs: ``control_keys``, ``init_key``, ``forecast_keys``, ``variance_ceiling`` and ``check_finite`` of
             :class:`~torch_denkf.filters.Filter`.
@@ -79,6 +81,7 @@ class IEnKS(Filter):
         inflation: float = 1.0,
         rotate: bool = False,
         process_noise: TensorDictModuleBase | Sequence[float] | float | None = None,
+        reading_space: Space | None = None,
         observation_key: NestedKey | None = None,
         **kwargs: Unpack[FilterOptions],
     ):
@@ -89,8 +92,9 @@ class IEnKS(Filter):
         check_module("noise", noise)
         if sensor is not None:
             check_module("sensor", sensor)
+        space = declared(initial).space
         if process_noise is not None:
-            transition = NoisyTransition(transition, as_process_noise(process_noise, initial))
+            transition = NoisyTransition(transition, as_process_noise(process_noise, initial), space=space)
         reading = sensor.out_keys[0] if sensor is not None and observation_key is None else observation_key
         analysis = IteratedAnalysis(
             transition,
@@ -98,6 +102,8 @@ class IEnKS(Filter):
             iterations=iterations,
             inflation=inflation,
             rotate=rotate,
+            space=space,
+            reading_space=reading_space,
             observation_key=reading,
             noise_variance_key=noise.out_keys[0],
         )

@@ -11,15 +11,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torch_denkf._checks import check_count, check_number
-from torch_denkf.functional import analyse, ensemble_mean, ensemble_var
+from torch_denkf.functional import analyse
 from torch_denkf.functional.inflation import inflate, random_rotation
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing_iterated import iterated_smoothing
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._gaussian import further_keys
 from torch_denkf.modules._running import check_module, random_parts, run_module
+from torch_denkf.modules._spaces import checked_spaces, reading_about
 from torch_denkf.modules.carried import Beside
 from torch_denkf.modules.motion_noise import NoisyTransition
+from torch_denkf.smoothers.past import moments_of
 
 __all__ = ["IteratedAnalysis", "with_smoothed"]
 
@@ -65,6 +68,8 @@ class IteratedAnalysis(SubModel):
         iterations: of Gauss-Newton.
         inflation: factor on the anomalies of the smoothed members, where anything is observed.
         rotate: random mean-preserving rotation of them.
+        space: in which the state lives; ``None`` for plain numbers. Members are corrected as tangents at their mean.
+        reading_space: in which the reading lives; innovation and R are tangents.
         ensemble_key: members before the step, ``[*B, E, S]``.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or one reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
@@ -89,6 +94,8 @@ class IteratedAnalysis(SubModel):
         iterations: int = 10,
         inflation: float = 1.0,
         rotate: bool = False,
+        space: Space | None = None,
+        reading_space: Space | None = None,
         ensemble_key: NestedKey = ("belief", "ensemble"),
         observation_key: NestedKey = ("sensor", "ensemble"),
         noise_variance_key: NestedKey = ("sensor", "noise"),
@@ -114,6 +121,7 @@ class IteratedAnalysis(SubModel):
             optional_keys=[observed_key, *optional],
         )
         self.iterations, self.inflation, self.rotate = iterations, inflation, rotate
+        self.space, self.reading_space = checked_spaces(space, reading_space, ())
         self.info_prefix, self.observed_key = info_prefix, unravel_key(observed_key)
         self.noise_variance_key = unravel_key(noise_variance_key)
         self.reading_keys = self.in_keys[1:3]
@@ -140,13 +148,20 @@ class IteratedAnalysis(SubModel):
     def on_entries(self, entries, call):
         """The belief, the smoothed belief, and the diagnostics."""
         ensemble, reading, variance = (self.required(entries, key) for key in self.in_keys[:3])
-        reading = reading.mean(-2) if reading.ndim == ensemble.ndim else reading
-        observed, dim = entries.get(self.observed_key), ensemble.shape[-1]
-        noise = self._motion_noise(entries, ensemble, call)
-        whole = torch.cat([ensemble, *noise.values()], -1)
+        space, on = self.space, self.reading_space
+        if reading.ndim == ensemble.ndim:
+            reading = reading.mean(-2) if on is None else on.mean(reading)
+        center = ensemble[..., :1, :] if space is None else space.mean(ensemble).unsqueeze(-2)
+        start = ensemble if space is None else space.minus(ensemble, center)
+        observed, dim = entries.get(self.observed_key), start.shape[-1]
+        noise = self._motion_noise(entries, start, call)
+        whole = torch.cat([start, *noise.values()], -1)
+
+        def states(members: torch.Tensor) -> torch.Tensor:
+            return members[..., :dim] if space is None else space.plus(center, members[..., :dim])
 
         def forecast(members: torch.Tensor) -> Entries:
-            work, begin = {**entries, unravel_key(self.in_keys[0]): members[..., :dim]}, dim
+            work, begin = {**entries, unravel_key(self.in_keys[0]): states(members)}, dim
             for key, value in noise.items():
                 work[key] = members[..., begin : begin + value.shape[-1]]
                 begin += value.shape[-1]
@@ -156,19 +171,24 @@ class IteratedAnalysis(SubModel):
         def predict(members: torch.Tensor) -> torch.Tensor:
             observation = self.module["observation"]
             written = run_module(observation, forecast(members), call._replace(sample=False))
-            return written[unravel_key(observation.out_keys[0])]
+            predicted = written[unravel_key(observation.out_keys[0])]
+            if on is None:
+                return predicted
+            about, read = reading_about(on, predicted, reading, observed)
+            return about - read.unsqueeze(-2)  # as seen from the reading: each iteration has tangents of its own
 
+        due = reading if on is None else torch.zeros_like(variance)
         smoothed, predicted = iterated_smoothing(
-            whole, predict, reading, variance, observed=observed, iterations=self.iterations
+            whole, predict, due, variance, observed=observed, iterations=self.iterations
         )
-        diagnostics = analyse(predicted, predicted, reading, variance, scheme="sakov", observed=observed)[1:]
+        diagnostics = analyse(predicted, predicted, due, variance, scheme="sakov", observed=observed)[1:]
         smoothed = self._after(smoothed, observed, self._noise(entries, [ensemble], call))
         moved = forecast(smoothed)[unravel_key(self.module["transition"].out_keys[0])]
-        before = smoothed[..., :dim]
+        before = states(smoothed)
         age = torch.ones(*call.batch_size, 1, dtype=torch.int64, device=ensemble.device)
         out = (
-            *(moved, ensemble_mean(moved), ensemble_var(moved)),
-            *(before, ensemble_mean(before), ensemble_var(before), age),
+            *(moved, *moments_of(moved, None, space)),
+            *(before, *moments_of(before, None, space), age),
             *diagnostics,
         )
         return dict(zip(self.out_keys, out, strict=True))

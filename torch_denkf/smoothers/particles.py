@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_denkf.filters import Filter
 from torch_denkf.filters.structure import previous_key
 from torch_denkf.functional.linalg import cholesky
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing_particles import backward_smooth
 from torch_denkf.functional.weighted import weighted_mean
 from torch_denkf.modules import NoisyTransition
@@ -33,6 +34,9 @@ class ParticleSmoother(Smoother):
     deterministic. Each step costs E² densities. For other motions :class:`FixedLag` follows the ancestors of the
     particles, which a long lag leaves few of. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, the filter's
     particles, their ``log_weight`` ``[*B, T, E]``, ``mean`` and ``var``, see :class:`Smoother`.
+
+    On a space the density is a Gaussian's of the tangent from where the motion leads to the later particle. That is
+    right where the noise of a step is small against a turn.
 
     Args:
         filter: a particle filter.
@@ -75,8 +79,6 @@ class ParticleSmoother(Smoother):
                 "ParticleSmoother needs the density of the motion: a NoisyTransition with noise in all dimensions, "
                 "after the motion (process_noise= of ParticleFilter). FixedLag smooths particles of any motion."
             )
-        if filter.structure.space is not None:
-            raise TypeError(f"ParticleSmoother is for plain numbers, not for {filter.structure.space}; FixedLag is.")
         keys = [(prefix, "ensemble"), (prefix, "log_weight")]
         super().__init__(filter, lag, keys, ("ensemble", "log_weight", "mean", "var"))
 
@@ -84,11 +86,12 @@ class ParticleSmoother(Smoother):
         particles, log_weights = (entries[key] for key in self._needed)
         densities = self._densities(entries, particles, log_weights)
         smoothed = backward_smooth(log_weights, densities, follows=follows, lag=self.lag)
-        return particles, smoothed, *moments_of(particles, smoothed)
+        return particles, smoothed, *moments_of(particles, smoothed, self.filter.structure.space)
 
     def _densities(self, entries: Entries, particles: Tensor, log_weights: Tensor) -> Tensor:
         """Log-density of each particle at t, in the columns, given each at t − 1, in the rows, ``[*B, T, E, E]``."""
         motion, structure = self.filter.transition_module.module, self.filter.structure
+        space = structure.space
         key, out_key = unravel_key(motion.in_keys[0]), unravel_key(motion.out_keys[0])
         time, count = particles.ndim - 3, particles.shape[-3]
 
@@ -97,6 +100,9 @@ class ParticleSmoother(Smoother):
 
         def after(value: Tensor) -> Tensor:
             return value.narrow(time, 1, count - 1)
+
+        def mean(members: Tensor) -> Tensor:
+            return weighted_mean(members, weights) if space is None else space.mean(members, weights.exp())
 
         # A step reads the belief before it, the action that led out of there, and what else there is at its own time.
         work = {name: after(value) for name, value in entries.items() if value.ndim > time}
@@ -107,22 +113,24 @@ class ParticleSmoother(Smoother):
             if previous_key(control) in entries:
                 work[control] = after(entries[previous_key(control)])
         old, weights = before(particles), before(log_weights)
-        work.update({key: old, motion.mean_key: weighted_mean(old, weights)})
+        work.update({key: old, motion.mean_key: mean(old)})
         call = Call(old.shape[:-2], sample=False)
         moved = run_module(motion.module["transition"], work, call)[out_key]
-        work[motion.forecast_mean_key] = weighted_mean(moved, weights)
+        work[motion.forecast_mean_key] = mean(moved)
         noise = run_module(motion.module["noise"], work, call)[unravel_key(motion.module["noise"].out_keys[0])]
-        log_density = log_density_of_pairs(after(particles), moved, as_covariance(noise, work[motion.mean_key]))
+        cov = as_covariance(noise, work[motion.mean_key])
+        log_density = log_density_of_pairs(after(particles), moved, cov, space)
         return torch.cat([torch.zeros_like(log_density.narrow(time, 0, 1)), log_density], time)
 
 
-def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor) -> Tensor:
+def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor, space: Space | None = None) -> Tensor:
     """Log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
 
     Args:
         values: ``[*B, E, S]``.
         means: ``[*B, E, S]``.
         cov: one for all pairs, ``[*B, S, S]``.
+        space: whose points values and means are; the density is of the tangents between them.
 
     Returns:
         The log-densities, ``[*B, E, E]``; NaN where ``cov`` is not positive definite.
@@ -132,7 +140,12 @@ def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor) -> Tensor:
         tensor([[-1.8379]])
     """
     factor = cholesky(cov)
-    white = [torch.linalg.solve_triangular(factor, value.mT, upper=False).mT for value in (values, means)]
-    square = (white[0].unsqueeze(-3) - white[1].unsqueeze(-2)).square().sum(-1)
+    if space is None:
+        white = [torch.linalg.solve_triangular(factor, value.mT, upper=False).mT for value in (values, means)]
+        away = white[0].unsqueeze(-3) - white[1].unsqueeze(-2)
+    else:
+        away = space.minus(values.unsqueeze(-3), means.unsqueeze(-2))
+        away = torch.linalg.solve_triangular(factor.unsqueeze(-3), away.mT, upper=False).mT
+    square = away.square().sum(-1)
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None, None]
-    return -0.5 * (square + log_det + values.shape[-1] * math.log(2 * math.pi))
+    return -0.5 * (square + log_det + cov.shape[-1] * math.log(2 * math.pi))

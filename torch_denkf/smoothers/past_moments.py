@@ -4,6 +4,8 @@ Of a state :math:`x_{t-j}` three things are carried: its smoothed mean, the prod
 steps since, and the covariance V that :math:`x_{t-j}` would keep if :math:`x_t` were known. With the belief of t,
 P, the covariance is :math:`V + D P D^T`, and a reading that moves the mean of t by d moves that of t - j by D d. It is
 the Rauch-Tung-Striebel smoother, forward in time, and does not ask how the reading was used.
+
+Of points of a space, V and D are of the tangents at the means: each time a mean moves, they are carried to the new one.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import nn
 
+from torch_denkf.functional.manifolds import Space
 from torch_denkf.functional.smoothing import smoothing_gain
 from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._call import Entries
@@ -70,11 +73,11 @@ class CrossTransition(InPlaceOf):
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
     """The state itself, of which nothing is left open."""
     mean, cov = belief[prefix, "mean"], belief[prefix, "cov"]
-    gain = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
+    gain = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
     return [torch.stack([value] * lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
 
 
-def _oldest_carried(prefix: str, lag: int, entries: Entries) -> tuple[torch.Tensor, ...]:
+def _oldest_carried(prefix: str, lag: int, entries: Entries, *, space: Space | None = None) -> tuple[torch.Tensor, ...]:
     return _oldest(*(entries[prefix, name] for name in ("cov", *MOMENTS_PAST.carried)))
 
 
@@ -122,7 +125,7 @@ class MomentsPast(SubModel):
         check_age(age, mean.shape[:-1])
         # At the start of an episode, before its own frame, no step has been made.
         start = (age < 0).unsqueeze(-1)
-        identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+        identity = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device)
         gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, forecast_cov)))
         left_open = torch.where(start, 0, cov - gain @ torch.where(start, 0, cross.mT))
         means = torch.cat([mean.unsqueeze(-2), past_mean[..., :-1, :]], -2)
@@ -141,6 +144,7 @@ class LaggedMoments(SubModel):
         smoothed_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]``, ``var`` ``[*B, S]`` and ``age``
             ``[*B, 1]``, see :class:`LaggedBelief`.
         past_key: prefix of what :class:`MomentsPast` writes.
+        space: in which the state lives; ``None`` for plain numbers.
     """
 
     def __init__(
@@ -150,16 +154,24 @@ class LaggedMoments(SubModel):
         forecast_prefix: str = "forecast",
         smoothed_prefix: str = "smoothed",
         past_key: str = "past",
+        space: Space | None = None,
     ):
         in_keys = [(belief_prefix, "mean"), (belief_prefix, "cov"), (forecast_prefix, "mean")]
         in_keys += [*((past_key, name) for name in ("mean", "cov", "gain")), (smoothed_prefix, "age")]
         out_keys = [(belief_prefix, name) for name in MOMENTS_PAST.carried]
         out_keys += [(smoothed_prefix, name) for name in (*MOMENTS_PAST.follow, "age")]
         super().__init__(nn.Identity(), in_keys, out_keys)
+        self.space = space
 
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
         """The past, and the belief of its oldest state."""
-        shift = (past_gain @ (mean - forecast)[..., None, :, None]).squeeze(-1)
-        past_mean = past_mean + shift
+        learned = mean - forecast if self.space is None else self.space.minus(mean, forecast)
+        shift = (past_gain @ learned[..., None, :, None]).squeeze(-1)
+        if self.space is None:
+            past_mean = past_mean + shift
+        else:
+            past_mean, turn = self.space.plus(past_mean, shift), self.space.right_jacobian(shift)
+            past_cov = turn @ past_cov @ turn.mT
+            past_gain = turn @ past_gain @ torch.linalg.inv(self.space.right_jacobian(learned)).unsqueeze(-3)
         age = (age + 1).clamp(max=past_mean.shape[-2])
         return past_mean, past_cov, past_gain, *_oldest(cov, past_mean, past_cov, past_gain), age

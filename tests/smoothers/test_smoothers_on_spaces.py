@@ -1,0 +1,232 @@
+"""Smoothers of orientations: against plain numbers, a Kalman filter of small angles, and each other."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from tests.filters.beliefs_for_tests import close
+from tests.filters.factories import stepwise
+from tests.filters.test_spaces import DT, SPACE, STD, B, Orientation, Q, R, T, Turning, log, make, turned
+from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differences, linear, noise, readings, rotating
+from torch_denkf.filters import EKF, UKF, ParticleFilter
+from torch_denkf.functional.gaussian import gaussian_log_prob
+from torch_denkf.functional.manifolds import SO3, Euclidean
+from torch_denkf.modules import AroundState, ConstantNoise, GaussianAround, LearnedTransition, Select, SubModel
+from torch_denkf.smoothers import FixedLag, IEnKS, ParticleSmoother, RTSSmoother
+from torch_denkf.smoothers.particles import log_density_of_pairs
+
+GAUSSIAN = {"EKF": EKF, "UKF": UKF}
+SMOOTHED = [("smoothed", "mean"), ("smoothed", "var")]
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+def numbers():
+    """Data, and a motion, sensor, observation and noise of plain numbers, which bend."""
+    torch.manual_seed(0)
+    data = TensorDict({"pose": torch.randn(B, T, 2), "start": torch.randn(B, T, 2)}, [B, T])
+    move = nn.Linear(2, 2, bias=False)
+    move.weight.data = torch.tensor([[1.0, 0.4], [-0.3, 0.9]])
+    motion = LearnedTransition(nn.Sequential(move, nn.Tanh()), residual=False)
+    return data, (motion, None, Select([0, 1])), ConstantNoise([0.3, 0.4], in_key="pose")
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF"])
+def test_numbers_as_a_space_change_nothing(kind):
+    data, parts, own = numbers()
+    outs = []
+    for space in (None, Euclidean(2)):
+        start = GaussianAround([0.5, 0.6], state_key="start", space=space)
+        options = {"process_noise": [0.1, 0.2], "observation_key": "pose", "reading_space": space}
+        outs.append(FixedLag(GAUSSIAN[kind](*parts, own, initial=start, **options), 3).sequence(data.clone()))
+    close(*outs, [*SMOOTHED, ("smoothed", "cov"), ("smoothed", "age"), ("belief", "cov")], atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF"])
+def test_small_angles_are_plain_numbers(kind):
+    data, flat = readings()
+    options, filter = {"process_noise": PROCESS, "observation_key": "pose"}, GAUSSIAN[kind]
+    start, plain = (GaussianAround(STARTS, state_key="start", space=space) for space in (SPACE, None))
+    on_space = filter(*rotating(), noise(), initial=start, reading_space=SO3(), **options)
+    out = FixedLag(on_space, 4).sequence(data.clone())
+    expected = FixedLag(filter(*linear(), noise(), initial=plain, **options), 4).sequence(flat)
+    assert_small_differences(out, expected, "smoothed", data["start"])
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF"])
+def test_online_lag_is_the_smoother(kind):
+    """With one step it is the same formula; with more, means move in several steps, which products of angles tell."""
+    filter, data = make(kind), log()
+    for lag, away, var in ((1, 1e-12, 1e-12), (5, 1e-3, 5e-3)):
+        whole, online = RTSSmoother(filter, lag)(data.clone()), FixedLag(filter, lag).sequence(data.clone())
+        later, own = online["smoothed"][:, lag:], whole["smoothed"][:, :-lag]
+        std = own["var"].sqrt()
+        assert (SPACE.minus(later["mean"], own["mean"]).abs() / std).max() < away
+        assert (later["var"] / own["var"] - 1).abs().max() < var
+        assert (online["smoothed", "age"][:, lag:] == lag).all()
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF"])
+def test_steps_and_compiled_steps_are_the_sequence(kind):
+    filter, data = FixedLag(make(kind), 3), log()
+    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
+    out = filter.sequence(data.clone())
+    close(stepwise(filter, data.clone()), out, filter.belief_keys, atol=1e-10)
+    filter.compile(chunk=2, backend="aot_eager")
+    close(filter.sequence(data.clone()), out, [*filter.belief_keys, *SMOOTHED], atol=1e-10)
+
+
+class GyroTurn(SubModel):
+    """Turns by what a gyro reads."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
+
+    def compute(self, state, gyro):
+        return SO3().plus(state, DT * gyro.unsqueeze(-2))
+
+
+def particles(parts, own, std, q, size, space=None, reading_space=None, **options):
+    start = AroundState(std, ensemble_size=size, state_key="start", space=space)
+    known = {"process_noise": q, "observation_key": "pose", "reading_space": reading_space}
+    return ParticleFilter(*parts, noise=own, initial=start, **known, **options)
+
+
+def test_particles_of_numbers_as_a_space_are_plain_ones():
+    data, parts, own = numbers()
+    outs = []
+    for space in (None, Euclidean(2)):
+        filter = particles(parts, own, [0.5, 0.6], [0.1, 0.2], 40, space=space, reading_space=space)
+        data = data if outs else filter.draw_noise(data)
+        outs.append(ParticleSmoother(filter, 3)(data.clone()))
+    close(*outs, [*SMOOTHED, ("smoothed", "log_weight"), ("smoothed", "ensemble")], atol=1e-10)
+
+
+def test_particles_of_small_angles_are_plain_ones():
+    """With the same noise, and none drawn again: weights multiply small differences up over all readings."""
+    data, flat = readings(0.1)
+    plain = particles(linear(), noise(), STARTS, PROCESS, 30, resampling=None)
+    flat = plain.draw_noise(flat)
+    data["noise"] = flat["noise"]
+    options = {"space": SPACE, "reading_space": SO3(), "resampling": None}
+    out = ParticleSmoother(particles(rotating(), noise(), STARTS, PROCESS, 30, **options))(data.clone())
+    assert_small_differences(out, ParticleSmoother(plain)(flat), "smoothed", data["start"], var=0.05)
+
+
+def test_particles_are_the_smoother_of_moments():
+    """Within 3.5 standard errors of as many draws as the fewest particles that ever counted; of orientations alone."""
+    data, size, std, q = log(steps=6, hidden=False), 600, [0.2] * 3, [0.1] * 3
+    data["start"], turn = data["state"][:, :1, :4].expand(B, 6, 4).contiguous(), GyroTurn()
+    known = {"process_noise": q, "observation_key": "pose", "reading_space": SO3()}
+    start, own = GaussianAround(std, state_key="start", space=SO3()), ConstantNoise([0.1] * 3, in_key="pose")
+    expected = RTSSmoother(EKF(turn, None, Orientation(), own, initial=start, **known))(data.clone())
+    torch.manual_seed(1)
+    with torch.no_grad():
+        filter = particles((turn, None, Orientation()), own, std, q, size, space=SO3(), reading_space=SO3())
+        out = ParticleSmoother(filter)(data.clone())
+    ess = out["info", "ess"]
+    fewest, std = torch.where(ess > 0, ess, size).amin(1, keepdim=True), expected["smoothed", "var"].sqrt()
+    away, before = (SO3().minus(out[key, "mean"], expected["smoothed", "mean"]) / std for key in ("smoothed", "belief"))
+    assert (away.abs() < 3.5 / fewest.sqrt()).all()
+    assert ((out["smoothed", "var"] / std.square() - 1).abs() < 3.5 * (2 / fewest).sqrt()).all()
+    assert away.square().mean().sqrt() < 0.15 < 0.3 < before.square().mean().sqrt()
+
+
+def test_densities_of_pairs_are_those_of_their_tangents():
+    values, means = (SPACE.exp(torch.randn(B, 4, 6)) for _ in range(2))
+    root = torch.randn(B, 6, 6)
+    cov = root @ root.mT + torch.eye(6)
+    found = log_density_of_pairs(values, means, cov, SPACE)
+    for i in range(4):
+        for j in range(4):
+            away = SPACE.minus(values[:, j], means[:, i])
+            due = gaussian_log_prob(away, torch.zeros_like(away), cov)
+            torch.testing.assert_close(found[:, i, j], due.reshape(found[:, i, j].shape))
+
+
+def iterated(parts, own, std, q, space=None, reading_space=None, size=8, key="pose", **options):
+    start = AroundState(std, ensemble_size=size, state_key="start", space=space)
+    known = {"initial": start, "observation_key": key, "reading_space": reading_space}
+    return IEnKS(*parts, own, process_noise=q, **known, **options)
+
+
+def test_the_iterated_smoother_of_numbers_as_a_space_is_the_plain_one():
+    data, parts, own = numbers()
+    outs = []
+    for space in (None, Euclidean(2)):
+        filter = iterated(parts, own, [0.5, 0.6], [0.1, 0.2], space, space, inflation=1.1, rotate=True)
+        data = data if outs else filter.draw_noise(data)
+        outs.append(filter.sequence(data.clone()))
+    infos = [("info", name) for name in ("nis", "log_likelihood", "innovation")]
+    close(*outs, [*SMOOTHED, ("smoothed", "ensemble"), ("belief", "ensemble"), ("belief", "var"), *infos], atol=1e-9)
+
+
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_the_iterated_smoother_of_small_angles_is_the_plain_one(iterations):
+    data, flat = readings()
+    plain = iterated(linear(), noise(), STARTS, PROCESS, iterations=iterations)
+    flat = plain.draw_noise(flat)
+    data["noise"] = flat["noise"]
+    on_space = iterated(rotating(), noise(), STARTS, PROCESS, SPACE, SO3(), iterations=iterations)
+    out, expected = on_space.sequence(data.clone()), plain.sequence(flat)
+    for key in ("belief", "smoothed"):
+        assert_small_differences(out, expected, key, data["start"])
+
+
+def orientations_iterated(size=8, **options):
+    parts, own = (Turning(), None, Orientation()), ConstantNoise(R, in_key="pose")
+    return iterated(parts, own, STD, Q, SPACE, SO3(), size, **options)
+
+
+def test_the_iterated_smoother_of_many_members_is_that_of_moments():
+    """An extended Kalman filter is as good as exact here. The bound is ten standard errors of so many members."""
+    data, size = log(), 400
+    expected = FixedLag(make("EKF"), 1).sequence(data.clone())
+    torch.manual_seed(0)
+    with torch.no_grad():
+        out = orientations_iterated(size, iterations=3).sequence(data.clone())
+    for key in ("belief", "smoothed"):
+        std = expected[key, "var"].sqrt()
+        assert (SPACE.minus(out[key, "mean"], expected[key, "mean"]).abs() < 10 * std / size**0.5).all()
+        assert ((out[key, "var"] / std.square() - 1).abs() < 5 * (2 / size) ** 0.5).all()
+
+
+@pytest.mark.parametrize("turn", [[2.0, -1.0, 0.5], [torch.pi, 0.0, 0.0]])
+def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
+    filter, turn = orientations_iterated(inflation=1.1, rotate=True), SO3().exp(torch.tensor(turn))
+    data = filter.draw_noise(log())
+    other = data.clone()
+    for key in ("start", "pose"):
+        other[key] = turned(turn, data[key])
+    here, there = filter.sequence(data), filter.sequence(other)
+    for key in ("belief", "smoothed"):
+        assert SPACE.minus(there[key, "mean"], turned(turn, here[key, "mean"])).abs().max() < 1e-8
+        close(there[key], here[key], ["var"], atol=1e-8)
+    close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)
+
+
+def test_iterated_steps_are_the_sequence_and_gradients_are_finite():
+    filter, data = orientations_iterated(), log()
+    data["is_init"] = (torch.arange(T) % 8 == 0).reshape(1, T, 1).expand(B, T, 1).clone()
+    data = filter.draw_noise(data)
+    data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
+    data["start"].requires_grad_()
+    out = filter.sequence(data.clone())
+    close(stepwise(filter, data.clone().detach()), out.detach(), filter.belief_keys, atol=1e-9)
+    (out["smoothed", "var"].sum() + SPACE.minus(out["belief", "mean"], data["state"]).square().sum()).backward()
+    assert data["start"].grad.isfinite().all()
+
+
+def test_the_iterated_smoother_takes_the_mean_of_samples_that_are_points():
+    data, parts, options = log(hidden=False), (Turning(), None, Orientation()), (STD, Q, SPACE, SO3())
+    filter = iterated(parts, ConstantNoise(R, in_key="pose"), *options)
+    data = filter.draw_noise(data)
+    expected = filter.sequence(data.clone())
+    away, sampled = 0.1 * torch.randn(B, T, 1, 3), ("poses", "ensemble")
+    data[sampled] = SO3().plus(data["pose"].unsqueeze(-2), torch.cat([away, -away] * 4, -2))
+    out = iterated(parts, ConstantNoise(R, in_key=sampled), *options, key=sampled).sequence(data)
+    close(out, expected, [("belief", "ensemble"), *SMOOTHED], atol=1e-9)
