@@ -1,0 +1,36 @@
+"""All numbers of the study that were chosen, each by drive 0022 alone, which has no poses.
+
+``python -m benchmarks.sequence07.calibration`` finds them again.
+"""
+
+#: What the lens's rectification has left, and what disparities are short of in pixels: by the likelihood of corners.
+CAMERA = {"radial": (0.025, -0.02), "disparity_offset": 0.25}
+
+#: Of corners, by the same likelihood: fields of CornerNoise.
+CORNERS = {
+    "pixel": 0.056,
+    "pixel_per_flow": 0.0039,
+    "disparity": 0.0467,
+    "disparity_per_flow": 0.0026,
+    "stereo": 0.45,
+    "stereo_per_offset": 0.7464,
+    "freedom": 1.4,
+}
+
+#: Of the filters, by the likelihood of their readings: what a row adds to the twist, in rad/s and m/s; which share of
+#: it is kept; what is added to the corners' covariance, times a factor, in rad and m; the gyro's noise in rad/s.
+FILTER = {
+    "pitch": 0.01,
+    "yaw": 0.01,
+    "roll": 0.01,
+    "side": 0.03,
+    "down": 0.03,
+    "ahead": 0.1,
+    "kept_tilt": 0.5,
+    "kept_yaw": 1.0,
+    "kept_side": 0.9,
+    "scale": 2.0,
+    "floor_turn": 0.0001,
+    "floor_move": 0.002,
+    "gyro": 0.05,
+}

@@ -1,0 +1,169 @@
+"""The filters: a car's pose, its twist and a gyro's bias, by motions that corners show and by turn rates."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from benchmarks.sequence07.chosen import FILTER
+from torch_denkf import Filter, FusedFilter, FusedSensor
+from torch_denkf.functional.manifolds import SE3, Euclidean, Product
+from torch_denkf.modules import (
+    AroundState,
+    EnsembleAnalysis,
+    GaussianAround,
+    MappedNoise,
+    NoisyTransition,
+    SubModel,
+    UKFTransition,
+)
+from torch_denkf.monitoring import Gated
+from torch_denkf.motions.motion import Motion
+
+__all__ = ["DT", "SPACE", "car_filter", "prepared"]
+
+Kind = Literal["EKF", "UKF", "DEnKF"]
+DT = 0.1037  # s, of a typical row; the length of each is read
+SPACE = Product(SE3(), Euclidean(6), Euclidean(3))  # pose; twist in rad/s and m/s; the gyro's bias in rad/s
+POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(13, 16)
+#: Standard deviations where a filter starts: pose, twist (from standing still), bias.
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.01] * 3
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.1] * 3 + [0.003] * 3  # ... from a belief
+
+
+class CarMotion(Motion):
+    """The twist keeps a share of itself from row to row, and moves the pose over the row: a twist is a row's mean."""
+
+    def __init__(self):
+        super().__init__(SPACE, "dt", {"kept": 6}, ("belief", "ensemble"), ("forecast", "ensemble"))
+
+    def move(self, state, kept, *, dt):
+        """The pose moved by the twist that is kept."""
+        pose, twist, bias = self.space.points(state)
+        twist = kept * twist
+        return torch.cat([SE3().plus(pose, twist * dt), twist, bias], -1)
+
+
+class LastMotion(SubModel):
+    """The motion since the row before, ``[*B, E, 7]``: a point of SE3."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
+
+    def compute(self, ensemble, dt):
+        """Where the twist leads in the time of a row."""
+        return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+
+
+class WhitenedMotion(SubModel):
+    """How far a member's motion is from the reading, ``[*B, E, 6]``, in standard deviations that are independent.
+
+    An ensemble's update takes variances and no covariance. The reading of this model is zero, with variances of one.
+    """
+
+    def __init__(self):
+        keys = [("forecast", "ensemble"), "dt", "motion", "motion_noise"]
+        super().__init__(nn.Identity(), keys, [("forecast", "observation")])
+
+    def compute(self, ensemble, dt, motion, cov):
+        """The tangent between both motions, by the root of its covariance."""
+        moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+        away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
+        return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
+
+
+class TurnRate(SubModel):
+    """What the gyro reads, ``[*B, E, 3]`` in rad/s."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+
+    def compute(self, ensemble):
+        """The twist's turn and the bias."""
+        return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
+
+
+class Given(SubModel):
+    """Hands an entry on, under another key."""
+
+    def __init__(self, in_key, out_key, size: int):
+        super().__init__(nn.Identity(), [in_key], [out_key])
+        self.observation_dim = size
+
+    def compute(self, value):
+        """The same."""
+        return value
+
+
+def process_noise() -> MappedNoise:
+    """What a row adds: noise of the twist, which moves the pose within the row, and of the bias."""
+    through = torch.zeros(15, 9, dtype=torch.float64)
+    through[:6, :6], through[6:, :] = DT * torch.eye(6), torch.eye(9)
+    return MappedNoise(Given("process", ("forecast", "noise"), 9), through)
+
+
+def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
+    """Readings with the noises that a filter is to believe.
+
+    Args:
+        readings: ``[*B, T]``.
+        values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
+        start: state of the first row, ``[*B, 16]``; by default at the origin, standing still.
+    """
+    values = FILTER if values is None else values
+    data = readings.clone()
+
+    def several(*names: str) -> Tensor:
+        numbers = torch.stack([torch.as_tensor(values[name], dtype=torch.float64) for name in names], -1)
+        return (numbers.unsqueeze(-2) if numbers.ndim > 1 else numbers).expand(*data.shape, len(names))
+
+    walks = several("pitch", "yaw", "roll", "side", "down", "ahead")
+    bias = torch.full_like(walks[..., :3], 1e-5)
+    data["process"] = torch.cat([walks, bias], -1).square()
+    share = several("kept_tilt", "kept_yaw", "kept_tilt", "kept_side", "kept_side")
+    data["kept"] = torch.cat([share, torch.ones_like(share[..., :1])], -1)
+    floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
+    scale = several("scale").square().unsqueeze(-1)
+    data["motion_noise"] = scale * data["motion_cov"] + torch.diag_embed(floor)
+    data["whitened"] = torch.zeros_like(data["motion"][..., :6])
+    data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
+    origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
+    data["start"] = origin.expand(*data.shape, 16).contiguous()
+    return data
+
+
+def car_filter(
+    kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, **analysis
+) -> Filter:
+    """A filter of all three parts of the state.
+
+    Args:
+        kind: of filter.
+        members: of the ensemble.
+        gate: options of :class:`~torch_denkf.monitoring.Gated` around the corners' update; ``None`` for none.
+        again: whether the start is a belief of a filter that has run before.
+        **analysis: options of the ensemble's analyses.
+    """
+    seen = {"observed_key": "motion_observed"}
+    sensors = {
+        "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
+        "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
+    }
+    std = RESTART if again else START
+    motion, noise = CarMotion(), process_noise()
+    if kind == "DEnKF":
+        initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)
+        sensors["motion"] = FusedSensor(WhitenedMotion(), [1.0] * 6, observation_key="whitened", **seen)
+        made = partial(EnsembleAnalysis, "etkf", **analysis)
+        filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
+    else:
+        initial = GaussianAround(std, state_key="start", space=SPACE)
+        if kind == "UKF":
+            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
+        else:
+            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
+    return filter if gate is None else Gated(filter, **gate)
