@@ -4,18 +4,23 @@
 """
 
 #: What the lens's rectification has left, and what disparities are short of in pixels: by the likelihood of corners.
-CAMERA = {"radial": (0.025, -0.02), "disparity_offset": 0.25}
+CAMERA = {
+    "radial": (0.0041, 0.0264, -0.0107),
+    "disparity_offset": (0.371, 0.375, 0.190, 0.644, -1.984, -3.642, 2.791),
+}
 
 #: Of corners, by the same likelihood: fields of CornerNoise.
 CORNERS = {
-    "pixel": 0.056,
+    "pixel": 0.0543,
     "pixel_per_flow": 0.0039,
-    "disparity": 0.0467,
-    "disparity_per_flow": 0.0026,
-    "stereo": 0.45,
-    "stereo_per_offset": 0.7464,
-    "freedom": 1.4,
+    "disparity": 0.0462,
+    "disparity_per_flow": 0.0024,
+    "stereo": 0.324,
+    "stereo_per_offset": 0.5826,
+    "stereo_per_disparity": 0.017,
+    "freedom": 1.36,
 }
+
 
 #: Of the filters, by the likelihood of their readings: what a row adds to the twist, in rad/s and m/s; which share of
 #: it is kept; what is added to the corners' covariance, times a factor, in rad and m; the gyro's noise in rad/s.

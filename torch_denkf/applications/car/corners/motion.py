@@ -28,6 +28,7 @@ class CornerNoise:
         disparity_per_flow: what a pixel of flow adds to it.
         stereo: of the disparity's error that stays with a corner: its right image shows not quite the same point.
         stereo_per_offset: what a pixel of difference between the heights in both images adds to it.
+        stereo_per_disparity: what a pixel of disparity adds to it.
         freedom: degrees of freedom of Student's t, by which outliers count less.
     """
 
@@ -37,6 +38,7 @@ class CornerNoise:
     disparity_per_flow: float = 0.003
     stereo: float = 0.45
     stereo_per_offset: float = 0.8
+    stereo_per_disparity: float = 0.0
     freedom: float = 1.4
 
 
@@ -90,20 +92,26 @@ def corner_motion(
     seen = seen & (before[..., 2] > 0.5) & (after[..., 2] > 0.5)
     before = torch.where(seen.unsqueeze(-1), before, before.new_tensor([*camera.center, 10.0]))
     after = torch.where(seen.unsqueeze(-1), after, before)
-    points, of_corner = camera.points(before), camera.jacobian_of_points(before)
-    stays = noise.stereo**2 + (0.0 if offset is None else (noise.stereo_per_offset * offset).square())
+    stays = noise.stereo**2 + (noise.stereo_per_disparity * before[..., 2]).square()
+    stays = stays if offset is None else stays + (noise.stereo_per_offset * offset).square()
+    wrong = torch.zeros_like(stays)  # how much too small a disparity of the earlier row is
     pose = SE3().neutral(before).expand(*before.shape[:-2], 7) if start is None else start
-    ridge = 1e-6 * torch.eye(6).to(before)
+    ridge, own = 1e-6 * torch.eye(6).to(before), before.new_tensor([0.0, 0.0, 1.0])
     for step in range(steps + 1):
+        true = before + wrong.unsqueeze(-1) * own
+        points, of_corner = camera.points(true), camera.jacobian_of_points(true)
         turn, moved = rotation_matrix(pose[..., :4]).unsqueeze(-3), points - pose[..., None, 4:]
         moved = rotate(SO3().inverse(pose[..., None, :4]), moved)
         ahead = seen & (moved[..., 2] > 1.0)
         moved = torch.where(ahead.unsqueeze(-1), moved, moved.new_tensor([0.0, 0.0, 10.0]))
         shown, slope = camera.project(moved), camera.jacobian(moved)
-        left = torch.where(ahead.unsqueeze(-1), after - shown, 0.0)
-        through = slope @ turn.mT @ of_corner
-        cov = _covariance(through[..., 2], (shown - before)[..., :2].square().sum(-1), stays, noise)
+        through = (slope @ turn.mT @ of_corner)[..., 2]
+        left = torch.where(ahead.unsqueeze(-1), after - shown + through * wrong.unsqueeze(-1), 0.0)
+        cov = _covariance(through, (shown - before)[..., :2].square().sum(-1), stays, noise)
         inverse = torch.linalg.inv(cov)
+        both = (stays + noise.disparity**2).unsqueeze(-1) * through - stays.unsqueeze(-1) * own
+        likely = (both.unsqueeze(-2) @ inverse @ left.unsqueeze(-1))[..., 0, 0]
+        wrong = likely.maximum(0.5 - before[..., 2])
         nis = (left.unsqueeze(-2) @ inverse @ left.unsqueeze(-1))[..., 0, 0]
         weight = torch.where(ahead, (noise.freedom + 3) / (noise.freedom + nis), 0.0)
         jacobian = slope @ torch.cat([skew(moved), -torch.eye(3).to(moved).expand_as(slope)], -1)
@@ -113,8 +121,9 @@ def corner_motion(
             change = torch.linalg.solve(information, (weighted @ left.unsqueeze(-1)).sum(-3)).squeeze(-1)
             pose = SE3().plus(pose, change.clamp(-1, 1))
     density = -0.5 * torch.logdet(cov) - 0.5 * (noise.freedom + 3) * torch.log1p(nis / noise.freedom)
-    constant = math.lgamma((noise.freedom + 3) / 2) - math.lgamma(noise.freedom / 2)
-    density = density + constant - 1.5 * math.log(noise.freedom * math.pi)
+    freedom = torch.as_tensor(noise.freedom).to(before)
+    constant = torch.lgamma((freedom + 3) / 2) - torch.lgamma(freedom / 2) - 1.5 * (freedom * math.pi).log()
+    density = density + constant
     mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
     return CornerMotion(pose, torch.linalg.inv(information), mean, weight)
 
@@ -134,7 +143,7 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
     disparity = noise.disparity**2 + noise.disparity_per_flow**2 * flow2
     cov = torch.diag_embed(torch.stack([place, place, disparity], -1))
     stays = torch.as_tensor(stays).to(place).expand_as(place)
-    for vector, variance in ((same, stays), (by_disparity, torch.full_like(place, noise.disparity**2))):
+    for vector, variance in ((same, stays), (by_disparity, torch.zeros_like(place) + noise.disparity**2)):
         cov = cov + variance[..., None, None] * vector.unsqueeze(-1) * vector.unsqueeze(-2)
     return cov
 
