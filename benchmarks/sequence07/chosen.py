@@ -18,6 +18,8 @@ CORNERS = {
     "stereo": 0.324,
     "stereo_per_offset": 0.5826,
     "stereo_per_disparity": 0.017,
+    "stereo_stale": 1.5,
+    "stereo_walk": 0.1,
     "freedom": 1.36,
 }
 

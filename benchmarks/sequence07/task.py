@@ -16,11 +16,11 @@ from torch import Tensor
 from benchmarks.sequence07.chosen import CAMERA, CORNERS
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.applications.car.corners.drive import read_corner_drive
-from torch_denkf.applications.car.corners.motion import CornerMotion, CornerNoise, corner_motion, started_by_ransac
+from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motions
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.functional.manifolds import SE3, quaternion_of
 
-__all__ = ["ROWS", "Condition", "chained", "corner_readings", "drive", "naive", "readings", "truth"]
+__all__ = ["ROWS", "Condition", "chained", "drive", "naive", "readings", "truth"]
 
 ROWS = 1101  # of the raw drive that sequence 07 has
 Condition = Literal["as it is", "corners lost", "wrong corners"]
@@ -64,21 +64,13 @@ def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
     return rows
 
 
-def corner_readings(rows: TensorDict, camera: StereoCamera, noise: CornerNoise) -> CornerMotion:
-    """The motion of each row since the row before, ``[T]``."""
-    before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
-    offset = rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
-    start, _ = started_by_ransac(before, after, rows["seen"], camera)
-    return corner_motion(before, after, rows["seen"], camera, noise, offset=offset, start=start)
-
-
 @cache
 def readings(folder: Path, name: str, condition: Condition = "as it is", count: int | None = None, seed: int = 0):
     """What a filter reads, ``[T]``: motion with covariance, turn rates, masks and time steps; computed once."""
     found = drive(folder, name, count)
     rows = with_wrong_corners(found.rows, seed) if condition == "wrong corners" else found.rows
-    motion = corner_readings(rows, calibrated(found.camera), CornerNoise(**CORNERS))
-    out = rows.exclude("corners", "seen")
+    motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
+    out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
     out["motion"], out["motion_cov"] = motion.motion, motion.cov
     if condition == "corners lost":
         there = torch.arange(len(rows)) % EVERY < EVERY - LOST

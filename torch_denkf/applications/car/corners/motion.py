@@ -9,12 +9,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, rotation_matrix, skew
 
-__all__ = ["CornerMotion", "CornerNoise", "corner_motion", "started_by_ransac"]
+__all__ = ["CornerMotion", "CornerNoise", "corner_motion", "corner_motions", "started_by_ransac"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class CornerNoise:
         stereo: of the disparity's error that stays with a corner: its right image shows not quite the same point.
         stereo_per_offset: what a pixel of difference between the heights in both images adds to it.
         stereo_per_disparity: what a pixel of disparity adds to it.
+        stereo_stale: what it is multiplied with where a corner has been through rows that repeat the one before.
+        stereo_walk: how much it changes from row to row.
         freedom: degrees of freedom of Student's t, by which outliers count less.
     """
 
@@ -39,7 +42,21 @@ class CornerNoise:
     stereo: float = 0.45
     stereo_per_offset: float = 0.8
     stereo_per_disparity: float = 0.0
+    stereo_stale: float = 1.0
+    stereo_walk: float = 0.1
     freedom: float = 1.4
+
+    def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
+        """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
+
+        Args:
+            corners: (u, v, disparity), ``[*, 3]``.
+            offset: difference of each corner's heights in both images, ``[*]`` in pixels.
+            stale: ``[*]`` bool: which have been through a row that repeats the one before.
+        """
+        var = self.stereo**2 + (self.stereo_per_disparity * corners[..., 2]).square()
+        var = var + (self.stereo_per_offset * offset).square()
+        return torch.where(stale, self.stereo_stale**2 * var, var)
 
 
 class CornerMotion(NamedTuple):
@@ -50,12 +67,16 @@ class CornerMotion(NamedTuple):
         cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
         log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
         weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
+        stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
+        stereo_var: of it, for a sound corner.
     """
 
     motion: Tensor
     cov: Tensor
     log_likelihood: Tensor
     weight: Tensor
+    stereo: Tensor
+    stereo_var: Tensor
 
 
 def corner_motion(
@@ -65,7 +86,7 @@ def corner_motion(
     camera: StereoCamera,
     noise: CornerNoise | None = None,
     *,
-    offset: Tensor | None = None,
+    stereo_var: Tensor | None = None,
     start: Tensor | None = None,
     steps: int = 12,
 ) -> CornerMotion:
@@ -81,7 +102,8 @@ def corner_motion(
         seen: ``[*B, N]`` bool: which there are. Others may hold any finite number.
         camera: of both rows.
         noise: of the corners.
-        offset: difference of each corner's heights in both images, ``[*B, N]`` in pixels; zero by default.
+        stereo_var: variance of the error of a corner's disparity that is the same in both rows, ``[*B, N]`` in pixels^2;
+            by default that of the noise, without what it has by offsets.
         start: motions to start from, ``[*B, 7]``; by default none moved.
         steps: of Gauss-Newton.
 
@@ -92,8 +114,8 @@ def corner_motion(
     seen = seen & (before[..., 2] > 0.5) & (after[..., 2] > 0.5)
     before = torch.where(seen.unsqueeze(-1), before, before.new_tensor([*camera.center, 10.0]))
     after = torch.where(seen.unsqueeze(-1), after, before)
-    stays = noise.stereo**2 + (noise.stereo_per_disparity * before[..., 2]).square()
-    stays = stays if offset is None else stays + (noise.stereo_per_offset * offset).square()
+    zero = torch.zeros_like(before[..., 2])
+    stays = noise.stereo_var(before, zero, zero.bool()) if stereo_var is None else stereo_var
     wrong = torch.zeros_like(stays)  # how much too small a disparity of the earlier row is
     pose = SE3().neutral(before).expand(*before.shape[:-2], 7) if start is None else start
     ridge, own = 1e-6 * torch.eye(6).to(before), before.new_tensor([0.0, 0.0, 1.0])
@@ -125,7 +147,50 @@ def corner_motion(
     constant = torch.lgamma((freedom + 3) / 2) - torch.lgamma(freedom / 2) - 1.5 * (freedom * math.pi).log()
     density = density + constant
     mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
-    return CornerMotion(pose, torch.linalg.inv(information), mean, weight)
+    gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # of the error that stays
+    error = (gain @ left.unsqueeze(-1))[..., 0, 0]
+    var = stays - stays * (gain @ (own - through).unsqueeze(-1))[..., 0, 0]
+    return CornerMotion(pose, torch.linalg.inv(information), mean, weight, error, var)
+
+
+def corner_motions(
+    rows: TensorDict, camera: StereoCamera, noise: CornerNoise | None = None, *, steps: int = 6, memory: bool = True
+) -> CornerMotion:
+    """The motion of each row since the row before; what a corner has shown of its disparity is remembered.
+
+    A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
+    row to row.
+
+    Args:
+        rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[T]``.
+        camera: of the rows.
+        noise: of the corners.
+        steps: of Gauss-Newton, from what random samples of corners show.
+        memory: False to take each row alone.
+
+    Returns:
+        Motions ``[T]``; where ``"motion_observed"`` is False, they mean nothing.
+    """
+    noise = CornerNoise() if noise is None else noise
+    before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
+    seen, offset = rows["seen"], rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
+    start, _ = started_by_ransac(before, after, seen, camera)
+    first = noise.stereo_var(before, offset, rows["repeats"] > 0)
+    if not memory:
+        return corner_motion(before, after, seen, camera, noise, stereo_var=first, start=start, steps=steps)
+    found: list[CornerMotion] = []
+    for row in range(len(rows)):
+        mean, var, came = torch.zeros_like(first[row]), first[row], rows["came_from"][row]
+        if found:
+            last = found[-1]
+            known = (came >= 0) & (last.weight > 0)[came]
+            mean = torch.where(known, last.stereo[came], mean)
+            var = torch.where(known, (last.stereo_var / last.weight)[came].minimum(var) + noise.stereo_walk**2, var)
+        less = torch.stack([torch.zeros_like(mean), torch.zeros_like(mean), mean], -1)
+        corners = before[row] - less, after[row] - less, seen[row]
+        one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[row], steps=steps)
+        found.append(one._replace(stereo=mean + one.stereo))
+    return CornerMotion(*(torch.stack(entry) for entry in zip(*found, strict=True)))
 
 
 def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
