@@ -1,78 +1,110 @@
 """Finds the numbers of ``chosen.py`` by drive 0022, which has no poses: ``python -m benchmarks.sequence07.calibration``.
 
-First the lens and the corners' noise, by the likelihood of the corners themselves. Then the filter's noises, by the
-likelihood of its readings.
+First the lens and then the corners' noise, by the likelihood of the corners themselves. Last the filter's noises, by
+the likelihood of its readings. ``... calibration noises`` finds these alone; ``chosen.py`` is to be filled in before.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.sequence07.chosen import CAMERA, CORNERS, FILTER
 from benchmarks.sequence07.filters import car_filter, prepared
-from benchmarks.sequence07.task import drive, readings
+from benchmarks.sequence07.task import calibrated, drive, readings
 from torch_denkf.applications.car.corners.camera import StereoCamera
-from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motion, started_by_ransac
+from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motions, started_by_ransac
 
 FOLDER = Path("../shared/data")
 
 
-def corner_likelihood(rows, camera: StereoCamera, noise: CornerNoise, start: Tensor, steps: int = 6) -> float:
-    """Mean log-likelihood of a corner in the later row, in the tracker's own pixels."""
-    before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
-    offset = rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
-    found = corner_motion(before, after, rows["seen"], camera, noise, offset=offset, start=start, steps=steps)
-    square = ((rows["corners"][:, :, 1, :2] - torch.tensor(camera.center)) / camera.focal).square().sum(-1)
-    first, second = camera.radial
-    scale = (1 - first * square - second * square**2) * (1 - 3 * first * square - 5 * second * square**2)
-    change = (torch.where(rows["seen"], scale, 1.0).log().sum(-1) / rows["seen"].sum(-1)).mean()
-    return found.log_likelihood.mean().item() + change.item()
+def _named(values: Tensor) -> tuple[tuple, CornerNoise]:
+    """Lens and noise of numbers ``[10 + 10]``: three of the radius, seven of the disparity, logarithms of the noise."""
+    noise = dict(zip(CORNERS, values[10:].exp().unbind(), strict=True))
+    return (values[:3].unbind(), values[3:10].unbind()), CornerNoise(**noise)
 
 
-def climb(score: Callable[[dict], float], start: dict, steps: dict, sweeps: int = 3) -> tuple[dict, float]:
-    """Changes one number after the other as long as the score grows; steps halve from sweep to sweep."""
-    best, found, steps = score(start), dict(start), dict(steps)
-    for _ in range(sweeps):
-        for name in start:
-            for sign in (1, -1):
-                for _ in range(4):
-                    tried = {**found, name: found[name] + sign * steps[name]}
-                    value = score(tried)
-                    if not value > best + 1e-4:
-                        break
-                    best, found = value, tried
-        steps = {name: step / 2 for name, step in steps.items()}
-    return found, best
+def corner_likelihood(
+    values: Tensor, rows: TensorDict, camera: StereoCamera, start: Tensor, steps: int = 3, memory: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Mean log-likelihood of a corner in the later row, in the tracker's own pixels; and the motions ``[T, 7]``."""
+    (radial, short), noise = _named(values)
+    lens = replace(camera, radial=radial, disparity_offset=short)
+    found = corner_motions(rows, lens, noise, start=start, steps=steps, memory=memory)
+    away = (rows["corners"][:, :, 1, :2] - torch.tensor(camera.center)) / camera.focal
+    square = away.square().sum(-1)
+    along = 1 - radial[0] - 3 * radial[1] * square - 5 * radial[2] * square**2
+    change = ((1 - radial[0] - radial[1] * square - radial[2] * square**2) * along).log()  # of a pixel's area
+    change = torch.where(rows["seen"], change, 0.0).sum(-1) / rows["seen"].sum(-1).clamp_min(1)
+    likelihood = (found.log_likelihood + change)[rows["motion_observed"].squeeze(-1)].mean()
+    return likelihood, found.motion
 
 
-def corners(folder: Path = FOLDER) -> None:
-    """Lens, tracker and corners: chosen on the even rows, and checked on the odd ones."""
+def lens(folder: Path = FOLDER, updates: int = 100) -> None:
+    """The lens by gradients, each row alone: found on the even rows, checked on the odd ones."""
     found = drive(folder, "0022")
-    keep = found.rows["motion_observed"].squeeze(-1)
-    rows = found.rows[keep]
+    rows = found.rows[found.rows["motion_observed"].squeeze(-1)]
     before, after = (found.camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
     start, _ = started_by_ransac(before, after, rows["seen"], found.camera)
+    noise = torch.tensor(list(CORNERS.values())).log()
+    plain = torch.cat([torch.zeros(10), noise])
+    scale = torch.cat([torch.tensor([0.001, 0.01, 0.01, 0.1, 0.1, 0.2, 0.5, 0.5, 1.0, 2.0]), torch.full((10,), 0.3)])
+    away = torch.zeros(20, requires_grad=True)
+    optimiser = torch.optim.Adam([away], lr=0.1)
+    for update in range(updates):
+        value, motion = corner_likelihood(plain + scale * away, rows[::2], found.camera, start[::2], 2, memory=False)
+        optimiser.zero_grad()
+        (-value).backward()
+        optimiser.step()
+        optimiser.param_groups[0]["lr"] *= 0.985
+        start[::2] = motion.detach()
+        if update % 20 == 0:
+            print(update, f"{value.item():.4f}", flush=True)
+    values = (plain + scale * away).detach()
+    with torch.no_grad():
+        odd = rows[1::2], found.camera, start[1::2], 8, False
+        after, before = (corner_likelihood(tried, *odd)[0].item() for tried in (values, plain))
+    print("radial", [round(value, 4) for value in values[:3].tolist()])
+    print("disparity_offset", [round(value, 3) for value in values[3:10].tolist()])
+    print({name: round(value, 4) for name, value in zip(CORNERS, values[10:].exp().tolist(), strict=True)})
+    print(f"odd rows {after:.4f}, with KITTI's lens {before:.4f}")
 
-    def score(values: dict, part: slice = slice(0, None, 2)) -> float:
-        camera = replace(found.camera, radial=(values["k1"], values["k2"]), disparity_offset=values["short"])
-        noise = CornerNoise(**{name: 2.0 ** values[name] for name in CORNERS})
-        return corner_likelihood(rows[part], camera, noise, start[part])
 
-    begin = {name: torch.tensor(value).log2().item() for name, value in CORNERS.items()}
-    plain = {**begin, "k1": 0.0, "k2": 0.0, "short": 0.0}
-    begin |= {"k1": CAMERA["radial"][0], "k2": CAMERA["radial"][1], "short": CAMERA["disparity_offset"]}
-    steps = dict.fromkeys(CORNERS, 0.4) | {"k1": 0.005, "k2": 0.01, "short": 0.1}
-    values, best = climb(score, begin, steps)
-    odd = slice(1, None, 2)
-    print({name: round(2.0 ** values[name], 4) for name in CORNERS})
-    print({name: round(values[name], 4) for name in ("k1", "k2", "short")})
-    print(f"even rows {best:.4f}; odd rows {score(values, odd):.4f}, with KITTI's lens {score(plain, odd):.4f}")
+@torch.no_grad()
+def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
+    """The corners' noise, with what corners have shown before: found on the first rows, checked on the others."""
+    found = drive(folder, "0022")
+    camera = calibrated(found.camera)
+    before, after = (camera.corners(found.rows["corners"][:, :, row]) for row in (0, 1))
+    start, _ = started_by_ransac(before, after, found.rows["seen"], camera)
+    fixed = torch.tensor([*CAMERA["radial"], *CAMERA["disparity_offset"]])
+    names, values = list(CORNERS), torch.tensor(list(CORNERS.values())).log()
+    steps = torch.full((len(names),), 0.3)
+
+    def scores(tried: Tensor, part: slice) -> Tensor:
+        def one(noise: Tensor) -> Tensor:
+            return corner_likelihood(torch.cat([fixed, noise]), found.rows[part], found.camera, start[part])[0]
+
+        return torch.func.vmap(one)(tried).nan_to_num(-torch.inf)
+
+    for number in range(rounds):
+        moves = torch.cat([torch.zeros(1, len(names)), torch.diag(steps), -torch.diag(steps)])
+        score = scores(values + moves, slice(0, rows))
+        up, down = (score[1:] - score[0]).unflatten(0, (2, -1))
+        better = torch.maximum(up, down) > 1e-4
+        steps, move = torch.where(better, steps, steps / 2), torch.where(better, torch.where(up > down, 1, -1) * steps, 0)
+        options = torch.stack([values, values + 0.3 * move, values + 0.6 * move, values + move])
+        options = torch.cat([options, (values + moves)[score.argmax()].unsqueeze(0)])
+        after = scores(options, slice(0, rows))
+        values = options[after.argmax()]
+        noise = {name: round(value, 4) for name, value in zip(names, values.exp().tolist(), strict=True)}
+        print(number, f"{after.max().item():.4f}", noise, flush=True)
+    print(f"other rows {scores(values.unsqueeze(0), slice(rows, None)).item():.4f}")
 
 
 @torch.no_grad()
@@ -123,7 +155,6 @@ def noises(rounds: int = 14) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    if "corners" in sys.argv[1:] or not sys.argv[1:]:
-        corners()
-    if "noises" in sys.argv[1:] or not sys.argv[1:]:
-        noises()
+    for part in (lens, corners, noises):
+        if part.__name__ in sys.argv[1:] or not sys.argv[1:]:
+            part()

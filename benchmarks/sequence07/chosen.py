@@ -5,22 +5,22 @@
 
 #: What the lens's rectification has left, and what disparities are short of in pixels: by the likelihood of corners.
 CAMERA = {
-    "radial": (0.0041, 0.0264, -0.0107),
-    "disparity_offset": (0.371, 0.375, 0.190, 0.644, -1.984, -3.642, 2.791),
+    "radial": (0.004, 0.0256, -0.0099),
+    "disparity_offset": (0.38, 0.382, 0.371, 0.659, -2.033, -3.549, 2.889),
 }
 
 #: Of corners, by the same likelihood: fields of CornerNoise.
 CORNERS = {
-    "pixel": 0.0543,
+    "pixel": 0.0549,
     "pixel_per_flow": 0.0039,
     "disparity": 0.0462,
-    "disparity_per_flow": 0.0024,
-    "stereo": 0.324,
-    "stereo_per_offset": 0.5826,
-    "stereo_per_disparity": 0.017,
-    "stereo_stale": 1.5,
+    "disparity_per_flow": 0.0025,
+    "stereo": 0.2194,
+    "stereo_per_offset": 0.2879,
+    "stereo_per_disparity": 0.0152,
+    "stereo_stale": 1.9734,
     "stereo_walk": 0.1,
-    "freedom": 1.36,
+    "freedom": 1.3781,
 }
 
 

@@ -18,6 +18,9 @@ from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, ro
 __all__ = ["CornerMotion", "CornerNoise", "corner_motion", "corner_motions", "started_by_ransac"]
 
 
+LEAST = 0.03  # weight of a corner that is not wrong
+
+
 @dataclass(frozen=True)
 class CornerNoise:
     """How far corners are off, in pixels: standard deviations.
@@ -68,7 +71,7 @@ class CornerMotion(NamedTuple):
         log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
         weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
         stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
-        stereo_var: of it, for a sound corner.
+        stereo_var: of it.
     """
 
     motion: Tensor
@@ -154,7 +157,13 @@ def corner_motion(
 
 
 def corner_motions(
-    rows: TensorDict, camera: StereoCamera, noise: CornerNoise | None = None, *, steps: int = 6, memory: bool = True
+    rows: TensorDict,
+    camera: StereoCamera,
+    noise: CornerNoise | None = None,
+    *,
+    start: Tensor | None = None,
+    steps: int = 6,
+    memory: bool = True,
 ) -> CornerMotion:
     """The motion of each row since the row before; what a corner has shown of its disparity is remembered.
 
@@ -165,7 +174,8 @@ def corner_motions(
         rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[T]``.
         camera: of the rows.
         noise: of the corners.
-        steps: of Gauss-Newton, from what random samples of corners show.
+        start: motions to start from, ``[T, 7]``; by default those of random samples of corners.
+        steps: of Gauss-Newton.
         memory: False to take each row alone.
 
     Returns:
@@ -174,7 +184,7 @@ def corner_motions(
     noise = CornerNoise() if noise is None else noise
     before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
     seen, offset = rows["seen"], rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
-    start, _ = started_by_ransac(before, after, seen, camera)
+    start = started_by_ransac(before, after, seen, camera)[0] if start is None else start
     first = noise.stereo_var(before, offset, rows["repeats"] > 0)
     if not memory:
         return corner_motion(before, after, seen, camera, noise, stereo_var=first, start=start, steps=steps)
@@ -182,14 +192,15 @@ def corner_motions(
     for row in range(len(rows)):
         mean, var, came = torch.zeros_like(first[row]), first[row], rows["came_from"][row]
         if found:
-            last = found[-1]
-            known = (came >= 0) & (last.weight > 0)[came]
-            mean = torch.where(known, last.stereo[came], mean)
-            var = torch.where(known, (last.stereo_var / last.weight)[came].minimum(var) + noise.stereo_walk**2, var)
+            known = (came >= 0) & seen[row - 1][came]
+            mean = torch.where(known, found[-1].stereo[came], mean)
+            var = torch.where(known, found[-1].stereo_var[came].minimum(var) + noise.stereo_walk**2, var)
         less = torch.stack([torch.zeros_like(mean), torch.zeros_like(mean), mean], -1)
         corners = before[row] - less, after[row] - less, seen[row]
         one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[row], steps=steps)
-        found.append(one._replace(stereo=mean + one.stereo))
+        sound = one.weight > LEAST  # the others tell nothing of their disparity
+        mean, var = mean + torch.where(sound, one.stereo, 0.0), torch.where(sound, one.stereo_var / one.weight, var)
+        found.append(one._replace(stereo=mean, stereo_var=var))
     return CornerMotion(*(torch.stack(entry) for entry in zip(*found, strict=True)))
 
 
