@@ -11,16 +11,16 @@ CAMERA = {
 
 #: Of corners, by the same likelihood: fields of CornerNoise.
 CORNERS = {
-    "pixel": 0.0549,
-    "pixel_per_flow": 0.0039,
-    "disparity": 0.0462,
-    "disparity_per_flow": 0.0025,
-    "stereo": 0.2194,
-    "stereo_per_offset": 0.2879,
-    "stereo_per_disparity": 0.0152,
-    "stereo_stale": 1.9734,
-    "stereo_walk": 0.1,
-    "freedom": 1.3781,
+    "pixel": 0.0476,
+    "pixel_per_flow": 0.0041,
+    "disparity": 0.0498,
+    "disparity_per_flow": 0.0035,
+    "stereo": 0.2627,
+    "stereo_per_offset": 0.2553,
+    "stereo_per_disparity": 0.0385,
+    "stereo_stale": 2.03,
+    "stereo_walk": 0.0719,
+    "freedom": 1.78,
 }
 
 
