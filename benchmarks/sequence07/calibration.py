@@ -1,7 +1,7 @@
 """Finds the numbers of ``chosen.py`` by drive 0022, which has no poses: ``python -m benchmarks.sequence07.calibration``.
 
-First the lens and then the corners' noise, by the likelihood of the corners themselves. Last the filter's noises, by
-the likelihood of its readings. ``... calibration noises`` finds these alone; ``chosen.py`` is to be filled in before.
+First the lens and then the corners' noise, by the likelihood of the corners themselves. Then what is wrong for many
+rows, by two halves of the corners. Last the filter's noises, by the likelihood of its readings. ``... calibration noises`` finds these alone; ``chosen.py`` is to be filled in before.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from benchmarks.sequence07.filters import car_filter, prepared
 from benchmarks.sequence07.task import calibrated, drive, readings
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motions, started_by_ransac
+from torch_denkf.functional.manifolds import SE3
 
 FOLDER = Path("../shared/data")
 
@@ -108,6 +109,38 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
 
 
 @torch.no_grad()
+def slip(folder: Path = FOLDER, seed: int = 0) -> None:
+    """Errors that last: the corners are split at random, each with all its rows, and each half shows a motion.
+
+    The mean of both has half the error of their difference. Its square and how much of it is left some rows later are
+    those of a process that forgets a share from row to row.
+    """
+    found, random = drive(folder, "0022"), torch.Generator().manual_seed(seed)
+    rows, motions = found.rows, []
+    half = torch.rand(rows["seen"].shape, generator=random) < 0.5
+    for row in range(1, len(rows)):
+        came = rows["came_from"][row]
+        half[row] = torch.where(came >= 0, half[row - 1][came], half[row])
+    use = rows["motion_observed"].squeeze(-1)
+    for part in (half, ~half):
+        some = rows.clone()
+        some["seen"] = rows["seen"] & part
+        use = use & (some["seen"].sum(-1) >= 8)
+        motions.append(corner_motions(some, calibrated(found.camera), CornerNoise(**CORNERS)).motion)
+    error = SE3().minus(*motions) / 2 / rows["dt"]
+    limit = 10 * error[use].abs().median(0).values  # a half may follow another car
+    use = use & (error.abs() < limit).all(-1)
+
+    def product(lag: int) -> Tensor:
+        both = use[lag:] & use[: len(use) - lag]
+        return (error[lag:] * error[: len(use) - lag])[both].mean(0)
+
+    kept = (product(6) / product(1)).mean() ** (1 / 5)
+    std = (product(1) / kept).sqrt()
+    print("SLIP", [float(f"{value:.2g}") for value in std.tolist()], "SLIP_KEPT", round(kept.item(), 3))
+
+
+@torch.no_grad()
 def filter_likelihoods(tried: list[dict], folder: Path = FOLDER, skip: int = 20) -> Tensor:
     """Log-likelihood of all readings of 0022 under the extended Kalman filter, for each of several choices ``[B]``."""
     data = readings(folder, "0022")
@@ -155,6 +188,6 @@ def noises(rounds: int = 14) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    for part in (lens, corners, noises):
+    for part in (lens, corners, slip, noises):
         if part.__name__ in sys.argv[1:] or not sys.argv[1:]:
             part()

@@ -25,19 +25,29 @@ CORNERS = {
 
 
 #: Of the filters, by the likelihood of their readings: what a row adds to the twist, in rad/s and m/s; which share of
-#: it is kept; what is added to the corners' covariance, times a factor, in rad and m; the gyro's noise in rad/s.
+#: it is kept, and of its last change; what is added to the corners' covariance, times a factor, in rad and m; the
+#: gyro's noise in rad/s.
 FILTER = {
-    "pitch": 0.01,
-    "yaw": 0.01,
+    "pitch": 0.008,
+    "yaw": 0.006,
     "roll": 0.01,
     "side": 0.03,
     "down": 0.03,
     "ahead": 0.1,
-    "kept_tilt": 0.5,
-    "kept_yaw": 1.0,
+    "kept_pitch": 0.55,
+    "kept_yaw": 0.99,
+    "kept_roll": 0.65,
     "kept_side": 0.9,
+    "swing_pitch": 0.59,
+    "swing_yaw": 0.8,
+    "swing_roll": 0.18,
     "scale": 2.0,
     "floor_turn": 0.0001,
     "floor_move": 0.002,
     "gyro": 0.05,
 }
+
+#: Error of the corners' motion that lasts, by how much the motions of two halves of the corners differ: standard
+#: deviations in rad/s and m/s, and which share is left a row later.
+SLIP = (0.0009, 0.001, 0.0015, 0.036, 0.028, 0.077)
+SLIP_KEPT = 0.825

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.sequence07.chosen import FILTER
+from benchmarks.sequence07.chosen import FILTER, SLIP, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
@@ -28,24 +28,32 @@ __all__ = ["DT", "SPACE", "car_filter", "prepared"]
 
 Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
-SPACE = Product(SE3(), Euclidean(6), Euclidean(3))  # pose; twist in rad/s and m/s; the gyro's bias in rad/s
-POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(13, 16)
-#: Standard deviations where a filter starts: pose, twist (from standing still), bias.
-START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.01] * 3
-RESTART = [1e-4] * 6 + [0.01] * 3 + [0.1] * 3 + [0.003] * 3  # ... from a belief
+#: Pose; twist in rad/s and m/s; how its turn has changed since the row before; the gyro's bias in rad/s; the slip.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(3), Euclidean(3), Euclidean(6))
+POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(16, 19)
+#: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.01] * 3
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.1] * 3 + [0.01] * 3 + [0.003] * 3
 
 
 class CarMotion(Motion):
-    """The twist keeps a share of itself from row to row, and moves the pose over the row: a twist is a row's mean."""
+    """The twist of the row before goes on, and moves the pose over the row: a twist is a row's mean.
+
+    A share of the twist is kept, and a share of the turn's last change comes again: a car sways. The pose also moves
+    by the slip, which is what corners do not show of the twist, because the same corners are wrong for many rows. No
+    sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+    """
 
     def __init__(self):
-        super().__init__(SPACE, "dt", {"kept": 6}, ("belief", "ensemble"), ("forecast", "ensemble"))
+        keys = {"kept": 6, "swing": 3}
+        super().__init__(SPACE, "dt", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
 
-    def move(self, state, kept, *, dt):
-        """The pose moved by the twist that is kept."""
-        pose, twist, bias = self.space.points(state)
-        twist = kept * twist
-        return torch.cat([SE3().plus(pose, twist * dt), twist, bias], -1)
+    def move(self, state, kept, swing, *, dt):
+        """The pose moved by the twist that is kept, and by the slip."""
+        pose, twist, change, bias, slip = self.space.points(state)
+        swings = torch.cat([swing * change, torch.zeros_like(twist[..., 3:])], -1)
+        after, slip = kept * twist + swings, SLIP_KEPT * slip
+        return torch.cat([SE3().plus(pose, (after + slip) * dt), after, (after - twist)[..., :3], bias, slip], -1)
 
 
 class LastMotion(SubModel):
@@ -100,10 +108,11 @@ class Given(SubModel):
 
 
 def process_noise() -> MappedNoise:
-    """What a row adds: noise of the twist, which moves the pose within the row, and of the bias."""
-    through = torch.zeros(15, 9, dtype=torch.float64)
-    through[:6, :6], through[6:, :] = DT * torch.eye(6), torch.eye(9)
-    return MappedNoise(Given("process", ("forecast", "noise"), 9), through)
+    """What a row adds: noise of the twist, which moves the pose within the row; of the bias; of the slip."""
+    through = torch.zeros(24, 15, dtype=torch.float64)
+    through[:6, :6], through[6:12, :6], through[12:15, :3] = DT * torch.eye(6), torch.eye(6), torch.eye(3)
+    through[15:, 6:] = torch.eye(9)
+    return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
 
 
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
@@ -112,7 +121,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, ``[*B, 16]``; by default at the origin, standing still.
+        start: state of the first row, ``[*B, 28]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -123,8 +132,10 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
 
     walks = several("pitch", "yaw", "roll", "side", "down", "ahead")
     bias = torch.full_like(walks[..., :3], 1e-5)
-    data["process"] = torch.cat([walks, bias], -1).square()
-    share = several("kept_tilt", "kept_yaw", "kept_tilt", "kept_side", "kept_side")
+    slip = (1 - SLIP_KEPT**2) ** 0.5 * torch.tensor(SLIP, dtype=torch.float64).expand(*data.shape, 6)
+    data["process"] = torch.cat([walks, bias, slip], -1).square()
+    data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll")
+    share = several("kept_pitch", "kept_yaw", "kept_roll", "kept_side", "kept_side")
     data["kept"] = torch.cat([share, torch.ones_like(share[..., :1])], -1)
     floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
     scale = several("scale").square().unsqueeze(-1)
@@ -132,7 +143,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 16).contiguous()
+    data["start"] = origin.expand(*data.shape, 28).contiguous()
     return data
 
 
@@ -153,7 +164,7 @@ def car_filter(
         "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
         "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
     }
-    std = RESTART if again else START
+    std = [*(RESTART if again else START), *SLIP]
     motion, noise = CarMotion(), process_noise()
     if kind == "DEnKF":
         initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)
