@@ -121,7 +121,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, ``[*B, 28]``; by default at the origin, standing still.
+        start: state of the first row, ``[*B, 25]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -143,7 +143,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 28).contiguous()
+    data["start"] = origin.expand(*data.shape, 25).contiguous()
     return data
 
 

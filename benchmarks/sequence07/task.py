@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -20,10 +20,11 @@ from torch_denkf.applications.car.corners.motion import CornerNoise, corner_moti
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.functional.manifolds import SE3, quaternion_of
 
-__all__ = ["ROWS", "Condition", "chained", "drive", "naive", "readings", "truth"]
+__all__ = ["CONDITIONS", "ROWS", "Condition", "chained", "drive", "naive", "readings", "truth"]
 
 ROWS = 1101  # of the raw drive that sequence 07 has
 Condition = Literal["as it is", "corners lost", "wrong corners"]
+CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 LOST, EVERY = 10, 100  # rows without corners, 1 s, in each 10 s
 WRONG, OFF = 0.2, 30.0  # share of wrong corners; how far off they are, in pixels, uniformly in each direction
 
@@ -38,7 +39,7 @@ class Drive:
 
 @cache
 def drive(folder: Path, name: str, count: int | None = None) -> Drive:
-    """Rows of ``inertial/NAME.npz`` in a folder, and its camera as it is calibrated."""
+    """Rows of ``kitti_inertial/NAME.npz`` in a folder, and its camera as it is calibrated."""
     return Drive(*read_corner_drive(folder / "kitti_inertial" / f"{name}.npz", count))
 
 
@@ -64,26 +65,36 @@ def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
     return rows
 
 
+def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDict:
+    """Rows as they are, or with what happens to their corners."""
+    if condition == "wrong corners":
+        return with_wrong_corners(rows, seed)
+    if condition == "corners lost":
+        rows = rows.clone()
+        there = (torch.arange(len(rows)) % EVERY < EVERY - LOST).unsqueeze(-1)
+        rows["seen"] &= there
+        rows["motion_observed"] &= there
+    return rows
+
+
 @cache
 def readings(folder: Path, name: str, condition: Condition = "as it is", count: int | None = None, seed: int = 0):
     """What a filter reads, ``[T]``: motion with covariance, turn rates, masks and time steps; computed once."""
     found = drive(folder, name, count)
-    rows = with_wrong_corners(found.rows, seed) if condition == "wrong corners" else found.rows
+    rows = in_condition(found.rows, condition, seed)
     motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
     out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
     out["motion"], out["motion_cov"] = motion.motion, motion.cov
-    if condition == "corners lost":
-        there = torch.arange(len(rows)) % EVERY < EVERY - LOST
-        out["motion_observed"] = out["motion_observed"] & there.unsqueeze(-1)
     hidden = ~out["motion_observed"].squeeze(-1)
     out["motion"][hidden] = SE3().neutral(out["motion"])
     out["motion_cov"][hidden] = torch.eye(6, dtype=torch.float64)
     return out
 
 
-def naive(found: Drive) -> tuple[Tensor, Tensor]:
+def naive(folder: Path, name: str, condition: Condition, count: int | None = None, seed: int = 0):
     """OpenCV's pose from corners, refined, with the camera as KITTI calibrates it: motions ``[T, 7]``, and a mask."""
-    rows, camera = found.rows, found.camera
+    found = drive(folder, name, count)
+    rows, camera = in_condition(found.rows, condition, seed), found.camera
     matrix = np.array([[camera.focal, 0, camera.center[0]], [0, camera.focal, camera.center[1]], [0, 0, 1.0]])
     before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
     motions = SE3().neutral(before).repeat(len(rows), 1)
