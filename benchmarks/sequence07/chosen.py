@@ -41,6 +41,7 @@ FILTER = {
     "swing_pitch": 0.543,
     "swing_yaw": 0.869,
     "swing_roll": 0.207,
+    "swing_ahead": 0.2,
     "scale": 1.43,
     "floor_turn": 0.000189,
     "floor_move": 0.000174,

@@ -24,36 +24,41 @@ from torch_denkf.modules import (
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
 
-__all__ = ["DT", "SPACE", "car_filter", "prepared"]
+__all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
 Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
-#: Pose; twist in rad/s and m/s; how its turn has changed since the row before; the gyro's bias in rad/s; the slip.
-SPACE = Product(SE3(), Euclidean(6), Euclidean(3), Euclidean(3), Euclidean(6))
-POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(16, 19)
+#: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
+#: in rad/s; the slip.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
+POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
+SWAYS = [0, 1, 2, 5]  # of the twist
 #: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
-START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.01] * 3
-RESTART = [1e-4] * 6 + [0.01] * 3 + [0.1] * 3 + [0.01] * 3 + [0.003] * 3
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
 
 
 class CarMotion(Motion):
-    """The twist of the row before goes on, and moves the pose over the row: a twist is a row's mean.
+    """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
 
-    A share of the twist is kept, and a share of the turn's last change comes again: a car sways. The pose also moves
-    by the slip, which is what corners do not show of the twist, because the same corners are wrong for many rows. No
-    sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+    A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
+    The pose also moves by the slip, which is what corners do not show of the twist, because the same corners are wrong
+    for many rows. No sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+
+    The pose trails so that the row's own readings correct the twist before it moves the pose.
     """
 
     def __init__(self):
-        keys = {"kept": 6, "swing": 3}
-        super().__init__(SPACE, "dt", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
+        keys = {"kept": 6, "swing": 4}
+        super().__init__(SPACE, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
 
     def move(self, state, kept, swing, *, dt):
-        """The pose moved by the twist that is kept, and by the slip."""
+        """The pose moved by twist and slip; the twist that is kept."""
         pose, twist, change, bias, slip = self.space.points(state)
-        swings = torch.cat([swing * change, torch.zeros_like(twist[..., 3:])], -1)
-        after, slip = kept * twist + swings, SLIP_KEPT * slip
-        return torch.cat([SE3().plus(pose, (after + slip) * dt), after, (after - twist)[..., :3], bias, slip], -1)
+        change = swing * change
+        after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
+        moved = SE3().plus(pose, (twist + slip) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, SLIP_KEPT * slip], -1)
 
 
 class LastMotion(SubModel):
@@ -107,11 +112,29 @@ class Given(SubModel):
         return value
 
 
+def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
+    """Poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
+
+    Args:
+        out: of a filter's sequence, ``[*B, T]``. The pose trails, so that of a row is forecast for the next one.
+        prefix: ``"belief"`` or ``"smoothed"``.
+    """
+    prefix = "forecast" if prefix == "belief" else prefix
+    if (prefix, "ensemble") in out.keys(True):
+        members = out[prefix, "ensemble"][..., 1:, :, POSE]
+        first = members[..., :1, :]
+        away = SE3().minus(members, first.expand_as(members))
+        mean = SE3().plus(first.squeeze(-2), away.mean(-2))
+        return mean, SE3().minus(members, mean.unsqueeze(-2).expand_as(members)).var(-2)
+    var = out[prefix, "cov"].diagonal(dim1=-2, dim2=-1) if (prefix, "cov") in out.keys(True) else out[prefix, "var"]
+    return out[prefix, "mean"][..., 1:, POSE], var[..., 1:, :6]
+
+
 def process_noise() -> MappedNoise:
-    """What a row adds: noise of the twist, which moves the pose within the row; of the bias; of the slip."""
-    through = torch.zeros(24, 15, dtype=torch.float64)
-    through[:6, :6], through[6:12, :6], through[12:15, :3] = DT * torch.eye(6), torch.eye(6), torch.eye(3)
-    through[15:, 6:] = torch.eye(9)
+    """What a row adds: noise of the twist, of the bias, of the slip."""
+    through = torch.zeros(25, 15, dtype=torch.float64)
+    through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
+    through[16:, 6:] = torch.eye(9)
     return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
 
 
@@ -121,10 +144,13 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, ``[*B, 25]``; by default at the origin, standing still.
+        start: state of the first row, with its own pose, ``[*B, 26]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
+    before = data["dt"].roll(1, -2)
+    before[..., :2, :] = 0  # the first row's pose is known
+    data["dt_before"] = before
 
     def several(*names: str) -> Tensor:
         numbers = torch.stack([torch.as_tensor(values[name], dtype=torch.float64) for name in names], -1)
@@ -134,7 +160,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     bias = torch.full_like(walks[..., :3], 1e-5)
     slip = (1 - SLIP_KEPT**2) ** 0.5 * torch.tensor(SLIP, dtype=torch.float64).expand(*data.shape, 6)
     data["process"] = torch.cat([walks, bias, slip], -1).square()
-    data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll")
+    data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll", "swing_ahead")
     share = several("kept_pitch", "kept_yaw", "kept_roll", "kept_side", "kept_side")
     data["kept"] = torch.cat([share, torch.ones_like(share[..., :1])], -1)
     floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
@@ -143,7 +169,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 25).contiguous()
+    data["start"] = origin.expand(*data.shape, 26).contiguous()
     return data
 
 
