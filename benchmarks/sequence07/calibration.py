@@ -98,7 +98,10 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
         score = scores(values + moves, slice(0, rows))
         up, down = (score[1:] - score[0]).unflatten(0, (2, -1))
         better = torch.maximum(up, down) > 1e-4
-        steps, move = torch.where(better, steps, steps / 2), torch.where(better, torch.where(up > down, 1, -1) * steps, 0)
+        steps, move = (
+            torch.where(better, steps, steps / 2),
+            torch.where(better, torch.where(up > down, 1, -1) * steps, 0),
+        )
         options = torch.stack([values, values + 0.3 * move, values + 0.6 * move, values + move])
         options = torch.cat([options, (values + moves)[score.argmax()].unsqueeze(0)])
         after = scores(options, slice(0, rows))

@@ -173,9 +173,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     return data
 
 
-def car_filter(
-    kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, **analysis
-) -> Filter:
+def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, **analysis) -> Filter:
     """A filter of all three parts of the state.
 
     Args:

@@ -33,7 +33,9 @@ def driven(count=240, runs=4, seed=0):
     data["gyro_observed"] = torch.ones(runs, count, 1, dtype=torch.bool)
     data["motion_observed"] = (torch.arange(count) % 9 > 0).reshape(1, count, 1).expand(runs, count, 1).clone()
     believed, motion = prepared(data), CarMotion()
-    state = SPACE.perturb(SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25))
+    state = SPACE.perturb(
+        SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25)
+    )
     state[:, 12] += 6.0
     states = [state]
     for row in range(1, count + 1):

@@ -162,7 +162,11 @@ def test_a_file_is_read_as_rows(tmp_path):
     features[:, 1, 2:] = torch.tensor([[20.0, 20.0, 21.0]])
     features[:, 2, 3:] = torch.tensor([[30.0, 31.0]])
     stored = {"features": features, "K": torch.diag(torch.tensor([700.0, 700.0, 1.0])), "b": torch.tensor(0.5)}
-    stored |= {"cam_T_imu": torch.eye(4), "rotational_velocity": torch.zeros(3, 5), "time_stamps": torch.arange(5)[None]}
+    stored |= {
+        "cam_T_imu": torch.eye(4),
+        "rotational_velocity": torch.zeros(3, 5),
+        "time_stamps": torch.arange(5)[None],
+    }
     np.savez(tmp_path / "drive.npz", **{key: value.numpy() for key, value in stored.items()})
     rows, _ = read_corner_drive(tmp_path / "drive.npz")
     assert rows["motion_observed"].flatten().tolist() == [False, True, True, False, True]
