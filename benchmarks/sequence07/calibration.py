@@ -1,7 +1,9 @@
-"""Finds the numbers of ``chosen.py`` by drive 0022, which has no poses: ``python -m benchmarks.sequence07.calibration``.
+"""Finds the numbers of ``chosen.py`` by drive 0022, which has no poses.
 
-First the lens and then the corners' noise, by the likelihood of the corners themselves. Then what is wrong for many
-rows, by two halves of the corners. Last the filter's noises, by the likelihood of its readings. ``... calibration noises`` finds these alone; ``chosen.py`` is to be filled in before.
+``python -m benchmarks.sequence07.calibration`` finds first the lens and then the corners' noise, by the likelihood of
+the corners themselves. Then what is wrong for many rows, by two halves of the corners. Last the filter's noises, by the
+likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from ``chosen.py``: fill in
+what the parts before have found.
 """
 
 from __future__ import annotations
@@ -144,18 +146,17 @@ def slip(folder: Path = FOLDER, seed: int = 0) -> None:
 
 
 @torch.no_grad()
-def filter_likelihoods(tried: list[dict], folder: Path = FOLDER, skip: int = 20) -> Tensor:
-    """Log-likelihood of all readings of 0022 under the extended Kalman filter, for each of several choices ``[B]``."""
-    data = readings(folder, "0022")
+def filter_likelihoods(tried: list[dict], data: TensorDict, skip: int = 20) -> Tensor:
+    """Log-likelihood of all readings ``[T]`` under the extended Kalman filter, for each of several choices ``[B]``."""
     data = data.expand(len(tried), *data.shape).contiguous()
     together = {name: torch.tensor([values[name] for values in tried], dtype=torch.float64) for name in tried[0]}
     out = car_filter("EKF").sequence(prepared(data, together), keep=[("info", "log_likelihood")])
     return out["info", "log_likelihood"][:, skip:].sum((1, 2)).nan_to_num(-torch.inf)
 
 
-def noises(rounds: int = 14) -> None:
-    """The filter's noises: all numbers one step up and down at once, then all steps that helped, together and halved."""
-    found, best = dict(FILTER), -torch.inf
+def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
+    """The filter's noises: each number a step up and down at once, then all steps that helped, together."""
+    found, best, data = dict(FILTER), -torch.inf, readings(folder, "0022")[0]
     steps = dict.fromkeys(found, 0.8)
 
     def moved(values: dict, name: str, step: float) -> dict:
@@ -166,7 +167,7 @@ def noises(rounds: int = 14) -> None:
 
     for number in range(rounds):
         tried = [dict(found)] + [moved(found, name, sign * steps[name]) for name in found for sign in (1, -1)]
-        scores = filter_likelihoods(tried)
+        scores = filter_likelihoods(tried, data)
         gains = (scores[1:] - scores[0]).reshape(-1, 2)
         together = {}
         for name, (up, down) in zip(found, gains.tolist(), strict=True):
@@ -181,7 +182,7 @@ def noises(rounds: int = 14) -> None:
                 values = moved(values, name, share * step)
             options.append(values)
         options.append(tried[int(scores.argmax())])
-        after = filter_likelihoods(options)
+        after = filter_likelihoods(options, data)
         best, found = after.max().item(), options[int(after.argmax())]
         print(number, f"{best:.1f}", {name: round(value, 6) for name, value in found.items()}, flush=True)
         if max(steps.values()) < 0.1:

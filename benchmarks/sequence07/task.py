@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -77,11 +78,12 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
     return rows
 
 
-@cache
-def readings(folder: Path, name: str, condition: Condition = "as it is", count: int | None = None, seed: int = 0):
-    """What a filter reads, ``[T]``: motion with covariance, turn rates, masks and time steps; computed once."""
+def readings(
+    folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
+) -> TensorDict:
+    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps."""
     found = drive(folder, name, count)
-    rows = in_condition(found.rows, condition, seed)
+    rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
     motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
     out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
     out["motion"], out["motion_cov"] = motion.motion, motion.cov

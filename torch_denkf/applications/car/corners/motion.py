@@ -105,8 +105,8 @@ def corner_motion(
         seen: ``[*B, N]`` bool: which there are. Others may hold any finite number.
         camera: of both rows.
         noise: of the corners.
-        stereo_var: variance of the error of a corner's disparity that is the same in both rows, ``[*B, N]`` in pixels^2;
-            by default that of the noise, without what it has by offsets.
+        stereo_var: variance of the error of a corner's disparity that is the same in both rows, ``[*B, N]`` in
+            pixels^2; by default that of the noise, without what it has by offsets.
         start: motions to start from, ``[*B, 7]``; by default none moved.
         steps: of Gauss-Newton.
 
@@ -171,37 +171,42 @@ def corner_motions(
     row to row.
 
     Args:
-        rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[T]``.
+        rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[*B, T]``.
         camera: of the rows.
         noise: of the corners.
-        start: motions to start from, ``[T, 7]``; by default those of random samples of corners.
+        start: motions to start from, ``[*B, T, 7]``; by default those of random samples of corners.
         steps: of Gauss-Newton.
         memory: False to take each row alone.
 
     Returns:
-        Motions ``[T]``; where ``"motion_observed"`` is False, they mean nothing.
+        Motions ``[*B, T]``; where ``"motion_observed"`` is False, they mean nothing.
     """
     noise = CornerNoise() if noise is None else noise
-    before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
-    seen, offset = rows["seen"], rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
-    start = started_by_ransac(before, after, seen, camera)[0] if start is None else start
+    before, after = (camera.corners(rows["corners"][..., row, :]) for row in (0, 1))
+    seen, offset = rows["seen"], rows["corners"][..., 0, 1] - rows["corners"][..., 0, 3]
+    if start is None:
+        flat = before.flatten(0, -3), after.flatten(0, -3), seen.flatten(0, -2)
+        start = started_by_ransac(*flat, camera)[0].reshape(*rows.batch_size, 7)
     first = noise.stereo_var(before, offset, rows["repeats"] > 0)
     if not memory:
         return corner_motion(before, after, seen, camera, noise, stereo_var=first, start=start, steps=steps)
     found: list[CornerMotion] = []
-    for row in range(len(rows)):
-        mean, var, came = torch.zeros_like(first[row]), first[row], rows["came_from"][row]
+    for row in range(rows.batch_size[-1]):
+        var, came, there = first[..., row, :], rows["came_from"][..., row, :], seen[..., row, :]
+        mean = torch.zeros_like(var)
         if found:
-            known = (came >= 0) & seen[row - 1][came]
-            mean = torch.where(known, found[-1].stereo[came], mean)
-            var = torch.where(known, found[-1].stereo_var[came].minimum(var) + noise.stereo_walk**2, var)
+            place = came.clamp_min(0)
+            known = (came >= 0) & seen[..., row - 1, :].gather(-1, place)
+            mean = torch.where(known, found[-1].stereo.gather(-1, place), mean)
+            kept = found[-1].stereo_var.gather(-1, place).minimum(var)
+            var = torch.where(known, kept + noise.stereo_walk**2, var)
         less = torch.stack([torch.zeros_like(mean), torch.zeros_like(mean), mean], -1)
-        corners = before[row] - less, after[row] - less, seen[row]
-        one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[row], steps=steps)
+        corners = before[..., row, :, :] - less, after[..., row, :, :] - less, there
+        one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[..., row, :], steps=steps)
         sound = one.weight > LEAST  # the others tell nothing of their disparity
         mean, var = mean + torch.where(sound, one.stereo, 0.0), torch.where(sound, one.stereo_var / one.weight, var)
         found.append(one._replace(stereo=mean, stereo_var=var))
-    return CornerMotion(*(torch.stack(entry) for entry in zip(*found, strict=True)))
+    return CornerMotion(*(torch.stack(entry, rows.ndim - 1) for entry in zip(*found, strict=True)))
 
 
 def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
