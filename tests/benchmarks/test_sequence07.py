@@ -96,14 +96,14 @@ def test_corners_are_lost_or_wrong_as_a_condition_says():
     assert rows["corners"].eq(0).all()
 
 
-def test_a_filter_is_nearer_than_its_readings_and_its_smoother_nearer_still():
+def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
     data, poses = driven(120)
     out = run(RTSSmoother(car_filter("EKF")), prepared(and_one_more(data)))
     paths = [chained(one["motion"], one["motion_observed"].squeeze(-1), one["dt"]) for one in data]
     paths = [torch.stack(paths), pose_of(out)[0], pose_of(out, "smoothed")[0]]
     steps = [SE3().compose(SE3().inverse(path[:, :-1]), path[:, 1:]) for path in (*paths, poses)]
     errors = [SE3().minus(step, steps[-1]).square().mean().sqrt() for step in steps[:-1]]
-    assert errors[2] < errors[1] < errors[0]
+    assert errors[2] < 0.95 * min(errors[:2])
 
 
 @pytest.mark.skipif(not DRIVE.exists(), reason="the drive is not here")
