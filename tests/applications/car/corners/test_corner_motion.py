@@ -1,14 +1,25 @@
 """The motion that stereo corners show: of drawn points, and of a real drive."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
 
 from tests.real_data import KITTI, SHARED
 from torch_denkf.applications.car import kitti_devkit_error
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.applications.car.corners.drive import corner_replay, read_corner_drive
-from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motion, started_by_ransac
+from torch_denkf.applications.car.corners.motion import (
+    CornerNoise,
+    corner_motion,
+    corner_motions,
+    started_by_ransac,
+)
 from torch_denkf.applications.car.kitti.files import read_poses
+from torch_denkf.envs import ReplayEnv
 from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate
 
 CAMERA = StereoCamera(700.0, (600.0, 180.0), 0.54)
@@ -70,16 +81,111 @@ def test_wrong_corners_are_left_out():
     assert found.weight[:, ::5].median() < 0.01 * found.weight[:, 1::5].median()
 
 
+def test_what_a_rectification_has_left_is_taken_off():
+    """A corner is moved outwards, and its right image so far that its disparity is short of a polynomial."""
+    radial, short = (0.004, 0.03, -0.01), (0.4, 0.3, 0.0, 0.0, -2.0, 0.0, 1.0)
+    camera = replace(CAMERA, radial=radial, disparity_offset=short)
+    pixels = torch.tensor([[900.0, 250.0, 880.0, 250.0]])
+    x, y = 300 / 700, 70 / 700
+    square = x**2 + y**2
+    factor = 1 - radial[0] - radial[1] * square - radial[2] * square**2
+    right = (280 / 700) ** 2 + y**2
+    beside = 280 * (1 - radial[0] - radial[1] * right - radial[2] * right**2)
+    offset = 0.4 + 0.3 * x - 2.0 * x * y + square**2
+    expected = torch.tensor([[600 + 300 * factor, 180 + 70 * factor, 300 * factor - beside + offset]])
+    assert_close(camera.corners(pixels), expected)
+    assert_close(CAMERA.corners(pixels), torch.tensor([[900.0, 250.0, 20.0]]))
+
+
+def test_wrong_disparities_do_not_make_the_way_shorter():
+    """Least squares on points that are wrong shorten the way, here by 6 of 10,000."""
+    noise = CornerNoise(0.06, 0.0, 0.05, 0.0, 0.45, 0.0, freedom=200.0)
+    before, after, seen, motion = drawn(1000)
+    stays = noise.stereo * torch.randn(1000, 60)
+    after[..., :2] += noise.pixel * torch.randn(1000, 60, 2)
+    for corners in (before, after):
+        corners[..., 2] += stays + noise.disparity * torch.randn(1000, 60)
+    ahead = SE3().minus(corner_motion(before, after, seen, CAMERA, noise).motion, motion)[:, 5]
+    assert ahead.mean().abs() < 3 * ahead.std() / 1000**0.5
+
+
+def rows_of(count=8, batch=40, corners=60, stereo=0.5, seed=0):
+    """Drawn drives of a few rows, each with the same corners; their disparities are wrong, and stay so."""
+    torch.manual_seed(seed)
+    step = SE3().exp(torch.tensor([0.0, 0.01, 0.0, 0.0, 0.0, 1.0]))
+    drives = []
+    for _ in range(batch):
+        points = torch.randn(corners, 3) * torch.tensor([8.0, 2.0, 10.0]) + torch.tensor([0.0, 0.0, 40.0])
+        points[:, 2] = points[:, 2].clamp_min(15.0)
+        wrong, places = stereo * torch.randn(corners), []
+        for _ in range(count):
+            corner = CAMERA.project(points)
+            corner[:, :2] += 0.05 * torch.randn(corners, 2)
+            right = corner[:, 0] - corner[:, 2] - wrong + 0.05 * torch.randn(corners)
+            places.append(torch.stack([corner[:, 0], corner[:, 1], right, corner[:, 1]], -1))
+            points = rotate(SO3().inverse(step[:4]).expand(corners, 4), points - step[4:])
+        pairs = torch.stack([torch.stack([places[max(row - 1, 0)], places[row]], 1) for row in range(count)])
+        rows = TensorDict({"corners": pairs, "seen": torch.ones(count, corners, dtype=torch.bool)}, [count])
+        rows["came_from"] = torch.arange(corners).expand(count, corners).clone()
+        rows["came_from"][:2] = -1
+        rows["repeats"] = torch.zeros(count, corners, dtype=torch.int64)
+        rows["seen"][0] = False
+        drives.append(rows)
+    return drives, step
+
+
+def test_what_corners_have_shown_makes_later_motions_better():
+    """To the side; of the way ahead, corners that are all remembered tell no more than their first row did."""
+    drives, step = rows_of()
+    noise = CornerNoise(0.07, 0.0, 0.05, 0.0, 0.5, 0.0, stereo_walk=0.02, freedom=20.0)
+    errors = {}
+    for memory in (False, True):
+        found = [corner_motions(rows, CAMERA, noise, memory=memory).motion[-1] for rows in drives]
+        errors[memory] = SE3().minus(torch.stack(found), step).square().mean(0).sqrt()
+    assert errors[True][3] < 0.8 * errors[False][3]
+    assert (errors[True] < 1.2 * errors[False]).all()
+
+
+def test_a_corner_that_is_wrong_once_spoils_no_later_row():
+    drives, step = rows_of(batch=10)
+    noise = CornerNoise(0.07, 0.0, 0.05, 0.0, 0.5, 0.0, stereo_walk=0.02, freedom=2.0)
+    sound = [corner_motions(rows, CAMERA, noise).motion for rows in drives]
+    for rows in drives:
+        rows["corners"][:, ::5, 1] += 30 * torch.randn(len(rows), 12, 4)
+    spoilt = [corner_motions(rows, CAMERA, noise).motion for rows in drives]
+    errors = [SE3().minus(torch.stack(found)[:, 1:], step).square().mean((0, 1)).sqrt() for found in (sound, spoilt)]
+    assert (errors[1] < 1.5 * errors[0]).all()
+
+
+def test_a_file_is_read_as_rows(tmp_path):
+    """Three corners: one from the start, one that is new in row 2; row 3 repeats row 2, and the third is new there."""
+    features = -torch.ones(4, 3, 5)
+    features[:, 0] = torch.tensor([[10.0, 11.0, 12.0, 12.0, 13.0]])
+    features[:, 1, 2:] = torch.tensor([[20.0, 20.0, 21.0]])
+    features[:, 2, 3:] = torch.tensor([[30.0, 31.0]])
+    stored = {"features": features, "K": torch.diag(torch.tensor([700.0, 700.0, 1.0])), "b": torch.tensor(0.5)}
+    stored |= {
+        "cam_T_imu": torch.eye(4),
+        "rotational_velocity": torch.zeros(3, 5),
+        "time_stamps": torch.arange(5)[None],
+    }
+    np.savez(tmp_path / "drive.npz", **{key: value.numpy() for key, value in stored.items()})
+    rows, _ = read_corner_drive(tmp_path / "drive.npz")
+    assert rows["motion_observed"].flatten().tolist() == [False, True, True, False, True]
+    assert rows["seen"].sum(-1).tolist() == [0, 1, 1, 2, 3]
+    assert rows["came_from"].tolist() == [[-1] * 3, [-1] * 3, [0, -1, -1], [0, -1, -1], [-1] * 3]
+    assert rows["repeats"][4].tolist() == [1, 1, 0]
+
+
 @pytest.mark.skipif(not DRIVE.exists(), reason="the drive is not here")
 def test_a_real_drive():
     """Odometry sequence 07: 400 rows of it, of which some repeat the corners of the row before."""
     rows, camera = read_corner_drive(DRIVE, 400)
     assert rows["motion_observed"].shape == (400, 1)
     assert 20 < (~rows["motion_observed"]).sum() < 60
-    corners, offset = rows["corners"], rows["corners"][:, :, 0, 1] - rows["corners"][:, :, 0, 3]
-    before, after = (camera.corners(corners[:, :, row]) for row in (0, 1))
+    before, after = (camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
     start, _ = started_by_ransac(before, after, rows["seen"], camera)
-    found = corner_motion(before, after, rows["seen"], camera, offset=offset, start=start).motion
+    found = corner_motions(rows, camera, start=start).motion
     matrices = torch.as_tensor(read_poses(KITTI / "poses" / "07.txt"))[:400]
     truth = torch.cat([quaternion_of(matrices[:, :3, :3]), matrices[:, :3, 3]], -1)
     errors = []
@@ -93,5 +199,7 @@ def test_a_real_drive():
     # OpenCV's poses with the last motion held over repeats: 1.77 % on the whole sequence.
     assert errors[0].translation < 3.0
     assert errors[1].translation < errors[0].translation
-    replay = corner_replay({"07": rows})
-    assert len(replay) == 400
+    replay = corner_replay({"07": rows.exclude("corners", "seen", "came_from", "repeats")})
+    rollout = ReplayEnv(replay).rollout(20)
+    assert_close(rollout["gyro"], rows["gyro"][: len(rollout)])
+    assert rollout["motion_observed"].equal(rows["motion_observed"][: len(rollout)])

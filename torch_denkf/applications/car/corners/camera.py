@@ -14,29 +14,32 @@ __all__ = ["StereoCamera"]
 class StereoCamera:
     """A rectified stereo camera. Its axes: x to the right, y down, z ahead, from the left lens.
 
-    A corner is (u left, v left, disparity) in pixels here, ``[*, 3]``. The lens may be left with a little distortion:
-    an image's radius is too large by the factor ``1 + radial[0] r^2 + radial[1] r^4``, with r the distance from the
-    centre over the focal length.
+    A corner is (u left, v left, disparity) in pixels here, ``[*, 3]``. The rectification may have left a little. Below,
+    x and y are a corner's place from the centre, over the focal length, and r is the root of x^2 + y^2.
 
     Attributes:
         focal: focal length in pixels.
         center: where the optical axis meets the images, (u, v) in pixels.
         baseline: distance of the lenses in m.
-        radial: what the rectification has left of the distortion.
-        disparity_offset: in pixels, what corners' disparities are short of.
+        radial: an image's radius is too large by the factor ``1 + radial[0] + radial[1] r^2 + radial[2] r^4``.
+        disparity_offset: what disparities are short of, in pixels: what to multiply 1, x, y, x^2, xy, y^2 and r^4 with,
+            or the first of it.
     """
 
     focal: float
     center: tuple[float, float]
     baseline: float
-    radial: tuple[float, float] = (0.0, 0.0)
-    disparity_offset: float = 0.0
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    disparity_offset: tuple[float, ...] = (0.0,)
 
     def corners(self, pixels: Tensor) -> Tensor:
         """Corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""
         left, right = self._undistorted(pixels[..., :2]), self._undistorted(pixels[..., 2:])
-        disparity = left[..., :1] - right[..., :1] + self.disparity_offset
-        return torch.cat([left, disparity], -1)
+        x, y = ((pixels[..., :2] - torch.tensor(self.center).to(pixels)) / self.focal).unbind(-1)
+        powers = [torch.ones_like(x), x, y, x.square(), x * y, y.square(), (x.square() + y.square()).square()]
+        short = sum(number * power for number, power in zip(self.disparity_offset, powers, strict=False))
+        disparity = left[..., 0] - right[..., 0] + short
+        return torch.cat([left, disparity.unsqueeze(-1)], -1)
 
     def points(self, corners: Tensor) -> Tensor:
         """Points ``[*, 3]`` in m of corners ``[*, 3]``."""
@@ -69,5 +72,5 @@ class StereoCamera:
         center = torch.tensor(self.center).to(pixels)
         away = (pixels - center) / self.focal
         square = away.square().sum(-1, keepdim=True)
-        factor = 1 - self.radial[0] * square - self.radial[1] * square.square()
+        factor = 1 - self.radial[0] - self.radial[1] * square - self.radial[2] * square.square()
         return center + self.focal * away * factor

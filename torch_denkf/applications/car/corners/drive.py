@@ -35,6 +35,8 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
         ===================== ============ =======================================================================
         ``corners``           [T,N,2,4]    in the row before and in this one, pixels; zero where there are fewer
         ``seen``              [T,N]        bool: which there are
+        ``came_from``         [T,N]        int64: where a corner stands in the row before; -1 for a new one
+        ``repeats``           [T,N]        int64: how many rows that repeat the one before a corner has been through
         ``motion_observed``   [T,1]        bool: there are corners, and the row repeats none
         ``gyro``              [T,3]        rad/s about the camera's axes
         ``gyro_observed``     [T,1]        bool: True
@@ -55,12 +57,13 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
         features, matrix, baseline, to_camera, rates, stamps = (np.asarray(stored[name], np.float64) for name in names)
     count = features.shape[-1] if rows is None else rows
     features = features[..., :count]
-    corners, seen, repeats = _pairs(features)
+    pairs = _pairs(features)
     time = torch.as_tensor(stamps[0, :count] - stamps[0, 0]).unsqueeze(-1)
     steps = time.diff(dim=0)
     gyro = torch.as_tensor(rates[:, :count].T @ to_camera[:3, :3].T)
-    data = TensorDict({"corners": corners, "seen": seen, "gyro": gyro, "time": time}, [count])
-    data["motion_observed"] = seen.any(-1, keepdim=True) & ~repeats.unsqueeze(-1)
+    again = pairs.pop("again")
+    data = TensorDict({**pairs, "gyro": gyro, "time": time}, [count])
+    data["motion_observed"] = data["seen"].any(-1, keepdim=True) & ~again.unsqueeze(-1)
     data["gyro_observed"] = torch.ones(count, 1, dtype=torch.bool)
     data["dt"] = torch.cat([steps[:1], steps])
     data["step"] = torch.arange(count).unsqueeze(-1)
@@ -82,16 +85,24 @@ def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
     return EpisodeReplay(rows, episodes, for_tests=lambda episode: False, **options)
 
 
-def _pairs(features: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-    """Corners of neighbouring rows side by side ``[T, N, 2, 4]``, which there are ``[T, N]``, and repeats ``[T]``."""
+def _pairs(features: np.ndarray) -> dict[str, Tensor]:
+    """Corners of neighbouring rows side by side, with the keys of :func:`read_corner_drive`; which rows are repeats."""
     there = (features != -1).all(0)
     both = there[:, 1:] & there[:, :-1]
-    most, count = max(int(both.sum(0).max()), 1), features.shape[-1]
+    most, count, tracks = max(int(both.sum(0).max()), 1), features.shape[-1], len(there)
     corners, seen = np.zeros((count, most, 2, 4)), np.zeros((count, most), bool)
-    repeats = np.zeros(count, bool)
+    came_from, repeats = np.full((count, most), -1), np.zeros((count, most), int)
+    again, survived = np.zeros(count, bool), np.zeros(tracks, int)
+    places = np.full(tracks, -1)  # of tracks in the row before
     for row in range(1, count):
         which = np.flatnonzero(both[:, row - 1])
         pair = features[:, which, row - 1 : row + 1].transpose(1, 2, 0)
         corners[row, : len(which)], seen[row, : len(which)] = pair, True
-        repeats[row] = len(which) > 0 and bool((pair[:, 0] == pair[:, 1]).all())
-    return torch.as_tensor(corners), torch.as_tensor(seen), torch.as_tensor(repeats)
+        again[row] = len(which) > 0 and bool((pair[:, 0] == pair[:, 1]).all())
+        survived[which] += again[row]
+        came_from[row, : len(which)], repeats[row, : len(which)] = places[which], survived[which]
+        places[:] = -1
+        if not again[row]:  # behind a repeat, a corner is another point of the world
+            places[which] = np.arange(len(which))
+    found = {"corners": corners, "seen": seen, "came_from": came_from, "repeats": repeats, "again": again}
+    return {key: torch.as_tensor(value) for key, value in found.items()}

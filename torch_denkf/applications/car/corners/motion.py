@@ -9,12 +9,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.functional.manifolds import SE3, SO3, quaternion_of, rotate, rotation_matrix, skew
 
-__all__ = ["CornerMotion", "CornerNoise", "corner_motion", "started_by_ransac"]
+__all__ = ["CornerMotion", "CornerNoise", "corner_motion", "corner_motions", "started_by_ransac"]
+
+
+LEAST = 0.03  # weight of a corner that is not wrong
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,9 @@ class CornerNoise:
         disparity_per_flow: what a pixel of flow adds to it.
         stereo: of the disparity's error that stays with a corner: its right image shows not quite the same point.
         stereo_per_offset: what a pixel of difference between the heights in both images adds to it.
+        stereo_per_disparity: what a pixel of disparity adds to it.
+        stereo_stale: what it is multiplied with where a corner has been through rows that repeat the one before.
+        stereo_walk: how much it changes from row to row.
         freedom: degrees of freedom of Student's t, by which outliers count less.
     """
 
@@ -37,7 +44,22 @@ class CornerNoise:
     disparity_per_flow: float = 0.003
     stereo: float = 0.45
     stereo_per_offset: float = 0.8
+    stereo_per_disparity: float = 0.0
+    stereo_stale: float = 1.0
+    stereo_walk: float = 0.1
     freedom: float = 1.4
+
+    def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
+        """Variance of the error that stays with a corner, ``[*]`` in pixels^2, before anything is seen of it.
+
+        Args:
+            corners: (u, v, disparity), ``[*, 3]``.
+            offset: difference of each corner's heights in both images, ``[*]`` in pixels.
+            stale: ``[*]`` bool: which have been through a row that repeats the one before.
+        """
+        var = self.stereo**2 + (self.stereo_per_disparity * corners[..., 2]).square()
+        var = var + (self.stereo_per_offset * offset).square()
+        return torch.where(stale, self.stereo_stale**2 * var, var)
 
 
 class CornerMotion(NamedTuple):
@@ -48,12 +70,16 @@ class CornerMotion(NamedTuple):
         cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
         log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
         weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
+        stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
+        stereo_var: of it.
     """
 
     motion: Tensor
     cov: Tensor
     log_likelihood: Tensor
     weight: Tensor
+    stereo: Tensor
+    stereo_var: Tensor
 
 
 def corner_motion(
@@ -63,7 +89,7 @@ def corner_motion(
     camera: StereoCamera,
     noise: CornerNoise | None = None,
     *,
-    offset: Tensor | None = None,
+    stereo_var: Tensor | None = None,
     start: Tensor | None = None,
     steps: int = 12,
 ) -> CornerMotion:
@@ -79,7 +105,8 @@ def corner_motion(
         seen: ``[*B, N]`` bool: which there are. Others may hold any finite number.
         camera: of both rows.
         noise: of the corners.
-        offset: difference of each corner's heights in both images, ``[*B, N]`` in pixels; zero by default.
+        stereo_var: variance of the error of a corner's disparity that is the same in both rows, ``[*B, N]`` in
+            pixels^2; by default that of the noise, without what it has by offsets.
         start: motions to start from, ``[*B, 7]``; by default none moved.
         steps: of Gauss-Newton.
 
@@ -90,20 +117,26 @@ def corner_motion(
     seen = seen & (before[..., 2] > 0.5) & (after[..., 2] > 0.5)
     before = torch.where(seen.unsqueeze(-1), before, before.new_tensor([*camera.center, 10.0]))
     after = torch.where(seen.unsqueeze(-1), after, before)
-    points, of_corner = camera.points(before), camera.jacobian_of_points(before)
-    stays = noise.stereo**2 + (0.0 if offset is None else (noise.stereo_per_offset * offset).square())
+    zero = torch.zeros_like(before[..., 2])
+    stays = noise.stereo_var(before, zero, zero.bool()) if stereo_var is None else stereo_var
+    wrong = torch.zeros_like(stays)  # how much too small a disparity of the earlier row is
     pose = SE3().neutral(before).expand(*before.shape[:-2], 7) if start is None else start
-    ridge = 1e-6 * torch.eye(6).to(before)
+    ridge, own = 1e-6 * torch.eye(6).to(before), before.new_tensor([0.0, 0.0, 1.0])
     for step in range(steps + 1):
+        true = before + wrong.unsqueeze(-1) * own
+        points, of_corner = camera.points(true), camera.jacobian_of_points(true)
         turn, moved = rotation_matrix(pose[..., :4]).unsqueeze(-3), points - pose[..., None, 4:]
         moved = rotate(SO3().inverse(pose[..., None, :4]), moved)
         ahead = seen & (moved[..., 2] > 1.0)
         moved = torch.where(ahead.unsqueeze(-1), moved, moved.new_tensor([0.0, 0.0, 10.0]))
         shown, slope = camera.project(moved), camera.jacobian(moved)
-        left = torch.where(ahead.unsqueeze(-1), after - shown, 0.0)
-        through = slope @ turn.mT @ of_corner
-        cov = _covariance(through[..., 2], (shown - before)[..., :2].square().sum(-1), stays, noise)
+        through = (slope @ turn.mT @ of_corner)[..., 2]
+        left = torch.where(ahead.unsqueeze(-1), after - shown + through * wrong.unsqueeze(-1), 0.0)
+        cov = _covariance(through, (shown - before)[..., :2].square().sum(-1), stays, noise)
         inverse = torch.linalg.inv(cov)
+        both = (stays + noise.disparity**2).unsqueeze(-1) * through - stays.unsqueeze(-1) * own
+        likely = (both.unsqueeze(-2) @ inverse @ left.unsqueeze(-1))[..., 0, 0]
+        wrong = likely.maximum(0.5 - before[..., 2])
         nis = (left.unsqueeze(-2) @ inverse @ left.unsqueeze(-1))[..., 0, 0]
         weight = torch.where(ahead, (noise.freedom + 3) / (noise.freedom + nis), 0.0)
         jacobian = slope @ torch.cat([skew(moved), -torch.eye(3).to(moved).expand_as(slope)], -1)
@@ -113,10 +146,67 @@ def corner_motion(
             change = torch.linalg.solve(information, (weighted @ left.unsqueeze(-1)).sum(-3)).squeeze(-1)
             pose = SE3().plus(pose, change.clamp(-1, 1))
     density = -0.5 * torch.logdet(cov) - 0.5 * (noise.freedom + 3) * torch.log1p(nis / noise.freedom)
-    constant = math.lgamma((noise.freedom + 3) / 2) - math.lgamma(noise.freedom / 2)
-    density = density + constant - 1.5 * math.log(noise.freedom * math.pi)
+    freedom = torch.as_tensor(noise.freedom).to(before)
+    constant = torch.lgamma((freedom + 3) / 2) - torch.lgamma(freedom / 2) - 1.5 * (freedom * math.pi).log()
+    density = density + constant
     mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
-    return CornerMotion(pose, torch.linalg.inv(information), mean, weight)
+    gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # of the error that stays
+    error = (gain @ left.unsqueeze(-1))[..., 0, 0]
+    var = stays - stays * (gain @ (own - through).unsqueeze(-1))[..., 0, 0]
+    return CornerMotion(pose, torch.linalg.inv(information), mean, weight, error, var)
+
+
+def corner_motions(
+    rows: TensorDict,
+    camera: StereoCamera,
+    noise: CornerNoise | None = None,
+    *,
+    start: Tensor | None = None,
+    steps: int = 6,
+    memory: bool = True,
+) -> CornerMotion:
+    """The motion of each row since the row before; what a corner has shown of its disparity is remembered.
+
+    A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
+    row to row.
+
+    Args:
+        rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[*B, T]``.
+        camera: of the rows.
+        noise: of the corners.
+        start: motions to start from, ``[*B, T, 7]``; by default those of random samples of corners.
+        steps: of Gauss-Newton.
+        memory: False to take each row alone.
+
+    Returns:
+        Motions ``[*B, T]``; where ``"motion_observed"`` is False, they mean nothing.
+    """
+    noise = CornerNoise() if noise is None else noise
+    before, after = (camera.corners(rows["corners"][..., row, :]) for row in (0, 1))
+    seen, offset = rows["seen"], rows["corners"][..., 0, 1] - rows["corners"][..., 0, 3]
+    if start is None:
+        flat = before.flatten(0, -3), after.flatten(0, -3), seen.flatten(0, -2)
+        start = started_by_ransac(*flat, camera)[0].reshape(*rows.batch_size, 7)
+    first = noise.stereo_var(before, offset, rows["repeats"] > 0)
+    if not memory:
+        return corner_motion(before, after, seen, camera, noise, stereo_var=first, start=start, steps=steps)
+    found: list[CornerMotion] = []
+    for row in range(rows.batch_size[-1]):
+        var, came, there = first[..., row, :], rows["came_from"][..., row, :], seen[..., row, :]
+        mean = torch.zeros_like(var)
+        if found:
+            place = came.clamp_min(0)
+            known = (came >= 0) & seen[..., row - 1, :].gather(-1, place)
+            mean = torch.where(known, found[-1].stereo.gather(-1, place), mean)
+            kept = found[-1].stereo_var.gather(-1, place).minimum(var)
+            var = torch.where(known, kept + noise.stereo_walk**2, var)
+        less = torch.stack([torch.zeros_like(mean), torch.zeros_like(mean), mean], -1)
+        corners = before[..., row, :, :] - less, after[..., row, :, :] - less, there
+        one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[..., row, :], steps=steps)
+        sound = one.weight > LEAST  # the others tell nothing of their disparity
+        mean, var = mean + torch.where(sound, one.stereo, 0.0), torch.where(sound, one.stereo_var / one.weight, var)
+        found.append(one._replace(stereo=mean, stereo_var=var))
+    return CornerMotion(*(torch.stack(entry, rows.ndim - 1) for entry in zip(*found, strict=True)))
 
 
 def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, noise: CornerNoise) -> Tensor:
@@ -134,7 +224,7 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
     disparity = noise.disparity**2 + noise.disparity_per_flow**2 * flow2
     cov = torch.diag_embed(torch.stack([place, place, disparity], -1))
     stays = torch.as_tensor(stays).to(place).expand_as(place)
-    for vector, variance in ((same, stays), (by_disparity, torch.full_like(place, noise.disparity**2))):
+    for vector, variance in ((same, stays), (by_disparity, torch.zeros_like(place) + noise.disparity**2)):
         cov = cov + variance[..., None, None] * vector.unsqueeze(-1) * vector.unsqueeze(-2)
     return cov
 

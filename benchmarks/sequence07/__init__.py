@@ -1,0 +1,1 @@
+"""A whole drive of KITTI by stereo corners and turn rates."""

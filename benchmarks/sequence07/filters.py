@@ -1,0 +1,204 @@
+"""The filters: a car's pose, its twist and a gyro's bias, by motions that corners show and by turn rates."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from benchmarks.sequence07.chosen import FILTER, SLIP, SLIP_KEPT
+from torch_denkf import Filter, FusedFilter, FusedSensor
+from torch_denkf.functional.manifolds import SE3, Euclidean, Product
+from torch_denkf.modules import (
+    AroundState,
+    EnsembleAnalysis,
+    GaussianAround,
+    MappedNoise,
+    NoisyTransition,
+    SubModel,
+    UKFTransition,
+)
+from torch_denkf.monitoring import Gated
+from torch_denkf.motions.motion import Motion
+
+__all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
+
+Kind = Literal["EKF", "UKF", "DEnKF"]
+DT = 0.1037  # s, of a typical row; the length of each is read
+#: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
+#: in rad/s; the slip.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
+POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
+SWAYS = [0, 1, 2, 5]  # of the twist
+#: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
+
+
+class CarMotion(Motion):
+    """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
+
+    A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
+    The pose also moves by the slip, which is what corners do not show of the twist, because the same corners are wrong
+    for many rows. No sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+
+    The pose trails so that the row's own readings correct the twist before it moves the pose.
+    """
+
+    def __init__(self):
+        keys = {"kept": 6, "swing": 4}
+        super().__init__(SPACE, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
+
+    def move(self, state, kept, swing, *, dt):
+        """The pose moved by twist and slip; the twist that is kept."""
+        pose, twist, change, bias, slip = self.space.points(state)
+        change = swing * change
+        after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
+        moved = SE3().plus(pose, (twist + slip) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, SLIP_KEPT * slip], -1)
+
+
+class LastMotion(SubModel):
+    """The motion since the row before, ``[*B, E, 7]``: a point of SE3."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
+
+    def compute(self, ensemble, dt):
+        """Where the twist leads in the time of a row."""
+        return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+
+
+class WhitenedMotion(SubModel):
+    """How far a member's motion is from the reading, ``[*B, E, 6]``, in standard deviations that are independent.
+
+    An ensemble's update takes variances and no covariance. The reading of this model is zero, with variances of one.
+    """
+
+    def __init__(self):
+        keys = [("forecast", "ensemble"), "dt", "motion", "motion_noise"]
+        super().__init__(nn.Identity(), keys, [("forecast", "observation")])
+
+    def compute(self, ensemble, dt, motion, cov):
+        """The tangent between both motions, by the root of its covariance."""
+        moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+        away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
+        return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
+
+
+class TurnRate(SubModel):
+    """What the gyro reads, ``[*B, E, 3]`` in rad/s."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
+
+    def compute(self, ensemble):
+        """The twist's turn and the bias."""
+        return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
+
+
+class Given(SubModel):
+    """Hands an entry on, under another key."""
+
+    def __init__(self, in_key, out_key, size: int):
+        super().__init__(nn.Identity(), [in_key], [out_key])
+        self.observation_dim = size
+
+    def compute(self, value):
+        """The same."""
+        return value
+
+
+def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
+    """Poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
+
+    Args:
+        out: of a filter's sequence, ``[*B, T]``. The pose trails, so that of a row is forecast for the next one.
+        prefix: ``"belief"`` or ``"smoothed"``.
+    """
+    prefix = "forecast" if prefix == "belief" else prefix
+    if (prefix, "ensemble") in out.keys(True):
+        members = out[prefix, "ensemble"][..., 1:, :, POSE]
+        first = members[..., :1, :]
+        away = SE3().minus(members, first.expand_as(members))
+        mean = SE3().plus(first.squeeze(-2), away.mean(-2))
+        return mean, SE3().minus(members, mean.unsqueeze(-2).expand_as(members)).var(-2)
+    var = out[prefix, "cov"].diagonal(dim1=-2, dim2=-1) if (prefix, "cov") in out.keys(True) else out[prefix, "var"]
+    return out[prefix, "mean"][..., 1:, POSE], var[..., 1:, :6]
+
+
+def process_noise() -> MappedNoise:
+    """What a row adds: noise of the twist, of the bias, of the slip."""
+    through = torch.zeros(25, 15, dtype=torch.float64)
+    through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
+    through[16:, 6:] = torch.eye(9)
+    return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
+
+
+def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
+    """Readings with the noises that a filter is to believe.
+
+    Args:
+        readings: ``[*B, T]``.
+        values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
+        start: state of the first row, with its own pose, ``[*B, 26]``; by default at the origin, standing still.
+    """
+    values = FILTER if values is None else values
+    data = readings.clone()
+    before = data["dt"].roll(1, -2)
+    before[..., :2, :] = 0  # the first row's pose is known
+    data["dt_before"] = before
+
+    def several(*names: str) -> Tensor:
+        numbers = torch.stack([torch.as_tensor(values[name], dtype=torch.float64) for name in names], -1)
+        return (numbers.unsqueeze(-2) if numbers.ndim > 1 else numbers).expand(*data.shape, len(names))
+
+    walks = several("pitch", "yaw", "roll", "side", "down", "ahead")
+    bias = torch.full_like(walks[..., :3], 1e-5)
+    slip = (1 - SLIP_KEPT**2) ** 0.5 * torch.tensor(SLIP, dtype=torch.float64).expand(*data.shape, 6)
+    data["process"] = torch.cat([walks, bias, slip], -1).square()
+    data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll", "swing_ahead")
+    share = several("kept_pitch", "kept_yaw", "kept_roll", "kept_side", "kept_side")
+    data["kept"] = torch.cat([share, torch.ones_like(share[..., :1])], -1)
+    floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
+    scale = several("scale").square().unsqueeze(-1)
+    data["motion_noise"] = scale * data["motion_cov"] + torch.diag_embed(floor)
+    data["whitened"] = torch.zeros_like(data["motion"][..., :6])
+    data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
+    origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
+    data["start"] = origin.expand(*data.shape, 26).contiguous()
+    return data
+
+
+def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again: bool = False, **analysis) -> Filter:
+    """A filter of all three parts of the state.
+
+    Args:
+        kind: of filter.
+        members: of the ensemble.
+        gate: options of :class:`~torch_denkf.monitoring.Gated` around the corners' update; ``None`` for none.
+        again: whether the start is a belief of a filter that has run before.
+        **analysis: options of the ensemble's analyses.
+    """
+    seen = {"observed_key": "motion_observed"}
+    sensors = {
+        "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
+        "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
+    }
+    std = [*(RESTART if again else START), *SLIP]
+    motion, noise = CarMotion(), process_noise()
+    if kind == "DEnKF":
+        initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)
+        sensors["motion"] = FusedSensor(WhitenedMotion(), [1.0] * 6, observation_key="whitened", **seen)
+        made = partial(EnsembleAnalysis, "etkf", **analysis)
+        filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
+    else:
+        initial = GaussianAround(std, state_key="start", space=SPACE)
+        if kind == "UKF":
+            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
+        else:
+            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
+    return filter if gate is None else Gated(filter, **gate)

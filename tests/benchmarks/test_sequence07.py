@@ -1,0 +1,119 @@
+"""Intervals on simulated drives, what happens to corners, and a run of a few rows."""
+
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+
+from benchmarks.sequence07 import study
+from benchmarks.sequence07.filters import DT, POSE, SPACE, SWAYS, CarMotion, car_filter, pose_of, prepared
+from benchmarks.sequence07.study import Claim, and_one_more, claimed, run, windows
+from benchmarks.sequence07.task import EVERY, LOST, WRONG, chained, in_condition
+from tests.real_data import KITTI, SHARED
+from torch_denkf.functional.manifolds import SE3
+from torch_denkf.smoothers import RTSSmoother
+
+DRIVE = SHARED / "kitti_inertial" / "0027.npz"
+
+
+@pytest.fixture(autouse=True)
+def _double(float64):
+    return
+
+
+def driven(count=240, runs=4, seed=0):
+    """Drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
+    torch.manual_seed(seed)
+    data = TensorDict({"motion": SE3().neutral(torch.zeros(7)).expand(runs, count, 7).clone()}, [runs, count])
+    data["motion_cov"] = torch.diag_embed(torch.tensor([1e-4] * 3 + [2e-3] * 3).square()).expand(runs, count, 6, 6)
+    data["dt"] = torch.full((runs, count, 1), DT)
+    data["gyro"] = torch.zeros(runs, count, 3)
+    data["gyro_observed"] = torch.ones(runs, count, 1, dtype=torch.bool)
+    data["motion_observed"] = (torch.arange(count) % 9 > 0).reshape(1, count, 1).expand(runs, count, 1).clone()
+    believed, motion = prepared(data), CarMotion()
+    state = SPACE.perturb(
+        SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25)
+    )
+    state[:, 12] += 6.0
+    states = [state]
+    for row in range(1, count + 1):
+        noise = believed["process"][:, 0].sqrt() * torch.randn(runs, 15)
+        step = torch.cat([torch.zeros(runs, 6), noise[:, :6], noise[:, SWAYS], noise[:, 6:]], -1)
+        dt = torch.full((runs, 1), DT if row > 1 else 0.0)
+        state = SPACE.plus(motion.move(state, believed["kept"][:, 0], believed["swing"][:, 0], dt=dt), step)
+        states.append(state)
+    states = torch.stack(states, 1)
+    poses, states = states[:, 1:, POSE], states[:, :-1]
+    root = torch.linalg.cholesky(believed["motion_noise"])
+    error = (root @ torch.randn(runs, count, 6, 1)).squeeze(-1)
+    data["motion"] = SE3().plus(SE3().exp(states[..., 7:13] * DT), error)
+    gyro = believed["gyro_noise"].sqrt() * torch.randn(runs, count, 3)
+    data["gyro"] = states[..., 7:10] + states[..., 17:20] + gyro
+    return data, poses
+
+
+def test_intervals_hold_what_they_claim_of_errors_that_are_drawn():
+    truth, var = SE3().exp(0.1 * torch.randn(500, 2, 6)), torch.rand(500, 2, 6) * 1e-4
+    mean = SE3().perturb(truth, var.sqrt(), torch.randn(500, 2, 6))
+    held = Claim(mean, var, truth).held()
+    assert_close(held, torch.full((2,), 0.9), rtol=0, atol=0.015)
+    assert_close(Claim(mean, var / 4, truth).held(), torch.full((2,), 0.589), rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
+def test_relative_motions_are_as_far_off_as_a_filter_claims(kind):
+    """Drives that are what the filter takes them for, with errors that last: over 1, 10 and 100 rows."""
+    data, poses = driven()
+    options = {} if kind == "EKF" else {"members": 64, "localisation": "significance"}
+    means = run(car_filter(kind, **options), prepared(data))["belief", "mean"]
+    parts = [windows(data[at : at + 1], means[at : at + 1], poses[at]) for at in range(len(data))]
+    part, true = torch.cat([part.flatten(0, 1) for part, _ in parts]), torch.cat([true for _, true in parts])
+    held = claimed(run(car_filter(kind, again=True, **options), part), true).held()
+    assert ((held > 0.8) & (held < 0.98)).all(), held
+
+
+def test_the_last_velocity_is_held_where_no_motion_is_seen():
+    step = SE3().exp(torch.tensor([0.0, 0.1, 0.0, 0.0, 0.0, 1.0]))
+    motions = step.expand(5, 7).clone()
+    motions[3] = SE3().neutral(step)
+    dt = torch.full((5, 1), 0.1)
+    dt[3] = 0.2  # twice as long
+    path = chained(motions, torch.tensor([False, True, True, False, True]), dt)
+    assert_close(path[-1], SE3().exp(torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0, 5.0])))
+
+
+def test_corners_are_lost_or_wrong_as_a_condition_says():
+    rows = TensorDict({"corners": torch.zeros(300, 40, 2, 4), "seen": torch.ones(300, 40, dtype=torch.bool)}, [300])
+    rows["motion_observed"] = torch.ones(300, 1, dtype=torch.bool)
+    lost = in_condition(rows, "corners lost", 0)
+    assert (~lost["motion_observed"]).sum() == 300 // EVERY * LOST
+    assert lost["seen"].any(-1).equal(lost["motion_observed"].squeeze(-1))
+    wrong = in_condition(rows, "wrong corners", 0)["corners"]
+    assert wrong[:, :, 0].eq(0).all(), "those of the row before stay where they are"
+    assert wrong[:, :, 1].ne(0).all(-1).double().mean().item() == pytest.approx(WRONG, abs=0.02)
+    assert rows["corners"].eq(0).all()
+
+
+def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
+    data, poses = driven(120)
+    out = run(RTSSmoother(car_filter("EKF")), prepared(and_one_more(data)))
+    paths = [chained(one["motion"], one["motion_observed"].squeeze(-1), one["dt"]) for one in data]
+    paths = [torch.stack(paths), pose_of(out)[0], pose_of(out, "smoothed")[0]]
+    steps = [SE3().compose(SE3().inverse(path[:, :-1]), path[:, 1:]) for path in (*paths, poses)]
+    errors = [SE3().minus(step, steps[-1]).square().mean().sqrt() for step in steps[:-1]]
+    assert errors[2] < 0.95 * min(errors[:2])
+
+
+@pytest.mark.skipif(not DRIVE.exists(), reason="the drive is not here")
+def test_a_run_of_a_few_rows(tmp_path, monkeypatch):
+    data = str(KITTI.parent)
+    monkeypatch.setattr(sys, "argv", ["sequence07", "--smoke", "--data", data, "--out", str(tmp_path)])
+    study.main()
+    rows = study.COLUMNS.read(tmp_path / "sequence07.csv")
+    assert {row["filter"] for row in rows} == {"OpenCV, RANSAC", "corners' motion alone", "EKF", "RTS smoother"}
+    assert all(row["translation"] < 6 for row in rows)
+    page = (tmp_path / "sequence07.md").read_text()
+    assert "## As it is" in page
+    assert (tmp_path / "sequence07.png").stat().st_size > 1e4
