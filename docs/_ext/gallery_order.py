@@ -13,6 +13,7 @@ ORDER = (
     "training",
     "diagnostics",
     "monitor",
+    "hidden",
     "policy",
     "to_robot",
 )
