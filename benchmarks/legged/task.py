@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
@@ -10,19 +11,41 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 
-from torch_denkf import Filter
-from torch_denkf.applications.legged import QUADRUPED, quadruped_env, trot
+from torch_denkf.applications.legged import QUADRUPED, quadruped_env, trot, with_last_rows
 from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.velocity import base_velocity_of_moments
 from torch_denkf.functional.manifolds import SO3, rotate
 
-__all__ = ["LEVEL", "Robot", "humanoid", "quadruped", "scores", "smoothed_velocity"]
+__all__ = ["GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "quadruped", "scores"]
 
 LEVEL = 0.9  # of the intervals
+ROWS = 5  # that the learned contacts read
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor, and what happens on it.
+
+    Attributes:
+        friction: the least and the most, of which each run draws.
+        softness: seconds in which the floor gives way.
+        pushes: standard deviation in N of forces on the base.
+    """
+
+    friction: tuple[float, float] = (0.3, 1.5)
+    softness: float = 0.01
+    pushes: float = 0.0
+
+
+#: Grounds of the test, by name. All but the first are not seen in training.
+GROUNDS = {
+    "as in training": Ground(),
+    "slippery": Ground(friction=(0.2, 0.2)),
+    "soft, with pushes": Ground(friction=(0.5, 1.0), softness=0.05, pushes=200.0),
+}
 
 
 @dataclass(frozen=True)
@@ -48,30 +71,31 @@ class Robot:
     doubtful: Tensor
 
 
-def quadruped(runs: int, seconds: float, seed: int) -> Robot:
+def quadruped(runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
     """dm_control's quadruped, which trots at paces, strides and turns of its own in each run; all sensors err.
 
     Args:
         runs: R.
         seconds: of a run, 100 rows each.
-        seed: of gaits and errors.
+        seed: of grounds, gaits and errors.
+        ground: that it trots on; ``None`` for that of training.
     """
-    random, logs = np.random.default_rng(seed), []
-    env = quadruped_env(seed=seed)
-    for _ in range(runs):
+    random, logs, ground = np.random.default_rng(seed), [], Ground() if ground is None else ground
+    for run in range(runs):
+        friction = math.exp(random.uniform(*(math.log(each) for each in ground.friction)))
+        options = {"friction": friction, "softness": ground.softness, "pushes": ground.pushes}
+        env = quadruped_env(seed=1000 * seed + run, **options)
         low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
         gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
         row, rows = env.reset(), []
         for step in range(round(seconds / env.dt)):
-            rows.append(row.exclude("action", "done", "terminated", "reward"))
+            rows.append(row.select("imu", "joints", "joint_rates", "contact", "true"))
             row["action"] = min(1.0, step * env.dt) * trot(step * env.dt, **gait)
             row = env.step(row)["next"]
         logs.append(torch.stack(rows))
-    log = torch.stack(logs).double().update({"contact": torch.stack([each["contact"] for each in logs])})
-    log = log.select("imu", "joints", "joint_rates", "contact", "true")
-    start = min(100, log.shape[1] // 2)
+    log = with_last_rows(torch.stack(logs), ROWS)
     doubtful = torch.zeros(log.shape, dtype=torch.bool)
-    return Robot("quadruped, simulated", env.model, QUADRUPED, env.dt, log, slice(start, None), doubtful)
+    return Robot("quadruped", env.model, QUADRUPED, env.dt, log, slice(min(100, log.shape[1] // 2), None), doubtful)
 
 
 def humanoid(folder: Path) -> Robot:
@@ -96,67 +120,43 @@ def base_pose(robot: Robot, mean: Tensor) -> tuple[Tensor, Tensor]:
     return turn, mean[..., 7:10] - rotate(turn, sensor[4:])
 
 
-def smoothed_velocity(robot: Robot, out: TensorDictBase, gyro_std: float) -> tuple[Tensor, Tensor]:
-    """The base's velocity and its variances, of what a smoother of moments or of an ensemble wrote.
-
-    An ensemble's covariance is that of its members.
-    """
-    sensor = LegKinematics(robot.model, **robot.names).base.double()
-    gyro, mean = robot.log["imu"][..., :3], out["smoothed", "mean"]
-    cov = out.get(("smoothed", "cov"), None)
-    if cov is None:
-        from torch_denkf.applications.legged.motion import legged_space
-
-        space = legged_space(len(robot.names["feet"]))
-        away = space.minus(out["smoothed", "ensemble"], mean.unsqueeze(-2))
-        cov = away.mT @ away / (away.shape[-2] - 1)
-    velocity, var = base_velocity_of_moments(mean, cov, gyro, sensor)
-    return velocity, var + gyro_std**2 * sensor[4:].square().sum()
-
-
-def scores(robot: Robot, mean: Tensor, velocity: Tensor, var: Tensor) -> dict[str, float]:
+def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = None) -> dict[str, float]:
     """How wrong the base's velocity, tilt and path are, and how wide the velocity's intervals.
 
     Args:
         robot: with its log.
-        mean: ``[R, T, 16 + 3 F]``.
         velocity: of the base in its own axes, ``[R, T, 3]``.
         var: its variances.
+        mean: of a filter ``[R, T, 16 + 3 F]``; ``None`` where only the velocity is known.
 
     Returns:
-        Root mean square errors of the velocity in m/s: ``x``, ``y``, ``z``, ``norm``, and ``certain``, the norm without
-        rows whose truth is in doubt; ``held``, the share of the true velocities in the intervals, and
-        ``held_certain``; ``nees``, the mean square error by variance, and ``nees_certain``; ``nll``, the mean negative
-        log-likelihood; ``tilt`` in degrees; ``drift``, how far the end of the path is off, in % of its length.
+        ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows whose
+        truth is in doubt; ``held``, the share of the true velocities in the intervals; ``nees``, the mean of square
+        error by variance; ``nll``, the mean negative log-likelihood. With ``mean`` also ``tilt`` in degrees, and
+        ``drift``, how far the end of the path is off, in % of its length.
     """
     true, rows, half = robot.log["true"], robot.rows, NormalDist().inv_cdf((1 + LEVEL) / 2)
     error, var = (velocity - true["velocity"])[:, rows], var[:, rows]
     sure = ~robot.doubtful[:, rows]
-    square, inside = error.square(), (error.abs() <= half * var.sqrt()).double()
-    x, y, z = square.mean((0, 1)).sqrt().tolist()
+    square = error.square()
+    found = {
+        "velocity": square.sum(-1).mean().sqrt().item(),
+        "certain": square.sum(-1)[sure].mean().sqrt().item(),
+        "nees": (square / var).mean().item(),
+        "held": (error.abs() <= half * var.sqrt()).double().mean().item(),
+        "nll": 0.5 * (square / var + var.log()).mean().item(),
+    }
+    if mean is None:
+        return found
     turn, place = base_pose(robot, mean)
     up = [rotate(SO3().inverse(each), mean.new_tensor([0.0, 0.0, 1.0]))[:, rows] for each in (turn, true["orientation"])]
     tilt = torch.atan2(torch.linalg.cross(*up).norm(dim=-1), (up[0] * up[1]).sum(-1)).rad2deg()
-    walked = true["position"].diff(dim=1).norm(dim=-1).sum(1) if robot.name != "iCub" else _steps(true["position"])
     moved = [_from_start(*pose) for pose in ((turn, place), (true["orientation"], true["position"]))]
-    drift = (moved[0][:, -1] - moved[1][:, -1]).norm(dim=-1) / walked
-    return {
-        "x": x,
-        "y": y,
-        "z": z,
-        "norm": square.sum(-1).mean().sqrt().item(),
-        "certain": square.sum(-1)[sure].mean().sqrt().item(),
-        "held": inside.mean().item(),
-        "held_certain": inside[sure].mean().item(),
-        "nees": (square / var).mean().item(),
-        "nees_certain": (square / var)[sure].mean().item(),
-        "nll": 0.5 * (square / var + var.log()).mean().item(),
-        "tilt": tilt.square().mean().sqrt().item(),
-        "drift": 100 * drift.mean().item(),
-    }
+    drift = (moved[0][:, -1] - moved[1][:, -1]).norm(dim=-1) / _length(true["position"])
+    return {**found, "tilt": tilt.square().mean().sqrt().item(), "drift": 100 * drift.mean().item()}
 
 
-def _steps(position: Tensor) -> Tensor:
+def _length(position: Tensor) -> Tensor:
     """The length of a path without the noise of single rows: of its places every 10 rows."""
     return position[:, ::10].diff(dim=1).norm(dim=-1).sum(1)
 

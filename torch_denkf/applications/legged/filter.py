@@ -19,7 +19,7 @@ from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegR
 from torch_denkf.applications.legged.velocity import BaseVelocity, StartEnsemble, StartMoments
 from torch_denkf.filters import Filter
 from torch_denkf.fusion import FusedFilter, FusedSensor
-from torch_denkf.modules import ConstantNoise, EKFTransition, EnsembleAnalysis, NoisyTransition, UKFTransition
+from torch_denkf.modules import EKFTransition, EnsembleAnalysis, NoisyTransition, UKFTransition
 from torch_denkf.modules._running import named_modules_of
 
 __all__ = ["legged_filter"]
@@ -70,7 +70,7 @@ def legged_filter(
             believe all correlations.
         noises: of the sensors and feet.
         contacts: says how much each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
-            ``rates_key``. The error of the joints' angles is then a parameter, too.
+            ``rates_key``.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
@@ -110,8 +110,9 @@ def legged_filter(
         initial = StartMoments(std, n.velocity, **around)
         transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
     mask: dict[str, Any] = {"observed_key": ("legs", "observed")}
-    places = ConstantNoise([n.kinematics] * 3 * count, trainable=contacts is not None)
-    sensors = {"feet": FusedSensor(FeetInBody(space), places, observation_key=("legs", "feet"), **mask)}
+    sensors = {
+        "feet": FusedSensor(FeetInBody(space), [n.kinematics] * 3 * count, observation_key=("legs", "feet"), **mask)
+    }
     if rates_key is not None:
         rates, noise = FeetRates(space, imu_key=imu_key), [n.rate] * 3 * count if contacts is None else contacts
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)

@@ -82,9 +82,11 @@ class LearnedContacts(SubModel):
         blocks = torch.einsum("fg,...fij->...figj", feet, cov)
         return blocks.flatten(-4, -3).flatten(-2), slip
 
-    def features(self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor) -> Tensor:
-        """What the network reads of each foot, ``[*B, F, 16 K]``, of the last rows."""
-        rows, kinematics = self.rows, self.kinematics
+    def features(
+        self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
+    ) -> Tensor:
+        """What the network reads of each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         imu, joints, rates = (part.to(like.dtype).unflatten(-1, (rows, -1)) for part in (imu, joints, rates))
         stands = contact.to(like.dtype).unflatten(-1, (rows, -1)).unsqueeze(-1)  # [*B, K, F, 1]
