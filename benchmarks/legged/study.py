@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.legged.pictures import draw
-from benchmarks.legged.task import GROUNDS, LEVEL, Robot, humanoid, quadruped, scores
+from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, quadruped, scores
 from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
 
@@ -28,6 +26,7 @@ COLUMNS = Columns(
     whole=(),
     order=lambda row: (row["data"], row["filter"]),
 )
+SHOWN = list(GROUNDS)[1]  # in the picture
 KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
@@ -42,18 +41,18 @@ class Study:
 
     out: Path | None = None  # folder for legged.csv, legged.md and legged.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
-    runs: int = 6  # of the test, on each ground
-    seconds: float = 10.0  # of such a run
+    runs: int = 5  # of the test, on each ground
+    seconds: float = 8.0  # of such a run
     training_runs: int = 32  # of 6 s each; a quarter as many are for validation
-    updates: int = 120  # of the learned contacts
+    updates: int = 140  # of the learned contacts
     lstm_updates: int = 1000
     seed: int = 0
     smoke: bool = False  # a few short runs: does it run?
 
 
 @torch.no_grad()
-def run(robot: Robot, **options) -> tuple[dict[str, float], TensorDict]:
-    """Scores of a filter on a robot's log, with milliseconds of the processor for a step of all runs; and its belief.
+def run(robot: Robot, **options) -> tuple[TensorDict, float]:
+    """Belief of a filter on a robot's log, and milliseconds of the processor for a step of all runs.
 
     Args:
         robot: with its log.
@@ -62,10 +61,13 @@ def run(robot: Robot, **options) -> tuple[dict[str, float], TensorDict]:
     filter = legged_filter(robot.model, **robot.names, dt=robot.dt, **options).to(robot.log["imu"].dtype)
     torch.manual_seed(0)
     began = time.process_time()
-    belief = filter.sequence(robot.log.clone(), keep=[VELOCITY, ("belief", "velocity_var"), ("belief", "mean")])
-    ms = 1e3 * (time.process_time() - began) / robot.log.shape[1]
-    belief = belief["belief"]
-    return {**scores(robot, belief["velocity"], belief["velocity_var"], belief["mean"]), "ms": ms}, belief
+    out = filter.sequence(robot.log.clone(), keep=[VELOCITY, ("belief", "velocity_var"), ("belief", "mean")])
+    return out["belief"], 1e3 * (time.process_time() - began) / robot.log.shape[1]
+
+
+def scored(robot: Robot, belief: TensorDict) -> dict[str, float]:
+    """Scores of a belief."""
+    return scores(robot, belief["velocity"], belief["velocity_var"], belief["mean"])
 
 
 def in_the_air(robot: Robot) -> Robot:
@@ -75,36 +77,40 @@ def in_the_air(robot: Robot) -> Robot:
     return replace(robot, log=log)
 
 
-def chosen(validation: Robot, smoke: bool) -> LeggedNoises:
-    """The noises of the feet under which the true velocity is likeliest."""
+def chosen(validation: Robot, name: str, smoke: bool) -> LeggedNoises:
+    """The noises of the feet under which the true velocity is likeliest; of a validation by that name."""
     found = {}
     for kinematics, rate in product(KINEMATICS[-1:], RATES[:1]) if smoke else product(KINEMATICS, RATES):
         noises = LeggedNoises(kinematics=kinematics, rate=rate)
-        found[noises] = run(validation, kind="EKF", noises=noises)[0]
+        found[noises] = scored(validation, run(validation, kind="EKF", noises=noises)[0])
         numbers = {key: round(found[noises][key], 3) for key in ("nll", "velocity", "nees", "held")}
-        print(f"validation, kinematics {kinematics}, rate {rate}: {numbers}", flush=True)
+        print(f"{name}, kinematics {kinematics}, rate {rate}: {numbers}", flush=True)
     return min(found, key=lambda noises: found[noises]["nll"])
 
 
 def filter_rows(
-    robot: Robot, name: str, noises: LeggedNoises, contacts: LearnedContacts | None, kinds: dict[str, dict]
-) -> Iterator[tuple[dict, TensorDict]]:
-    """Rows of the library's filters, and their beliefs.
+    robots: dict[str, Robot], noises: LeggedNoises, contacts: LearnedContacts | None, kinds: dict[str, dict]
+) -> tuple[list[dict], dict[str, TensorDict]]:
+    """Rows of the library's filters; and their beliefs, by filter, of all runs.
 
     Args:
-        robot: with its log.
-        name: of the data.
+        robots: by the name of the data, with logs of one shape, which are filtered side by side.
         noises: of the filters.
         contacts: that are learned, for further rows; ``None`` for none.
         kinds: options of the filters, by name.
     """
+    every = replace(next(iter(robots.values())), log=torch.cat([robot.log for robot in robots.values()]))
+    runs = {}
     for kind, options in kinds.items():
-        variants = {"": None} if contacts is None else {", threshold": None, ", learned": contacts}
-        for label, used in variants.items():
-            found, belief = run(robot, noises=noises, contacts=used, **options)
-            yield {"data": name, "filter": f"{kind}{label}", **found}, belief
-    found, belief = run(in_the_air(robot), noises=noises, kind="EKF")
-    yield {"data": name, "filter": "integrated inertial sensor", **found}, belief
+        for label, used in {"": None} if contacts is None else {", threshold": None, ", learned": contacts}.items():
+            runs[f"{kind}{label}"] = run(every, noises=noises, contacts=used, **options)
+    runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
+    rows = []
+    for name, (belief, ms) in runs.items():
+        parts = belief.chunk(len(robots))
+        for (data, robot), part in zip(robots.items(), parts, strict=True):
+            rows.append({"data": data, "filter": name, **scored(robot, part), "ms": ms})
+    return rows, {name: belief for name, (belief, _) in runs.items()}
 
 
 def still(robot: Robot) -> dict[str, float]:
@@ -113,7 +119,7 @@ def still(robot: Robot) -> dict[str, float]:
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
-def page(rows: list[dict], study: Study, noises: LeggedNoises) -> str:
+def page(rows: list[dict], study: Study, noises: LeggedNoises, firm: LeggedNoises) -> str:
     """The table."""
     lines = [
         "# How fast is the base",
@@ -136,9 +142,12 @@ def page(rows: list[dict], study: Study, noises: LeggedNoises) -> str:
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
-        "of its own. The noises of the feet were chosen, and contacts and LSTM trained, on other simulated runs: "
-        f"kinematics {noises.kinematics:g} m, rate {noises.rate:g} m/s. iCub has these noises, too. Milliseconds are "
-        "those of the processor for a step of all runs of a table at once, without compilation, one thread.",
+        "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. The noises "
+        "of the feet are chosen on further runs on these grounds, for all filters: the joints' angles "
+        f"{noises.kinematics:g} m, their rates {noises.rate:g} m/s. Those of iCub are chosen on simulated runs of the "
+        f"quadruped on firm ground: {firm.kinematics:g} m and {firm.rate:g} m/s. Milliseconds are those of the "
+        f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
+        "one thread.",
         "",
         *made_by("legged"),
         f"* Seed: {study.seed}.",
@@ -155,37 +164,34 @@ def main() -> None:
     torch.manual_seed(study.seed)
     length = 0.3 if study.smoke else 6.0
     training = quadruped(study.training_runs, length, study.seed + 1)
-    validation = quadruped(study.training_runs // 4, length, study.seed + 2)
-    noises = chosen(validation, study.smoke)
-    window = min(50, training.log.shape[1] - 1)
-    contacts = learned_contacts(training, noises, study.updates, window)
+    validation, firm = (
+        quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM)
+    )
+    noises, firm_noises = chosen(validation, "validation", study.smoke), chosen(firm, "firm ground", study.smoke)
+    contacts = learned_contacts(training, noises, study.updates, min(40, training.log.shape[1] - 1))
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
-    rows: list[dict] = []
-    beliefs: dict[str, TensorDict] = {}
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
-    for number, (name, ground) in enumerate(GROUNDS.items()):
-        robot = quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
-        found = list(filter_rows(robot, name, noises, contacts, kinds))
-        if name == "slippery":
-            slides, beliefs = robot, {row["filter"]: belief for row, belief in found}
+    robots = {
+        name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
+        for number, (name, ground) in enumerate(GROUNDS.items())
+    }
+    rows, beliefs = filter_rows(robots, noises, contacts, kinds)
+    for name, robot in robots.items():
         with torch.no_grad():
-            found.append(({"data": name, "filter": "LSTM", **scores(robot, *lstm(lstm.read(robot.log)))}, None))
-        rows += [row for row, _ in found] + [{"data": name, "filter": "standing still", **still(robot)}]
-        _say(rows, name)
+            found = scores(robot, *lstm(lstm.read(robot.log)))
+        rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
     if (study.icub / "walking.npz").exists() and not study.smoke:
         robot, name = humanoid(study.icub), "iCub, real"
-        rows += [row for row, _ in filter_rows(robot, name, noises, None, kinds)]
+        rows += filter_rows({name: robot}, firm_noises, None, kinds)[0]
         rows.append({"data": name, "filter": "standing still", **still(robot)})
-        _say(rows, name)
+    for row in rows:
+        print(row["data"], row["filter"], {key: f"{row[key]:.3g}" for key in SCORES if key in row}, flush=True)
     print(f"{(time.monotonic() - began) / 60:.0f} min", flush=True)
     if study.out is not None:
         study.out.mkdir(parents=True, exist_ok=True)
         COLUMNS.write(rows, study.out / "legged.csv")
-        draw(slides, {label: beliefs[f"EKF, {label}"] for label in ("threshold", "learned")}, study.out / "legged.png")
-    write_page(page(rows, study, noises), None if study.out is None else study.out / "legged.md")
-
-
-def _say(rows: list[dict], name: str) -> None:
-    for row in rows:
-        if row["data"] == name:
-            print(name, row["filter"], {key: f"{row[key]:.3g}" for key in SCORES if key in row}, flush=True)
+        number = list(GROUNDS).index(SHOWN)
+        shown = {label: beliefs[f"EKF, {label}"].chunk(len(GROUNDS))[number] for label in ("threshold", "learned")}
+        draw(robots[SHOWN], shown, study.out / "legged.png")
+    text = page(rows, study, noises, firm_noises)
+    write_page(text, None if study.out is None else study.out / "legged.md")

@@ -19,7 +19,7 @@ from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 
-__all__ = ["GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "quadruped", "scores"]
+__all__ = ["FIRM", "GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "quadruped", "scores"]
 
 LEVEL = 0.9  # of the intervals
 ROWS = 5  # that the learned contacts read
@@ -27,24 +27,26 @@ ROWS = 5  # that the learned contacts read
 
 @dataclass(frozen=True)
 class Ground:
-    """A floor, and what happens on it.
+    """A floor, and what happens on it. Each run draws between the least and the most, of which each is one.
 
     Attributes:
-        friction: the least and the most, of which each run draws.
+        friction: drawn by its logarithm.
         softness: seconds in which the floor gives way.
         pushes: standard deviation in N of forces on the base.
     """
 
-    friction: tuple[float, float] = (0.3, 1.5)
-    softness: float = 0.01
-    pushes: float = 0.0
+    friction: tuple[float, float] = (0.15, 1.5)
+    softness: tuple[float, float] = (0.01, 0.03)
+    pushes: tuple[float, float] = (0.0, 100.0)
 
 
-#: Grounds of the test, by name. All but the first are not seen in training.
+FIRM = Ground((1.5, 1.5), (0.01, 0.01), (0.0, 0.0))
+#: Grounds of the test, by name. The last two are not seen in training.
 GROUNDS = {
-    "as in training": Ground(),
-    "slippery": Ground(friction=(0.2, 0.2)),
-    "soft, with pushes": Ground(friction=(0.5, 1.0), softness=0.05, pushes=200.0),
+    "firm ground": FIRM,
+    "slippery ground, friction 0.2": Ground((0.2, 0.2), (0.01, 0.01), (0.0, 0.0)),
+    "ice, friction 0.1: not seen in training": Ground((0.1, 0.1), (0.01, 0.01), (0.0, 0.0)),
+    "soft ground with pushes: not seen in training": Ground((0.5, 1.0), (0.05, 0.05), (200.0, 200.0)),
 }
 
 
@@ -82,9 +84,9 @@ def quadruped(runs: int, seconds: float, seed: int, ground: Ground | None = None
     """
     random, logs, ground = np.random.default_rng(seed), [], Ground() if ground is None else ground
     for run in range(runs):
+        options = {name: random.uniform(*getattr(ground, name)) for name in ("softness", "pushes")}
         friction = math.exp(random.uniform(*(math.log(each) for each in ground.friction)))
-        options = {"friction": friction, "softness": ground.softness, "pushes": ground.pushes}
-        env = quadruped_env(seed=1000 * seed + run, **options)
+        env = quadruped_env(friction=friction, seed=1000 * seed + run, **options)
         low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
         gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
         row, rows = env.reset(), []

@@ -16,7 +16,7 @@ __all__ = ["LSTM", "VELOCITY", "learned_contacts", "trained_lstm"]
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
 _MOMENTS = [("belief", "mean"), ("belief", "cov")]
 _SETTLING = 10  # rows of a window that are not scored: its belief comes from another filter
-_AGAIN = 40  # updates after which windows get new beliefs to start from
+_AGAIN = 50  # updates after which windows get new beliefs to start from
 
 
 def learned_contacts(robot: Robot, noises: LeggedNoises, updates: int, window: int) -> LearnedContacts:

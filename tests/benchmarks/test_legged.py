@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.common.arguments import ROOT
-from benchmarks.legged.study import Study, in_the_air, page, run, still
+from benchmarks.legged.study import Study, in_the_air, page, run, scored, still
 from benchmarks.legged.task import GROUNDS, base_pose, humanoid, quadruped, scores
 from benchmarks.legged.training import LSTM
 from tests.real_data import SHARED
@@ -73,14 +73,15 @@ def test_runs_differ_and_repeat(robot):
     again = quadruped(2, 1.5, 0)
     assert torch.equal(robot.log["imu"], again.log["imu"])
     assert (robot.log["imu"][0] - robot.log["imu"][1]).abs().max() > 0.1
-    slippery = quadruped(1, 1.0, 0, GROUNDS["slippery"])
+    slippery = quadruped(1, 1.0, 0, list(GROUNDS.values())[1])
     assert slippery.log["last", "imu"].shape == (1, 100, 30)
 
 
 def test_without_feet_the_inertial_sensor_is_integrated(robot):
     """Its error grows without bound, and the intervals know it."""
-    walks, _ = run(robot, kind="EKF")
-    flies, belief = run(in_the_air(robot), kind="EKF")
+    walks = scored(robot, run(robot, kind="EKF")[0])
+    belief, _ = run(in_the_air(robot), kind="EKF")
+    flies = scored(robot, belief)
     assert flies["velocity"] > walks["velocity"]
     var = belief["velocity_var"].sum(-1)[0]
     assert (var[60:].diff() > 0).all()
@@ -95,8 +96,8 @@ def test_the_lstm_reads_what_the_contacts_read_of_one_row(robot):
 
 
 def test_the_page_has_every_row():
-    rows = [{"data": data, "filter": "EKF", "velocity": 0.1, "certain": 0.2} for data in ("slippery", "iCub, real")]
-    text = page(rows, Study(), LeggedNoises())
+    rows = [{"data": data, "filter": "EKF", "velocity": 0.1, "certain": 0.2} for data in ("firm ground", "iCub, real")]
+    text = page(rows, Study(), LeggedNoises(), LeggedNoises())
     assert "| EKF | 0.100 |  |" in text
     assert "| EKF | 0.100 | 0.200 |" in text
 
