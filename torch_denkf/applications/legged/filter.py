@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.learned import SLIP, LearnedContacts
+from torch_denkf.applications.legged.learned import SLIP, LearnedContacts, Variances
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, legged_space
 from torch_denkf.applications.legged.noises import LeggedNoises
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
@@ -70,7 +70,7 @@ def legged_filter(
             believe all correlations.
         noises: of the sensors and feet.
         contacts: says how much each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
-            ``rates_key``.
+            ``rates_key``. An ensemble takes its variances, and no correlation of a foot's axes.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
@@ -114,7 +114,10 @@ def legged_filter(
         "feet": FusedSensor(FeetInBody(space), [n.kinematics] * 3 * count, observation_key=("legs", "feet"), **mask)
     }
     if rates_key is not None:
-        rates, noise = FeetRates(space, imu_key=imu_key), [n.rate] * 3 * count if contacts is None else contacts
+        noise: Any = [n.rate] * 3 * count if contacts is None else contacts
+        if kind == "DEnKF" and contacts is not None:
+            noise = Variances(contacts)
+        rates = FeetRates(space, imu_key=imu_key)
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
     per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0

@@ -105,6 +105,19 @@ class LearnedContacts(SubModel):
         self.module.scale.copy_(features.std(0).clamp(min=1e-3))
 
 
+class Variances(SubModel):
+    """The variances alone that learned contacts say, as analyses of ensembles read them."""
+
+    def __init__(self, contacts: LearnedContacts):
+        super().__init__(contacts, contacts.in_keys, contacts.out_keys)
+        self.observation_dim = contacts.observation_dim
+
+    def compute(self, *last):
+        """The variances ``[*B, 3 F]``, and how feet walk."""
+        cov, slip = self.module.compute(*last)
+        return cov.diagonal(dim1=-2, dim2=-1), slip
+
+
 def last_rows(rows: int) -> CatFrames:
     """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads."""
     options = {"dim": -1, "padding": "same"}
