@@ -15,10 +15,11 @@ from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.legged.pictures import draw
 from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, quadruped, scores
 from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
-from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
+from torch_denkf.applications.legged import LeggedNoises, legged_filter
 
 #: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
-KINEMATICS, RATES = (0.01, 0.02, 0.03), (0.3, 1.0, 3.0)
+KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
+ACCELEROMETER = 5e-3  # m/s^2/sqrt(Hz), of the simulated one, a little above its data sheet's 3.9e-3
 SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
 COLUMNS = Columns(
     names=("data", "filter", *SCORES),
@@ -81,7 +82,7 @@ def chosen(validation: Robot, name: str, smoke: bool) -> LeggedNoises:
     """The noises of the feet under which the true velocity is likeliest; of a validation by that name."""
     found = {}
     for kinematics, rate in product(KINEMATICS[-1:], RATES[:1]) if smoke else product(KINEMATICS, RATES):
-        noises = LeggedNoises(kinematics=kinematics, rate=rate)
+        noises = LeggedNoises(kinematics=kinematics, rate=rate, accelerometer=ACCELEROMETER)
         found[noises] = scored(validation, run(validation, kind="EKF", noises=noises)[0])
         numbers = {key: round(found[noises][key], 3) for key in ("nll", "velocity", "nees", "held")}
         print(f"{name}, kinematics {kinematics}, rate {rate}: {numbers}", flush=True)
@@ -89,21 +90,23 @@ def chosen(validation: Robot, name: str, smoke: bool) -> LeggedNoises:
 
 
 def filter_rows(
-    robots: dict[str, Robot], noises: LeggedNoises, contacts: LearnedContacts | None, kinds: dict[str, dict]
+    robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict]
 ) -> tuple[list[dict], dict[str, TensorDict]]:
     """Rows of the library's filters; and their beliefs, by filter, of all runs.
 
     Args:
         robots: by the name of the data, with logs of one shape, which are filtered side by side.
-        noises: of the filters.
-        contacts: that are learned, for further rows; ``None`` for none.
+        variants: of every filter, by what is behind its name: its noises, and its contacts. The first one's noises are
+            also those of the integrated sensor.
         kinds: options of the filters, by name.
     """
     every = replace(next(iter(robots.values())), log=torch.cat([robot.log for robot in robots.values()]))
-    runs = {}
-    for kind, options in kinds.items():
-        for label, used in {"": None} if contacts is None else {", threshold": None, ", learned": contacts}.items():
-            runs[f"{kind}{label}"] = run(every, noises=noises, contacts=used, **options)
+    runs = {
+        kind + label: run(every, **variant, **options)
+        for kind, options in kinds.items()
+        for label, variant in variants.items()
+    }
+    noises = next(iter(variants.values()))["noises"]
     runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
     rows = []
     for name, (belief, ms) in runs.items():
@@ -143,9 +146,10 @@ def page(rows: list[dict], study: Study, noises: LeggedNoises, firm: LeggedNoise
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
         "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. The noises "
-        "of the feet are chosen on further runs on these grounds, for all filters: the joints' angles "
-        f"{noises.kinematics:g} m, their rates {noises.rate:g} m/s. Those of iCub are chosen on simulated runs of the "
-        f"quadruped on firm ground: {firm.kinematics:g} m and {firm.rate:g} m/s. Milliseconds are those of the "
+        "of the feet are chosen on further runs. Threshold contacts have those that fit all grounds of the training: "
+        f"the joints' angles {noises.kinematics:g} m, their rates {noises.rate:g} m/s. Learned contacts have those that "
+        f"fit firm ground, {firm.kinematics:g} m, and tell the rest themselves. iCub has those of firm ground, too, "
+        f"{firm.kinematics:g} m and {firm.rate:g} m/s, of the simulated quadruped. Milliseconds are those of the "
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
         "one thread.",
         "",
@@ -168,21 +172,23 @@ def main() -> None:
         quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM)
     )
     noises, firm_noises = chosen(validation, "validation", study.smoke), chosen(firm, "firm ground", study.smoke)
-    contacts = learned_contacts(training, noises, study.updates, min(40, training.log.shape[1] - 1))
+    contacts = learned_contacts(training, firm_noises, study.updates, min(40, training.log.shape[1] - 1))
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
     robots = {
         name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(GROUNDS.items())
     }
-    rows, beliefs = filter_rows(robots, noises, contacts, kinds)
+    learned = {"noises": firm_noises, "contacts": contacts}
+    rows, beliefs = filter_rows(robots, {", threshold": {"noises": noises}, ", learned": learned}, kinds)
     for name, robot in robots.items():
         with torch.no_grad():
             found = scores(robot, *lstm(lstm.read(robot.log)))
         rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
     if (study.icub / "walking.npz").exists() and not study.smoke:
         robot, name = humanoid(study.icub), "iCub, real"
-        rows += filter_rows({name: robot}, firm_noises, None, kinds)[0]
+        feet = LeggedNoises(kinematics=firm_noises.kinematics, rate=firm_noises.rate)
+        rows += filter_rows({name: robot}, {"": {"noises": feet}}, kinds)[0]
         rows.append({"data": name, "filter": "standing still", **still(robot)})
     for row in rows:
         print(row["data"], row["filter"], {key: f"{row[key]:.3g}" for key in SCORES if key in row}, flush=True)
