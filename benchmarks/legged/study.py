@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 
@@ -13,20 +14,24 @@ from tensordict import TensorDict
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
 from benchmarks.legged.pictures import draw
-from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, quadruped, scores
+from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, jittered, quadruped, scores
 from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
 from torch_denkf.applications.legged import LeggedNoises, legged_filter
 
 #: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
 KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
-ACCELEROMETER = 5e-3  # m/s^2/sqrt(Hz), of the simulated one, a little above its data sheet's 3.9e-3
+#: Gyro in rad/s/sqrt(Hz), accelerometer in m/s^2/sqrt(Hz). The simulated ones are a little above their data sheets.
+SIMULATED = (1e-3, 5e-3)
+#: Of a log with uneven stamps: a turn or a force counts for a wrong time. One pair is chosen in validation.
+STAMPED = ((1e-3, 5e-3), (5e-3, 2e-2), (1e-2, 5e-2), (2e-2, 0.1), (4e-2, 0.2))
 SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
 COLUMNS = Columns(
-    names=("data", "filter", *SCORES),
+    names=("data", "filter", *SCORES, "nll"),
     text=("data", "filter"),
     whole=(),
     order=lambda row: (row["data"], row["filter"]),
 )
+NOISES = ("kinematics", "rate", "gyro", "accelerometer")
 SHOWN = list(GROUNDS)[1]  # in the picture
 KINDS = {
     "EKF": {"kind": "EKF"},
@@ -45,7 +50,7 @@ class Study:
     runs: int = 5  # of the test, on each ground
     seconds: float = 8.0  # of such a run
     training_runs: int = 32  # of 6 s each; a quarter as many are for validation
-    updates: int = 140  # of the learned contacts
+    updates: int = 120  # of the learned contacts
     lstm_updates: int = 1000
     seed: int = 0
     smoke: bool = False  # a few short runs: does it run?
@@ -78,15 +83,22 @@ def in_the_air(robot: Robot) -> Robot:
     return replace(robot, log=log)
 
 
-def chosen(validation: Robot, name: str, smoke: bool) -> LeggedNoises:
-    """The noises of the feet under which the true velocity is likeliest; of a validation by that name."""
+def chosen(validation: Robot, name: str, grid: Iterable[dict[str, float]]) -> LeggedNoises:
+    """The noises of a grid under which the true velocity is likeliest; of a validation by that name."""
     found = {}
-    for kinematics, rate in product(KINEMATICS[-1:], RATES[:1]) if smoke else product(KINEMATICS, RATES):
-        noises = LeggedNoises(kinematics=kinematics, rate=rate, accelerometer=ACCELEROMETER)
+    for options in grid:
+        noises = LeggedNoises(**options)
         found[noises] = scored(validation, run(validation, kind="EKF", noises=noises)[0])
         numbers = {key: round(found[noises][key], 3) for key in ("nll", "velocity", "nees", "held")}
-        print(f"{name}, kinematics {kinematics}, rate {rate}: {numbers}", flush=True)
+        print(f"validation, {name}, {options}: {numbers}", flush=True)
     return min(found, key=lambda noises: found[noises]["nll"])
+
+
+def feet_grid(smoke: bool) -> list[dict[str, float]]:
+    """Noises of the feet, with those of the simulated sensor."""
+    pairs = list(product(KINEMATICS, RATES))[: 1 if smoke else None]
+    gyro, accelerometer = SIMULATED
+    return [{"kinematics": k, "rate": r, "gyro": gyro, "accelerometer": accelerometer} for k, r in pairs]
 
 
 def filter_rows(
@@ -122,7 +134,7 @@ def still(robot: Robot) -> dict[str, float]:
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
-def page(rows: list[dict], study: Study, noises: LeggedNoises, firm: LeggedNoises) -> str:
+def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str:
     """The table."""
     lines = [
         "# How fast is the base",
@@ -145,13 +157,16 @@ def page(rows: list[dict], study: Study, noises: LeggedNoises, firm: LeggedNoise
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
-        "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. The noises "
-        "of the feet are chosen on further runs. Threshold contacts have those that fit all grounds of the training: "
-        f"the joints' angles {noises.kinematics:g} m, their rates {noises.rate:g} m/s. Learned contacts have those that "
-        f"fit firm ground, {firm.kinematics:g} m, and tell the rest themselves. iCub has those of firm ground, too, "
-        f"{firm.kinematics:g} m and {firm.rate:g} m/s, of the simulated quadruped. Milliseconds are those of the "
+        "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. Noises "
+        "are chosen on further runs, by the likelihood of the true velocity: threshold contacts have those that fit "
+        "all grounds of the training; learned contacts have those that fit firm ground, and tell the rest themselves. "
+        "iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly as iCub's. "
+        "Milliseconds are those of the "
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
         "one thread.",
+        "",
+        *head("noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"),
+        *(line(name, *(f"{getattr(each, key):g}" for key in NOISES)) for name, each in noises.items()),
         "",
         *made_by("legged"),
         f"* Seed: {study.seed}.",
@@ -171,7 +186,9 @@ def main() -> None:
     validation, firm = (
         quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM)
     )
-    noises, firm_noises = chosen(validation, "validation", study.smoke), chosen(firm, "firm ground", study.smoke)
+    noises, firm_noises = (
+        chosen(robot, name, feet_grid(study.smoke)) for robot, name in ((validation, "all grounds"), (firm, "firm ground"))
+    )
     contacts = learned_contacts(training, firm_noises, study.updates, min(40, training.log.shape[1] - 1))
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
     kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
@@ -179,6 +196,7 @@ def main() -> None:
         name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(GROUNDS.items())
     }
+    all_noises = {"threshold contacts": noises, "learned contacts": firm_noises}
     learned = {"noises": firm_noises, "contacts": contacts}
     rows, beliefs = filter_rows(robots, {", threshold": {"noises": noises}, ", learned": learned}, kinds)
     for name, robot in robots.items():
@@ -187,8 +205,11 @@ def main() -> None:
         rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
     if (study.icub / "walking.npz").exists() and not study.smoke:
         robot, name = humanoid(study.icub), "iCub, real"
-        feet = LeggedNoises(kinematics=firm_noises.kinematics, rate=firm_noises.rate)
-        rows += filter_rows({name: robot}, {"": {"noises": feet}}, kinds)[0]
+        feet = {"kinematics": firm_noises.kinematics, "rate": firm_noises.rate}
+        grid = [{**feet, "gyro": gyro, "accelerometer": accelerometer} for gyro, accelerometer in STAMPED]
+        stamped = chosen(jittered(firm, robot), "uneven stamps", grid)
+        all_noises["iCub"] = stamped
+        rows += filter_rows({name: robot}, {"": {"noises": stamped}}, kinds)[0]
         rows.append({"data": name, "filter": "standing still", **still(robot)})
     for row in rows:
         print(row["data"], row["filter"], {key: f"{row[key]:.3g}" for key in SCORES if key in row}, flush=True)
@@ -199,5 +220,5 @@ def main() -> None:
         number = list(GROUNDS).index(SHOWN)
         shown = {label: beliefs[f"EKF, {label}"].chunk(len(GROUNDS))[number] for label in ("threshold", "learned")}
         draw(robots[SHOWN], shown, study.out / "legged.png")
-    text = page(rows, study, noises, firm_noises)
+    text = page(rows, study, all_noises)
     write_page(text, None if study.out is None else study.out / "legged.md")

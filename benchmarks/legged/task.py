@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -19,7 +19,7 @@ from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 
-__all__ = ["FIRM", "GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "quadruped", "scores"]
+__all__ = ["FIRM", "GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "jittered", "quadruped", "scores"]
 
 LEVEL = 0.9  # of the intervals
 ROWS = 5  # that the learned contacts read
@@ -113,6 +113,15 @@ def humanoid(folder: Path) -> Robot:
     slides = ((log["force"] > 0.85 * log["force"].sum(-1).median()) & (speed > 0.15)).any(-1).double()
     doubtful = torch.nn.functional.max_pool1d(slides, 21, 1, 10) > 0  # the derivative spans as many rows
     return Robot("iCub", icub_model(folder), ICUB, "dt", log, slice(50, 1168), doubtful)
+
+
+def jittered(robot: Robot, like: Robot) -> Robot:
+    """A robot whose rows are stamped as unevenly as those of another: ``"dt"`` is what the stamps say."""
+    dt = like.log["dt"][:, 1:, 0]
+    late = dt.std() / 2**0.5 * torch.randn(*robot.log.shape, 1).to(dt)
+    steps = robot.dt + torch.cat([torch.zeros_like(late[:, :1]), late.diff(dim=1)], 1)
+    log = robot.log.clone().set("dt", steps.clamp(min=1e-4).to(robot.log["imu"].dtype))
+    return replace(robot, log=log, dt="dt")
 
 
 def base_pose(robot: Robot, mean: Tensor) -> tuple[Tensor, Tensor]:

@@ -97,7 +97,8 @@ def test_the_lstm_reads_what_the_contacts_read_of_one_row(robot):
 
 def test_the_page_has_every_row():
     rows = [{"data": data, "filter": "EKF", "velocity": 0.1, "certain": 0.2} for data in ("firm ground", "iCub, real")]
-    text = page(rows, Study(), LeggedNoises(), LeggedNoises())
+    text = page(rows, Study(), {"threshold": LeggedNoises(kinematics=0.7)})
+    assert "| threshold | 0.7 |" in text
     assert "| EKF | 0.100 |  |" in text
     assert "| EKF | 0.100 | 0.200 |" in text
 
