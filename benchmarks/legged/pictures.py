@@ -33,7 +33,9 @@ def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds
     for number, axis in enumerate(axes[:3]):
         for color, (name, belief) in enumerate(beliefs.items()):
             mean, var = (belief[key][0, rows, number] for key in ("velocity", "velocity_var"))
-            axis.fill_between(time, mean - half * var.sqrt(), mean + half * var.sqrt(), color=f"C{color}", alpha=0.2, lw=0)
+            axis.fill_between(
+                time, mean - half * var.sqrt(), mean + half * var.sqrt(), color=f"C{color}", alpha=0.2, lw=0
+            )
             axis.plot(time, mean, f"C{color}", label=f"EKF, {name} contacts, {LEVEL:.0%}")
         axis.plot(time, true[:, number], "k", lw=1, label="truth")
         axis.set_ylabel(f"{'xyz'[number]}, m/s")

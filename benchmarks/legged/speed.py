@@ -1,6 +1,6 @@
 """What a step costs: thousands of robots in one batch, a loop of single filters, and a packaged step.
 
-    python -m benchmarks.legged.speed --out benchmarks/legged/results
+python -m benchmarks.legged.speed --out benchmarks/legged/results
 """
 
 from __future__ import annotations

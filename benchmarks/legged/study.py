@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -165,7 +165,9 @@ def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
         "one thread.",
         "",
-        *head("noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"),
+        *head(
+            "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
+        ),
         *(line(name, *(f"{getattr(each, key):g}" for key in NOISES)) for name, each in noises.items()),
         "",
         *made_by("legged"),
@@ -183,11 +185,10 @@ def main() -> None:
     torch.manual_seed(study.seed)
     length = 0.3 if study.smoke else 6.0
     training = quadruped(study.training_runs, length, study.seed + 1)
-    validation, firm = (
-        quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM)
-    )
+    validation, firm = (quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM))
     noises, firm_noises = (
-        chosen(robot, name, feet_grid(study.smoke)) for robot, name in ((validation, "all grounds"), (firm, "firm ground"))
+        chosen(robot, name, feet_grid(study.smoke))
+        for robot, name in ((validation, "all grounds"), (firm, "firm ground"))
     )
     contacts = learned_contacts(training, firm_noises, study.updates, min(40, training.log.shape[1] - 1))
     lstm = trained_lstm(training, validation, contacts, study.lstm_updates)

@@ -160,7 +160,9 @@ def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = No
     if mean is None:
         return found
     turn, place = base_pose(robot, mean)
-    up = [rotate(SO3().inverse(each), mean.new_tensor([0.0, 0.0, 1.0]))[:, rows] for each in (turn, true["orientation"])]
+    up = [
+        rotate(SO3().inverse(each), mean.new_tensor([0.0, 0.0, 1.0]))[:, rows] for each in (turn, true["orientation"])
+    ]
     tilt = torch.atan2(torch.linalg.cross(*up).norm(dim=-1), (up[0] * up[1]).sum(-1)).rad2deg()
     moved = [_from_start(*pose) for pose in ((turn, place), (true["orientation"], true["position"]))]
     drift = (moved[0][:, -1] - moved[1][:, -1]).norm(dim=-1) / _length(true["position"])

@@ -229,9 +229,9 @@ def quadruped_env(
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 30.0  # feet that stand do not creep
     # With implicit damping the simulator moves otherwise than its accelerometer reads, by a third.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    for name, value, entries in (("friction", friction, model.geom_friction), ("softness", softness, model.geom_solref)):
-        check_number(name, value, above=0)
-        entries[:, 0] = value
+    check_number("friction", friction, above=0)
+    check_number("softness", softness, above=0)
+    model.geom_friction[:, 0], model.geom_solref[:, 0] = friction, softness
     return LeggedEnv(model, **QUADRUPED, errors=errors, on=150.0, off=100.0, pushes=pushes, seed=seed)
 
 

@@ -125,7 +125,9 @@ def last_rows(rows: int) -> CatFrames:
 
 
 def with_last_rows(log: TensorDictBase, rows: int) -> TensorDictBase:
-    """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads; the first row stands for those before.
+    """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
+
+    The first row stands for those before it.
 
     Args:
         log: with ``"imu"``, ``"joints"``, ``"joint_rates"`` and ``"contact"``.
