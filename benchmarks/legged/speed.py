@@ -29,7 +29,7 @@ class Speed:
     out: Path | None = None  # folder for speed.md
     robots: int = 4096  # in a batch
     rounds: int = 7
-    packaged: tuple[str, ...] = ("EKF", "DEnKF, 32 members")
+    packaged: tuple[str, ...] = ("EKF",)  # which takes minutes to compile
     smoke: bool = False  # a few robots, nothing packaged
 
 
@@ -79,7 +79,7 @@ def main() -> None:
     text = [
         "# What a step costs",
         "",
-        f"The simulated quadruped, four feet, single precision. Times are those of the processor, one thread: medians of "
+        "The simulated quadruped, four feet, single precision. Times are of the processor, one thread: medians of "
         f"{study.rounds} rounds. A batch holds {study.robots:,} robots.",
         "",
         *head("filter", "batch, us a robot", "single filters in a loop, us a robot", "packaged step of one robot, ms"),
