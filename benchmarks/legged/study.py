@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import torch
 from tensordict import TensorDict
@@ -24,15 +26,23 @@ KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
 SIMULATED = (1e-3, 5e-3)
 #: Of a log with uneven stamps: a turn or a force counts for a wrong time. One pair is chosen in validation.
 STAMPED = ((1e-3, 5e-3), (5e-3, 2e-2), (1e-2, 5e-2), (2e-2, 0.1), (4e-2, 0.2))
+NOISES = ("kinematics", "rate", "gyro", "accelerometer")
+ICUB = "iCub, real"
 SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
 COLUMNS = Columns(
-    names=("data", "filter", *SCORES, "nll"),
+    names=("data", "filter", *SCORES, "nll", *NOISES),
     text=("data", "filter"),
     whole=(),
-    order=lambda row: (row["data"], row["filter"]),
+    order=lambda row: ([*GROUNDS, ICUB].index(row["data"]), row["filter"]),
 )
-NOISES = ("kinematics", "rate", "gyro", "accelerometer")
+VALIDATED = Columns(
+    names=("data", *NOISES, "velocity", "nees", "held", "nll"),
+    text=("data",),
+    whole=(),
+    order=lambda row: (row["data"], *(row[key] for key in NOISES)),
+)
 SHOWN = list(GROUNDS)[1]  # in the picture
+VALIDATION_RUNS = 8
 KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
@@ -47,11 +57,15 @@ class Study:
 
     out: Path | None = None  # folder for legged.csv, legged.md and legged.png
     icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
-    runs: int = 5  # of the test, on each ground
+    parts: tuple[Literal["simulated", "icub"], ...] = (
+        "simulated",
+        "icub",
+    )  # rows of the other are read from legged.csv
+    runs: int = 4  # of the test, on each ground
     seconds: float = 8.0  # of such a run
-    training_runs: int = 32  # of 6 s each; a quarter as many are for validation
-    updates: int = 120  # of the learned contacts
-    lstm_updates: int = 1000
+    training_runs: int = 24  # of 6 s each
+    updates: int = 80  # of the learned contacts
+    lstm_updates: int = 500
     seed: int = 0
     smoke: bool = False  # a few short runs: does it run?
 
@@ -83,15 +97,27 @@ def in_the_air(robot: Robot) -> Robot:
     return replace(robot, log=log)
 
 
-def chosen(validation: Robot, name: str, grid: Iterable[dict[str, float]]) -> LeggedNoises:
-    """The noises of a grid under which the true velocity is likeliest; of a validation by that name."""
-    found = {}
+def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path | None) -> LeggedNoises:
+    """The noises of a grid under which the true velocity is likeliest.
+
+    Args:
+        make: makes the log.
+        name: of the log.
+        grid: noises.
+        out: folder with ``validation.csv``; what is in it is not run again. ``None`` for none.
+    """
+    file = None if out is None else out / "validation.csv"
+    rows, robot = [] if file is None or not file.exists() else VALIDATED.read(file), None
     for options in grid:
-        noises = LeggedNoises(**options)
-        found[noises] = scored(validation, run(validation, kind="EKF", noises=noises)[0])
-        numbers = {key: round(found[noises][key], 3) for key in ("nll", "velocity", "nees", "held")}
-        print(f"validation, {name}, {options}: {numbers}", flush=True)
-    return min(found, key=lambda noises: found[noises]["nll"])
+        if not any(row["data"] == name and all(row[key] == options[key] for key in NOISES) for row in rows):
+            robot = make() if robot is None else robot
+            found = scored(robot, run(robot, kind="EKF", noises=LeggedNoises(**options))[0])
+            rows.append({"data": name, **options, **{key: found[key] for key in ("velocity", "nees", "held", "nll")}})
+            print("validation", rows[-1], flush=True)
+            if file is not None:
+                VALIDATED.write(rows, file)
+    best = min((row for row in rows if row["data"] == name), key=lambda row: row["nll"])
+    return LeggedNoises(**{key: best[key] for key in NOISES})
 
 
 def feet_grid(smoke: bool) -> list[dict[str, float]]:
@@ -119,12 +145,14 @@ def filter_rows(
         for label, variant in variants.items()
     }
     noises = next(iter(variants.values()))["noises"]
+    used = {key: getattr(noises, key) for key in NOISES}
     runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
     rows = []
     for name, (belief, ms) in runs.items():
         parts = belief.chunk(len(robots))
         for (data, robot), part in zip(robots.items(), parts, strict=True):
-            rows.append({"data": data, "filter": name, **scored(robot, part), "ms": ms})
+            rows.append({"data": data, "filter": name, **scored(robot, part), "ms": ms, **used})
+            print(rows[-1], flush=True)
     return rows, {name: belief for name, (belief, _) in runs.items()}
 
 
@@ -134,7 +162,7 @@ def still(robot: Robot) -> dict[str, float]:
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
-def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str:
+def page(rows: list[dict], study: Study) -> str:
     """The table."""
     lines = [
         "# How fast is the base",
@@ -158,9 +186,8 @@ def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
         "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. Noises "
-        "are chosen on further runs, by the likelihood of the true velocity: threshold contacts have those that fit "
-        "all grounds of the training; learned contacts have those that fit firm ground, and tell the rest themselves. "
-        "iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly as iCub's. "
+        "are chosen on further runs, by the likelihood of the true velocity: on the training's grounds for all simulated "
+        "rows. iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly as iCub's. "
         "Milliseconds are those of the "
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
         "one thread.",
@@ -168,7 +195,7 @@ def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str
         *head(
             "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
         ),
-        *(line(name, *(f"{getattr(each, key):g}" for key in NOISES)) for name, each in noises.items()),
+        *(line(name, *(f"{row[key]:g}" for key in NOISES)) for name, row in _with_noises(rows).items()),
         "",
         *made_by("legged"),
         f"* Seed: {study.seed}.",
@@ -176,50 +203,69 @@ def page(rows: list[dict], study: Study, noises: dict[str, LeggedNoises]) -> str
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Runs the study."""
-    study = parse(Study)
-    if study.smoke:
-        study = replace(study, runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1)
-    began = time.monotonic()
-    torch.manual_seed(study.seed)
+def _with_noises(rows: list[dict]) -> dict[str, dict]:
+    """A row with noises, of the simulated ones and of iCub's."""
+    return {"iCub" if row["data"] == ICUB else "quadruped": row for row in rows if row["filter"].startswith("EKF")}
+
+
+def simulated(study: Study) -> list[dict]:
+    """The rows of the quadruped; leaves the picture in the folder."""
     length = 0.3 if study.smoke else 6.0
+    make = partial(quadruped, VALIDATION_RUNS, length, study.seed + 2)
+    noises = chosen(make, "all grounds", feet_grid(study.smoke), study.out)
     training = quadruped(study.training_runs, length, study.seed + 1)
-    validation, firm = (quadruped(study.training_runs // 4, length, study.seed + 2, ground) for ground in (None, FIRM))
-    noises, firm_noises = (
-        chosen(robot, name, feet_grid(study.smoke))
-        for robot, name in ((validation, "all grounds"), (firm, "firm ground"))
-    )
-    contacts = learned_contacts(training, firm_noises, study.updates, min(40, training.log.shape[1] - 1))
-    lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
-    kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
+    contacts = learned_contacts(training, noises, study.updates, min(40, training.log.shape[1] - 1))
+    lstm = trained_lstm(training, make(), contacts, study.lstm_updates)
     robots = {
         name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(GROUNDS.items())
     }
-    all_noises = {"threshold contacts": noises, "learned contacts": firm_noises}
-    learned = {"noises": firm_noises, "contacts": contacts}
-    rows, beliefs = filter_rows(robots, {", threshold": {"noises": noises}, ", learned": learned}, kinds)
+    kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
+    variants = {", threshold": {"noises": noises}, ", learned": {"noises": noises, "contacts": contacts}}
+    rows, beliefs = filter_rows(robots, variants, kinds)
     for name, robot in robots.items():
         with torch.no_grad():
             found = scores(robot, *lstm(lstm.read(robot.log)))
         rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
-    if (study.icub / "walking.npz").exists() and not study.smoke:
-        robot, name = humanoid(study.icub), "iCub, real"
-        feet = {"kinematics": firm_noises.kinematics, "rate": firm_noises.rate}
-        grid = [{**feet, "gyro": gyro, "accelerometer": accelerometer} for gyro, accelerometer in STAMPED]
-        stamped = chosen(jittered(firm, robot), "uneven stamps", grid)
-        all_noises["iCub"] = stamped
-        rows += filter_rows({name: robot}, {"": {"noises": stamped}}, kinds)[0]
-        rows.append({"data": name, "filter": "standing still", **still(robot)})
-    for row in rows:
-        print(row["data"], row["filter"], {key: f"{row[key]:.3g}" for key in SCORES if key in row}, flush=True)
-    print(f"{(time.monotonic() - began) / 60:.0f} min", flush=True)
     if study.out is not None:
-        study.out.mkdir(parents=True, exist_ok=True)
-        COLUMNS.write(rows, study.out / "legged.csv")
         number = list(GROUNDS).index(SHOWN)
         shown = {label: beliefs[f"EKF, {label}"].chunk(len(GROUNDS))[number] for label in ("threshold", "learned")}
         draw(robots[SHOWN], shown, study.out / "legged.png")
-    text = page(rows, study, all_noises)
-    write_page(text, None if study.out is None else study.out / "legged.md")
+    return rows
+
+
+def real(study: Study) -> list[dict]:
+    """The rows of iCub."""
+    robot = humanoid(study.icub)
+    make = partial(quadruped, VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
+    firm = chosen(make, "firm ground", feet_grid(study.smoke), study.out)
+    feet = {"kinematics": firm.kinematics, "rate": firm.rate}
+    grid = [{**feet, "gyro": gyro, "accelerometer": accelerometer} for gyro, accelerometer in STAMPED]
+    noises = chosen(lambda: jittered(make(), robot), "firm ground, uneven stamps", grid, study.out)
+    rows = filter_rows({ICUB: robot}, {"": {"noises": noises}}, KINDS)[0]
+    return [*rows, {"data": ICUB, "filter": "standing still", **still(robot)}]
+
+
+def main() -> None:
+    """Runs the study."""
+    study = parse(Study)
+    if study.smoke:
+        study = replace(study, parts=("simulated",), runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1)
+    torch.manual_seed(study.seed)
+    parts: dict[str, Callable[[Study], list[dict]]] = {"simulated": simulated}
+    if (study.icub / "walking.npz").exists():
+        parts["icub"] = real
+    if study.out is not None:
+        study.out.mkdir(parents=True, exist_ok=True)
+    file = None if study.out is None else study.out / "legged.csv"
+    rows = COLUMNS.read(file) if file is not None and file.exists() else []
+    for part in study.parts:
+        if part not in parts:
+            continue
+        began = time.monotonic()
+        rows = [row for row in rows if (row["data"] == ICUB) != (part == "icub")] + parts[part](study)
+        print(f"{part}: {(time.monotonic() - began) / 60:.0f} min", flush=True)
+        if file is not None:
+            COLUMNS.write(rows, file)
+    rows.sort(key=COLUMNS.order)
+    write_page(page(rows, study), None if study.out is None else study.out / "legged.md")

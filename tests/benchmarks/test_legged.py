@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from benchmarks.common.arguments import ROOT
-from benchmarks.legged.study import Study, in_the_air, page, run, scored, still
+from benchmarks.legged.study import ICUB, Study, chosen, in_the_air, page, run, scored, still
 from benchmarks.legged.task import GROUNDS, base_pose, humanoid, quadruped, scores
 from benchmarks.legged.training import LSTM
 from tests.real_data import SHARED
-from torch_denkf.applications.legged import LearnedContacts, LeggedNoises
+from torch_denkf.applications.legged import LearnedContacts
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.functional.manifolds import SO3, rotate
 
@@ -96,11 +96,18 @@ def test_the_lstm_reads_what_the_contacts_read_of_one_row(robot):
 
 
 def test_the_page_has_every_row():
-    rows = [{"data": data, "filter": "EKF", "velocity": 0.1, "certain": 0.2} for data in ("firm ground", "iCub, real")]
-    text = page(rows, Study(), {"threshold": LeggedNoises(kinematics=0.7)})
-    assert "| threshold | 0.7 |" in text
+    noises = {"kinematics": 0.7, "rate": 1.0, "gyro": 1.0, "accelerometer": 1.0}
+    rows = [{"data": d, "filter": "EKF", "velocity": 0.1, "certain": 0.2, **noises} for d in ("firm ground", ICUB)]
+    text = page(rows, Study())
     assert "| EKF | 0.100 |  |" in text
     assert "| EKF | 0.100 | 0.200 |" in text
+    assert "| iCub | 0.7 | 1 |" in text
+
+
+def test_the_likeliest_noises_are_chosen_once(robot, tmp_path):
+    grid = [{"kinematics": k, "rate": r, "gyro": 1e-3, "accelerometer": 5e-3} for k, r in ((0.01, 0.3), (1e-4, 1e-3))]
+    assert chosen(lambda: robot, "some", grid, tmp_path).kinematics == 0.01
+    assert chosen(None, "some", grid, tmp_path).kinematics == 0.01, "nothing is run again"
 
 
 def test_the_results_are_those_of_the_study():
