@@ -187,7 +187,8 @@ def page(rows: list[dict], study: Study) -> str:
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
         "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. Noises "
         "are chosen on further runs, by the likelihood of the true velocity: on the training's grounds for all "
-        "simulated rows. iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly as iCub's. "
+        "simulated rows. iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly "
+        "as iCub's. "
         "Milliseconds are those of the "
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
         "one thread.",
