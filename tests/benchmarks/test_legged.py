@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.common.arguments import ROOT
 from benchmarks.legged.study import ICUB, Study, chosen, in_the_air, page, run, scored, still
-from benchmarks.legged.task import GROUNDS, base_pose, humanoid, quadruped, scores
+from benchmarks.legged.task import FIRM, GROUNDS, base_pose, humanoid, quadruped, scores
 from benchmarks.legged.training import LSTM
 from tests.real_data import SHARED
 from torch_denkf.applications.legged import LearnedContacts
@@ -17,7 +17,7 @@ from torch_denkf.functional.manifolds import SO3, rotate
 
 @pytest.fixture(scope="module")
 def robot():
-    return quadruped(2, 1.5, 0)
+    return quadruped(2, 1.5, 0, FIRM)
 
 
 def true_mean(robot):
@@ -70,7 +70,7 @@ def test_a_turned_belief_tilts_and_drifts(robot):
 
 
 def test_runs_differ_and_repeat(robot):
-    again = quadruped(2, 1.5, 0)
+    again = quadruped(2, 1.5, 0, FIRM)
     assert torch.equal(robot.log["imu"], again.log["imu"])
     assert (robot.log["imu"][0] - robot.log["imu"][1]).abs().max() > 0.1
     slippery = quadruped(1, 1.0, 0, list(GROUNDS.values())[1])
