@@ -6,12 +6,15 @@ import pytest
 import torch
 
 from benchmarks.common.arguments import ROOT
+from benchmarks.legged.start import turned
 from benchmarks.legged.study import ICUB, Study, chosen, in_the_air, page, run, scored, still
 from benchmarks.legged.task import FIRM, GROUNDS, base_pose, humanoid, quadruped, scores
 from benchmarks.legged.training import LSTM
 from tests.real_data import SHARED
 from torch_denkf.applications.legged import LearnedContacts
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.applications.legged.motion import legged_space
+from torch_denkf.applications.legged.readings import FeetInBody
 from torch_denkf.functional.manifolds import SO3, rotate
 
 
@@ -123,3 +126,13 @@ def test_of_the_walk_the_truth_is_in_doubt_where_a_loaded_foot_moves():
     robot = humanoid(SHARED / "icub")
     assert 0 < robot.doubtful.double().mean() < 0.5
     assert robot.log.shape == robot.doubtful.shape
+
+
+def test_a_turned_world_looks_the_same_to_its_feet():
+    torch.manual_seed(0)
+    state, turn = torch.randn(5, 28), SO3().exp(torch.randn(5, 3))
+    state[:, :4] = SO3().exp(torch.randn(5, 3))
+    seen = FeetInBody(legged_space(4)).compute(state.unsqueeze(-2))
+    moved = turned(state, turn)
+    assert (FeetInBody(legged_space(4)).compute(moved.unsqueeze(-2)) - seen).abs().max() < 1e-5
+    assert (rotate(turn, state[:, 4:7]) - moved[:, 4:7]).abs().max() < 1e-6
