@@ -68,7 +68,9 @@ class LeggedEnv(EnvBase):
         errors: of the sensors; ``None`` for :class:`LeggedErrors`.
         on: force in N above which a foot counts as standing.
         off: force below which it does no more.
-        seed: of the errors.
+        pushes: standard deviation in N of forces on the base, level with the floor: one a second on average, for a
+            tenth of a second.
+        seed: of the errors and pushes.
 
     Raises:
         ValueError: if the model has no accelerometer there, no free joint, or ``dt`` is no multiple of its step.
@@ -84,10 +86,13 @@ class LeggedEnv(EnvBase):
         errors: LeggedErrors | None = None,
         on: float = 20.0,
         off: float = 10.0,
+        pushes: float = 0.0,
         seed: int = 0,
     ):
         super().__init__(batch_size=[])
         self.errors, self.dt, self.on, self.off = LeggedErrors() if errors is None else errors, dt, on, off
+        check_number("pushes", pushes, least=0)
+        self.pushes = pushes
         self.model, self.data, self.substeps = model, mujoco.MjData(model), round(dt / model.opt.timestep)
         check_number("off", off, most=on)
         if abs(self.substeps * model.opt.timestep - dt) > 1e-9:
@@ -129,13 +134,15 @@ class LeggedEnv(EnvBase):
         six = [self.errors.gyro_bias] * 3 + [self.errors.accelerometer_bias] * 3
         self.bias = np.array(six) * self.random.standard_normal(6)
         self.offset = self.errors.joint_offset * self.random.standard_normal(len(self.columns))
-        self.stands = np.zeros(len(self.feet), dtype=bool)
+        self.stands, self.pushed = np.zeros(len(self.feet), dtype=bool), 0
         for _ in range(round(0.5 / self.dt)):
             readings = self._move()
         return readings
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self.data.ctrl[:] = tensordict["action"].numpy()
+        if self.pushes:
+            self._push()
         readings = self._move()
         done = torch.zeros(1, dtype=torch.bool)
         return readings.update({"reward": torch.zeros(1), "done": done, "terminated": done.clone()})
@@ -158,6 +165,15 @@ class LeggedEnv(EnvBase):
         entries |= {"force": force, "true": {key: _floats(value) for key, value in true.items()}}
         entries = {key: _floats(value) if isinstance(value, np.ndarray) else value for key, value in entries.items()}
         return TensorDict({**entries, "contact": torch.as_tensor(self.stands.copy())})
+
+    def _push(self) -> None:
+        """Begins or ends a force on the base."""
+        force = self.data.xfrc_applied[int(self.model.jnt_bodyid[0])]
+        self.pushed -= 1
+        if self.pushed <= 0:
+            force[:] = 0.0
+            if self.random.random() < self.dt:
+                force[:2], self.pushed = self.pushes * self.random.standard_normal(2), round(0.1 / self.dt)
 
     def _with_errors(self, imu: np.ndarray) -> dict:
         e, draw, root = self.errors, self.random.standard_normal, math.sqrt(self.dt)
@@ -186,12 +202,22 @@ QUADRUPED: dict[str, Any] = {
 }
 
 
-def quadruped_env(errors: LeggedErrors | None = None, *, seed: int = 0) -> LeggedEnv:
+def quadruped_env(
+    errors: LeggedErrors | None = None,
+    *,
+    friction: float = 1.5,
+    softness: float = 0.01,
+    pushes: float = 0.0,
+    seed: int = 0,
+) -> LeggedEnv:
     """dm_control's quadruped on a floor, with an inertial sensor beside its middle, 100 steps a second.
 
     Args:
         errors: of the sensors.
-        seed: of them.
+        friction: of feet and floor: the force along the floor by the force upon it. On 0.3 feet slide.
+        softness: seconds in which the floor gives way and comes back.
+        pushes: standard deviation in N, see :class:`LeggedEnv`. The robot has 107 kg.
+        seed: of errors and pushes.
     """
     from dm_control.suite import common, quadruped  # type: ignore[import-untyped]  # which takes seconds
 
@@ -200,7 +226,13 @@ def quadruped_env(errors: LeggedErrors | None = None, *, seed: int = 0) -> Legge
     site.attrib.update(pos="0.12 0.05 0.08", euler="30 -20 60")
     model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"), common.ASSETS)
     model.opt.timestep = 0.0025
-    return LeggedEnv(model, **QUADRUPED, errors=errors, on=150.0, off=100.0, seed=seed)
+    model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 30.0  # feet that stand do not creep
+    # With implicit damping the simulator moves otherwise than its accelerometer reads, by a third.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    check_number("friction", friction, above=0)
+    check_number("softness", softness, above=0)
+    model.geom_friction[:, 0], model.geom_solref[:, 0] = friction, softness
+    return LeggedEnv(model, **QUADRUPED, errors=errors, on=150.0, off=100.0, pushes=pushes, seed=seed)
 
 
 def trot(

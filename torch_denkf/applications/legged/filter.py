@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.applications.legged.learned import SLIP, LearnedContacts, Variances
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, legged_space
 from torch_denkf.applications.legged.noises import LeggedNoises
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
@@ -37,6 +38,7 @@ def legged_filter(
     ensemble_size: int = 64,
     threshold: float | None = 2.0,
     noises: LeggedNoises | None = None,
+    contacts: LearnedContacts | None = None,
     gravity: float = 9.81,
     imu_key: NestedKey = "imu",
     joints_key: NestedKey = "joints",
@@ -67,6 +69,8 @@ def legged_filter(
         threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
             believe all correlations.
         noises: of the sensors and feet.
+        contacts: says how much each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
+            ``rates_key``. An ensemble takes its variances, and no correlation of a foot's axes.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
@@ -76,7 +80,7 @@ def legged_filter(
 
     Raises:
         KeyError: if the model lacks a name.
-        ValueError: on an unknown ``kind``.
+        ValueError: on an unknown ``kind``, or ``contacts`` without ``rates_key``.
 
     Source:
         Bloesch et al. 2012, RSS VIII (feet in the state). Errors are turns and steps in the sensor's axes; the
@@ -84,13 +88,15 @@ def legged_filter(
     """
     if kind not in ("DEnKF", "EKF", "UKF"):
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
+    if contacts is not None and rates_key is None:
+        raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
     count, space = len(kinematics.feet), legged_space(len(kinematics.feet))
     readings = LegReadings(
         kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
     motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key)
-    process = LeggedMotionNoise(count, dt, n, contact_key=contact_key)
+    process = LeggedMotionNoise(count, dt, n, contact_key=contact_key, slip_key=None if contacts is None else SLIP)
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])
@@ -108,8 +114,11 @@ def legged_filter(
         "feet": FusedSensor(FeetInBody(space), [n.kinematics] * 3 * count, observation_key=("legs", "feet"), **mask)
     }
     if rates_key is not None:
+        noise: Any = [n.rate] * 3 * count if contacts is None else contacts
+        if kind == "DEnKF" and contacts is not None:
+            noise = Variances(contacts)
         rates = FeetRates(space, imu_key=imu_key)
-        sensors["rates"] = FusedSensor(rates, [n.rate] * 3 * count, observation_key=("legs", "rates"), **mask)
+        sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
     per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
     velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)

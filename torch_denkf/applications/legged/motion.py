@@ -74,6 +74,7 @@ class LeggedMotionNoise(SubModel):
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         noises: of sensors and feet.
         contact_key: which feet stand, ``[*B, F]`` bool.
+        slip_key: how a standing foot walks at random, in m^2/s, ``[*B, F]``; ``None`` for that of ``noises``.
     """
 
     base: Tensor
@@ -81,10 +82,18 @@ class LeggedMotionNoise(SubModel):
     slip: Tensor
     air: Tensor
 
-    def __init__(self, feet: int, dt: float | NestedKey, noises: LeggedNoises, *, contact_key: NestedKey = "contact"):
-        self.dt = dt
-        timed = [] if isinstance(dt, (int, float)) else [dt]
-        super().__init__(nn.Identity(), [contact_key, *timed], [("forecast", "noise")])
+    def __init__(
+        self,
+        feet: int,
+        dt: float | NestedKey,
+        noises: LeggedNoises,
+        *,
+        contact_key: NestedKey = "contact",
+        slip_key: NestedKey | None = None,
+    ):
+        self.dt, self.learned = dt, slip_key is not None
+        more = [key for key in (slip_key, None if isinstance(dt, (int, float)) else dt) if key is not None]
+        super().__init__(nn.Identity(), [contact_key, *more], [("forecast", "noise")])
         n = noises
         densities = [n.gyro, n.accelerometer, n.accelerometer / 3**0.5, n.gyro_walk, n.accelerometer_walk]
         self.register_buffer("base", torch.tensor(densities).square().repeat_interleave(3))
@@ -92,8 +101,9 @@ class LeggedMotionNoise(SubModel):
         self.register_buffer("slip", torch.tensor(n.slip**2))
         self.register_buffer("air", torch.tensor(n.kinematics**2))
 
-    def compute(self, contact, dt=None):
+    def compute(self, contact, *more):
         """The variances."""
-        dt = self.slip.new_tensor(self.dt) if dt is None else dt.to(self.slip.dtype)
+        slip = more[0] if self.learned else self.slip
+        dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
-        return torch.cat([base, torch.where(contact, self.slip * dt, self.air).repeat_interleave(3, -1)], -1)
+        return torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)

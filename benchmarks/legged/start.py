@@ -1,0 +1,106 @@
+"""A filter that starts with a wrong idea of where up is: how long does it take to find it?
+
+    python -m benchmarks.legged.start --out benchmarks/legged/results
+
+An invariant filter's errors move alike wherever its mean is, so it should gain most where the start is far off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.tables import head, line, write_page
+from benchmarks.legged.study import KINDS
+from benchmarks.legged.task import FIRM, Robot, base_pose, quadruped
+from torch_denkf.applications.legged import LeggedNoises, legged_filter
+from torch_denkf.functional.manifolds import SO3, rotate
+
+KEPT = [("belief", "mean"), ("belief", "velocity")]
+
+
+@dataclass(frozen=True)
+class Start:
+    """How long does a filter take to find where up is?"""
+
+    out: Path | None = None  # folder for start.md
+    runs: int = 8
+    seconds: float = 4.0
+    degrees: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)  # by which the start is tilted
+    seed: int = 20
+    smoke: bool = False  # one short run
+
+
+def turned(state: Tensor, turn: Tensor) -> Tensor:
+    """States ``[*, 16 + 3 F]`` with the whole world turned about its origin, by quaternions ``[*, 4]``."""
+    turn = turn.expand(*state.shape[:-1], 4)
+    feet = rotate(turn.unsqueeze(-2), state[..., 16:].unflatten(-1, (-1, 3))).flatten(-2)
+    moved = [rotate(turn, state[..., 4:7]), rotate(turn, state[..., 7:10]), state[..., 10:16], feet]
+    return torch.cat([SO3().compose(turn, state[..., :4]), *moved], -1)
+
+
+@torch.no_grad()
+def tilts(robot: Robot, kind: str, degrees: float) -> tuple[Tensor, Tensor]:
+    """Tilt's errors in degrees and the velocity's in m/s, ``[R, T]``, of a filter that knows how wrong its start is."""
+    noises = LeggedNoises(tilt=max(math.radians(degrees), LeggedNoises().tilt))
+    filter = legged_filter(robot.model, **robot.names, dt=robot.dt, noises=noises, **KINDS[kind])
+    torch.manual_seed(0)
+    first, log = filter.initialise(robot.log[:, 0].clone()), robot.log[:, 1:].clone()
+    way = torch.linspace(0, 2 * math.pi, log.shape[0] + 1)[:-1]  # another axis of each run, level
+    turn = SO3().exp(math.radians(degrees) * torch.stack([way.cos(), way.sin(), torch.zeros_like(way)], -1))
+    for key in filter.carry_keys:
+        value = first[key]
+        if key[-1] == "mean":
+            value = turned(value, turn)
+        elif key[-1] == "ensemble":
+            value = turned(value, turn.unsqueeze(-2))
+        log["previous", *key] = value.unsqueeze(1).expand(-1, log.shape[1], *value.shape[1:]).clone()
+    belief = filter.sequence(log, keep=KEPT)["belief"]
+    orientation, _ = base_pose(robot, belief["mean"])
+    up = orientation.new_tensor([0.0, 0.0, 1.0])
+    one, other = (rotate(SO3().inverse(each), up) for each in (orientation, log["true", "orientation"]))
+    tilt = torch.atan2(torch.linalg.cross(one, other).norm(dim=-1), (one * other).sum(-1)).rad2deg()
+    return tilt, (belief["velocity"] - log["true", "velocity"]).norm(dim=-1)
+
+
+def main() -> None:
+    """Measures, and writes the table."""
+    study = parse(Start)
+    if study.smoke:
+        study = Start(runs=1, seconds=0.2, degrees=(20.0,), smoke=True)
+    robot = quadruped(study.runs, study.seconds, study.seed, FIRM)
+    moments, last = (10, 50, 100, 200), slice(-100, None)
+    text = [
+        "# A start that is tilted",
+        "",
+        f"{study.runs} simulated runs on firm ground. Each begins with a belief that is tilted about another axis, and "
+        "that knows by how much it may be. Errors are root mean squares over the runs; the last columns are those of "
+        "the last second.",
+        "",
+        *head(
+            "filter",
+            "start, deg",
+            *(f"tilt after {each / 100:g} s, deg" for each in moments),
+            "tilt, last second, deg",
+            "velocity, last second, m/s",
+        ),
+    ]
+    for kind in list(KINDS)[: 1 if study.smoke else 2]:
+        for degrees in study.degrees:
+            tilt, velocity = (each.square() for each in tilts(robot, kind, degrees))
+            numbers = [tilt[:, min(each, tilt.shape[1]) - 1].mean().sqrt().item() for each in moments]
+            numbers.append(tilt[:, last].mean().sqrt().item())
+            speed = velocity[:, last].mean().sqrt().item()
+            text.append(line(kind, f"{degrees:g}", *(f"{each:.2f}" for each in numbers), f"{speed:.3f}"))
+            print(text[-1], flush=True)
+    text += ["", *made_by("legged.start")]
+    write_page("\n".join(text) + "\n", None if study.out is None else study.out / "start.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""The study: its options, its rows, its table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+
+from benchmarks.common.arguments import made_by, parse
+from benchmarks.common.tables import Columns, head, line, write_page
+from benchmarks.legged.pictures import draw
+from benchmarks.legged.task import FIRM, GROUNDS, LEVEL, Robot, humanoid, jittered, quadruped, scores
+from benchmarks.legged.training import VELOCITY, learned_contacts, trained_lstm
+from torch_denkf.applications.legged import LeggedNoises, legged_filter
+
+#: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
+KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
+#: Gyro in rad/s/sqrt(Hz), accelerometer in m/s^2/sqrt(Hz). The simulated ones are a little above their data sheets.
+SIMULATED = (1e-3, 5e-3)
+#: Of a log with uneven stamps: a turn or a force counts for a wrong time. One pair is chosen in validation.
+STAMPED = ((1e-3, 5e-3), (5e-3, 2e-2), (1e-2, 5e-2), (2e-2, 0.1), (4e-2, 0.2))
+NOISES = ("kinematics", "rate", "gyro", "accelerometer")
+ICUB = "iCub, real"
+SCORES = ("velocity", "certain", "tilt", "drift", "nees", "held", "ms")
+COLUMNS = Columns(
+    names=("data", "filter", *SCORES, "nll", *NOISES),
+    text=("data", "filter"),
+    whole=(),
+    order=lambda row: ([*GROUNDS, ICUB].index(row["data"]), row["filter"]),
+)
+VALIDATED = Columns(
+    names=("data", *NOISES, "velocity", "nees", "held", "nll"),
+    text=("data",),
+    whole=(),
+    order=lambda row: (row["data"], *(row[key] for key in NOISES)),
+)
+SHOWN = list(GROUNDS)[1]  # in the picture
+VALIDATION_RUNS = 8
+KINDS = {
+    "EKF": {"kind": "EKF"},
+    "UKF": {"kind": "UKF"},
+    "DEnKF, 32 members": {"kind": "DEnKF", "ensemble_size": 32},
+    "DEnKF, 64 members": {"kind": "DEnKF", "ensemble_size": 64},
+}
+
+
+@dataclass(frozen=True)
+class Study:
+    """How fast is a walking robot's base, by its inertial sensor, joints and feet?"""
+
+    out: Path | None = None  # folder for legged.csv, legged.md and legged.png
+    icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
+    parts: tuple[Literal["simulated", "icub"], ...] = (
+        "simulated",
+        "icub",
+    )  # rows of the other are read from legged.csv
+    runs: int = 4  # of the test, on each ground
+    seconds: float = 8.0  # of such a run
+    training_runs: int = 24  # of 6 s each
+    updates: int = 80  # of the learned contacts
+    lstm_updates: int = 500
+    seed: int = 0
+    smoke: bool = False  # a few short runs: does it run?
+
+
+@torch.no_grad()
+def run(robot: Robot, **options) -> tuple[TensorDict, float]:
+    """Belief of a filter on a robot's log, and milliseconds of the processor for a step of all runs.
+
+    Args:
+        robot: with its log.
+        **options: of the filter; its precision is that of the log.
+    """
+    filter = legged_filter(robot.model, **robot.names, dt=robot.dt, **options).to(robot.log["imu"].dtype)
+    torch.manual_seed(0)
+    began = time.process_time()
+    out = filter.sequence(robot.log.clone(), keep=[VELOCITY, ("belief", "velocity_var"), ("belief", "mean")])
+    return out["belief"], 1e3 * (time.process_time() - began) / robot.log.shape[1]
+
+
+def scored(robot: Robot, belief: TensorDict) -> dict[str, float]:
+    """Scores of a belief."""
+    return scores(robot, belief["velocity"], belief["velocity_var"], belief["mean"])
+
+
+def in_the_air(robot: Robot) -> Robot:
+    """The same log, in which no foot ever stands: what is left is to integrate the inertial sensor."""
+    log = robot.log.clone()
+    log["contact"] = torch.zeros_like(log["contact"])
+    return replace(robot, log=log)
+
+
+def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path | None) -> LeggedNoises:
+    """The noises of a grid under which the true velocity is likeliest.
+
+    Args:
+        make: makes the log.
+        name: of the log.
+        grid: noises.
+        out: folder with ``validation.csv``; what is in it is not run again. ``None`` for none.
+    """
+    file = None if out is None else out / "validation.csv"
+    rows, robot = [] if file is None or not file.exists() else VALIDATED.read(file), None
+    for options in grid:
+        if not any(row["data"] == name and all(row[key] == options[key] for key in NOISES) for row in rows):
+            robot = make() if robot is None else robot
+            found = scored(robot, run(robot, kind="EKF", noises=LeggedNoises(**options))[0])
+            rows.append({"data": name, **options, **{key: found[key] for key in ("velocity", "nees", "held", "nll")}})
+            print("validation", rows[-1], flush=True)
+            if file is not None:
+                VALIDATED.write(rows, file)
+    best = min((row for row in rows if row["data"] == name), key=lambda row: row["nll"])
+    return LeggedNoises(**{key: best[key] for key in NOISES})
+
+
+def feet_grid(smoke: bool) -> list[dict[str, float]]:
+    """Noises of the feet, with those of the simulated sensor."""
+    pairs = list(product(KINEMATICS, RATES))[: 1 if smoke else None]
+    gyro, accelerometer = SIMULATED
+    return [{"kinematics": k, "rate": r, "gyro": gyro, "accelerometer": accelerometer} for k, r in pairs]
+
+
+def filter_rows(
+    robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict]
+) -> tuple[list[dict], dict[str, TensorDict]]:
+    """Rows of the library's filters; and their beliefs, by filter, of all runs.
+
+    Args:
+        robots: by the name of the data, with logs of one shape, which are filtered side by side.
+        variants: of every filter, by what is behind its name: its noises, and its contacts. The first one's noises are
+            also those of the integrated sensor.
+        kinds: options of the filters, by name.
+    """
+    every = replace(next(iter(robots.values())), log=torch.cat([robot.log for robot in robots.values()]))
+    runs = {
+        kind + label: run(every, **variant, **options)
+        for kind, options in kinds.items()
+        for label, variant in variants.items()
+    }
+    noises = next(iter(variants.values()))["noises"]
+    used = {key: getattr(noises, key) for key in NOISES}
+    runs["integrated inertial sensor"] = run(in_the_air(every), noises=noises, kind="EKF")
+    rows = []
+    for name, (belief, ms) in runs.items():
+        parts = belief.chunk(len(robots))
+        for (data, robot), part in zip(robots.items(), parts, strict=True):
+            rows.append({"data": data, "filter": name, **scored(robot, part), "ms": ms, **used})
+            print(rows[-1], flush=True)
+    return rows, {name: belief for name, (belief, _) in runs.items()}
+
+
+def still(robot: Robot) -> dict[str, float]:
+    """Scores of a velocity of zero: how fast the robot is."""
+    zero = torch.zeros_like(robot.log["true", "velocity"])
+    return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
+
+
+def page(rows: list[dict], study: Study) -> str:
+    """The table."""
+    lines = [
+        "# How fast is the base",
+        "",
+        "Velocity is the root mean square error of the base's velocity, all three axes together, in the base's axes; "
+        "tilt that of where up is. Drift is how far the end of the path is off, over the path's length. NEES is the "
+        "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
+        f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
+    ]
+    titles = ("filter", "velocity, m/s", "tilt, deg", "drift, %", "NEES", "held", "ms a step")
+    digits = {"velocity": 3, "tilt": 2, "drift": 1, "nees": 2, "held": 2, "ms": 0}
+    for data in dict.fromkeys(row["data"] for row in rows):
+        real = data.startswith("iCub")
+        own = {"velocity": 3, "certain": 3, **digits} if real else digits
+        lines += ["", f"## {data}", ""]
+        lines += head(*titles[:2], *(["velocity where the truth is sure, m/s"] if real else []), *titles[2:])
+        for row in rows:
+            if row["data"] == data:
+                lines.append(line(row["filter"], *(f"{row[k]:.{d}f}" if k in row else "" for k, d in own.items())))
+    lines += [
+        "",
+        f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
+        "of its own. Contacts and LSTM are trained on other simulated runs, whose friction is 0.15 to 1.5. Noises "
+        "are chosen on further runs, by the likelihood of the true velocity: on the training's grounds for all "
+        "simulated rows. iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly "
+        "as iCub's. "
+        "Milliseconds are those of the "
+        f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "
+        "one thread.",
+        "",
+        *head(
+            "noises", "joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)"
+        ),
+        *(line(name, *(f"{row[key]:g}" for key in NOISES)) for name, row in _with_noises(rows).items()),
+        "",
+        *made_by("legged"),
+        f"* Seed: {study.seed}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _with_noises(rows: list[dict]) -> dict[str, dict]:
+    """A row with noises, of the simulated ones and of iCub's."""
+    return {"iCub" if row["data"] == ICUB else "quadruped": row for row in rows if row["filter"].startswith("EKF")}
+
+
+def simulated(study: Study) -> list[dict]:
+    """The rows of the quadruped; leaves the picture in the folder."""
+    length = 0.3 if study.smoke else 6.0
+    make = partial(quadruped, VALIDATION_RUNS, length, study.seed + 2)
+    noises = chosen(make, "all grounds", feet_grid(study.smoke), study.out)
+    training = quadruped(study.training_runs, length, study.seed + 1)
+    contacts = learned_contacts(training, noises, study.updates, min(40, training.log.shape[1] - 1))
+    lstm = trained_lstm(training, make(), contacts, study.lstm_updates)
+    robots = {
+        name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
+        for number, (name, ground) in enumerate(GROUNDS.items())
+    }
+    kinds = {"EKF": KINDS["EKF"]} if study.smoke else KINDS
+    variants = {", threshold": {"noises": noises}, ", learned": {"noises": noises, "contacts": contacts}}
+    rows, beliefs = filter_rows(robots, variants, kinds)
+    for name, robot in robots.items():
+        with torch.no_grad():
+            found = scores(robot, *lstm(lstm.read(robot.log)))
+        rows += [{"data": name, "filter": "LSTM", **found}, {"data": name, "filter": "standing still", **still(robot)}]
+    if study.out is not None:
+        number = list(GROUNDS).index(SHOWN)
+        shown = {label: beliefs[f"EKF, {label}"].chunk(len(GROUNDS))[number] for label in ("threshold", "learned")}
+        draw(robots[SHOWN], shown, study.out / "legged.png")
+    return rows
+
+
+def real(study: Study) -> list[dict]:
+    """The rows of iCub."""
+    robot = humanoid(study.icub)
+    make = partial(quadruped, VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
+    firm = chosen(make, "firm ground", feet_grid(study.smoke), study.out)
+    feet = {"kinematics": firm.kinematics, "rate": firm.rate}
+    grid = [{**feet, "gyro": gyro, "accelerometer": accelerometer} for gyro, accelerometer in STAMPED]
+    noises = chosen(lambda: jittered(make(), robot), "firm ground, uneven stamps", grid, study.out)
+    rows = filter_rows({ICUB: robot}, {"": {"noises": noises}}, KINDS)[0]
+    return [*rows, {"data": ICUB, "filter": "standing still", **still(robot)}]
+
+
+def main() -> None:
+    """Runs the study."""
+    study = parse(Study)
+    if study.smoke:
+        study = replace(study, parts=("simulated",), runs=1, seconds=0.3, training_runs=4, updates=1, lstm_updates=1)
+    torch.manual_seed(study.seed)
+    parts: dict[str, Callable[[Study], list[dict]]] = {"simulated": simulated}
+    if (study.icub / "walking.npz").exists():
+        parts["icub"] = real
+    if study.out is not None:
+        study.out.mkdir(parents=True, exist_ok=True)
+    file = None if study.out is None else study.out / "legged.csv"
+    rows = COLUMNS.read(file) if file is not None and file.exists() else []
+    for part in study.parts:
+        if part not in parts:
+            continue
+        began = time.monotonic()
+        rows = [row for row in rows if (row["data"] == ICUB) != (part == "icub")] + parts[part](study)
+        print(f"{part}: {(time.monotonic() - began) / 60:.0f} min", flush=True)
+        if file is not None:
+            COLUMNS.write(rows, file)
+    rows.sort(key=COLUMNS.order)
+    write_page(page(rows, study), None if study.out is None else study.out / "legged.md")

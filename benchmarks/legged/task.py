@@ -1,0 +1,182 @@
+"""Logs of a simulated quadruped and of a real humanoid, and how well a filter knows the base's motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_denkf.applications.legged import QUADRUPED, quadruped_env, trot, with_last_rows
+from torch_denkf.applications.legged.icub import ICUB, icub_log, icub_model
+from torch_denkf.applications.legged.kinematics import LegKinematics
+from torch_denkf.functional.manifolds import SO3, rotate
+
+__all__ = ["FIRM", "GROUNDS", "LEVEL", "ROWS", "Ground", "Robot", "humanoid", "jittered", "quadruped", "scores"]
+
+LEVEL = 0.9  # of the intervals
+ROWS = 5  # that the learned contacts read
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor, and what happens on it. Each run draws between the least and the most, of which each is one.
+
+    Attributes:
+        friction: drawn by its logarithm.
+        softness: seconds in which the floor gives way.
+        pushes: standard deviation in N of forces on the base.
+    """
+
+    friction: tuple[float, float] = (0.15, 1.5)
+    softness: tuple[float, float] = (0.01, 0.03)
+    pushes: tuple[float, float] = (0.0, 100.0)
+
+
+FIRM = Ground((1.5, 1.5), (0.01, 0.01), (0.0, 0.0))
+#: Grounds of the test, by name. The last two are not seen in training.
+GROUNDS = {
+    "firm ground": FIRM,
+    "slippery ground, friction 0.2": Ground((0.2, 0.2), (0.01, 0.01), (0.0, 0.0)),
+    "ice, friction 0.1: not seen in training": Ground((0.1, 0.1), (0.01, 0.01), (0.0, 0.0)),
+    "soft ground with pushes: not seen in training": Ground((0.5, 1.0), (0.05, 0.05), (200.0, 200.0)),
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot and its log.
+
+    Attributes:
+        name: of the robot.
+        model: its chains of joints.
+        names: of its feet, sensor and joints.
+        dt: of the filter: seconds, or the key of them.
+        log: ``[R, T]``, readings and truth.
+        rows: that are scored.
+        doubtful: rows ``[R, T]`` of which the truth is in doubt.
+    """
+
+    name: str
+    model: mujoco.MjModel
+    names: dict[str, Any]
+    dt: float | str
+    log: TensorDict
+    rows: slice
+    doubtful: Tensor
+
+
+def quadruped(runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
+    """dm_control's quadruped, which trots at paces, strides and turns of its own in each run; all sensors err.
+
+    Args:
+        runs: R.
+        seconds: of a run, 100 rows each.
+        seed: of grounds, gaits and errors.
+        ground: that it trots on; ``None`` for that of training.
+    """
+    random, logs, ground = np.random.default_rng(seed), [], Ground() if ground is None else ground
+    for run in range(runs):
+        options = {name: random.uniform(*getattr(ground, name)) for name in ("softness", "pushes")}
+        friction = math.exp(random.uniform(*(math.log(each) for each in ground.friction)))
+        env = quadruped_env(friction=friction, seed=1000 * seed + run, **options)
+        low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
+        gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
+        row, rows = env.reset(), []
+        for step in range(round(seconds / env.dt)):
+            rows.append(row.select("imu", "joints", "joint_rates", "contact", "true"))
+            row["action"] = min(1.0, step * env.dt) * trot(step * env.dt, **gait)
+            row = env.step(row)["next"]
+        logs.append(torch.stack(rows))
+    log = with_last_rows(torch.stack(logs), ROWS)
+    doubtful = torch.zeros(log.shape, dtype=torch.bool)
+    return Robot("quadruped", env.model, QUADRUPED, env.dt, log, slice(min(100, log.shape[1] // 2), None), doubtful)
+
+
+def humanoid(folder: Path) -> Robot:
+    """The walk of iCub. Its truth is in doubt where motion capture moves a foot that carries the whole robot.
+
+    Args:
+        folder: with ``model.urdf`` and ``walking.npz``.
+    """
+    log = icub_log(folder)
+    feet, time = log["true", "feet"], log["dt"].cumsum(1)
+    speed = (feet[:, 10:] - feet[:, :-10]).norm(dim=-1) / (time[:, 10:] - time[:, :-10])
+    speed = torch.cat([speed[:, :1].expand(-1, 5, -1), speed, speed[:, -1:].expand(-1, 5, -1)], 1)
+    slides = ((log["force"] > 0.85 * log["force"].sum(-1).median()) & (speed > 0.15)).any(-1).double()
+    doubtful = torch.nn.functional.max_pool1d(slides, 21, 1, 10) > 0  # the derivative spans as many rows
+    return Robot("iCub", icub_model(folder), ICUB, "dt", log, slice(50, 1168), doubtful)
+
+
+def jittered(robot: Robot, like: Robot) -> Robot:
+    """A robot whose rows are stamped as unevenly as those of another: ``"dt"`` is what the stamps say."""
+    dt = like.log["dt"][:, 1:, 0]
+    late = dt.std() / 2**0.5 * torch.randn(*robot.log.shape, 1).to(dt)
+    steps = robot.dt + torch.cat([torch.zeros_like(late[:, :1]), late.diff(dim=1)], 1)
+    log = robot.log.clone().set("dt", steps.clamp(min=1e-4).to(robot.log["imu"].dtype))
+    return replace(robot, log=log, dt="dt")
+
+
+def base_pose(robot: Robot, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """Orientation and position of the base, of beliefs about its sensor ``[R, T, 16 + 3 F]``."""
+    sensor = LegKinematics(robot.model, **robot.names).base.to(mean.dtype)
+    turn = SO3().compose(mean[..., :4], SO3().inverse(sensor[:4]).expand_as(mean[..., :4]))
+    return turn, mean[..., 7:10] - rotate(turn, sensor[4:])
+
+
+def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = None) -> dict[str, float]:
+    """How wrong the base's velocity, tilt and path are, and how wide the velocity's intervals.
+
+    Args:
+        robot: with its log.
+        velocity: of the base in its own axes, ``[R, T, 3]``.
+        var: its variances.
+        mean: of a filter ``[R, T, 16 + 3 F]``; ``None`` where only the velocity is known.
+
+    Returns:
+        ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows whose
+        truth is in doubt; ``held``, the share of the true velocities in the intervals; ``nees``, the mean of square
+        error by variance; ``nll``, the mean negative log-likelihood. With ``mean`` also ``tilt`` in degrees, and
+        ``drift``, how far the end of the path is off, in % of its length.
+    """
+    true, rows, half = robot.log["true"], robot.rows, NormalDist().inv_cdf((1 + LEVEL) / 2)
+    error, var = (velocity - true["velocity"])[:, rows], var[:, rows]
+    sure = ~robot.doubtful[:, rows]
+    square = error.square()
+    found = {
+        "velocity": square.sum(-1).mean().sqrt().item(),
+        "certain": square.sum(-1)[sure].mean().sqrt().item(),
+        "nees": (square / var).mean().item(),
+        "held": (error.abs() <= half * var.sqrt()).double().mean().item(),
+        "nll": 0.5 * (square / var + var.log()).mean().item(),
+    }
+    if mean is None:
+        return found
+    turn, place = base_pose(robot, mean)
+    up = [
+        rotate(SO3().inverse(each), mean.new_tensor([0.0, 0.0, 1.0]))[:, rows] for each in (turn, true["orientation"])
+    ]
+    tilt = torch.atan2(torch.linalg.cross(*up).norm(dim=-1), (up[0] * up[1]).sum(-1)).rad2deg()
+    moved = [_from_start(*pose) for pose in ((turn, place), (true["orientation"], true["position"]))]
+    drift = (moved[0][:, -1] - moved[1][:, -1]).norm(dim=-1) / _length(true["position"])
+    return {**found, "tilt": tilt.square().mean().sqrt().item(), "drift": 100 * drift.mean().item()}
+
+
+def _length(position: Tensor) -> Tensor:
+    """The length of a path without the noise of single rows: of its places every 10 rows."""
+    return position[:, ::10].diff(dim=1).norm(dim=-1).sum(1)
+
+
+def _from_start(turn: Tensor, place: Tensor) -> Tensor:
+    """Places as seen from the first one, along its heading."""
+    forward = rotate(turn[:, 0], turn.new_tensor([1.0, 0.0, 0.0]))
+    angle = torch.atan2(forward[:, 1], forward[:, 0])
+    heading = SO3().exp(angle.unsqueeze(-1) * turn.new_tensor([0.0, 0.0, 1.0]))
+    return rotate(SO3().inverse(heading).unsqueeze(1), place - place[:, :1])

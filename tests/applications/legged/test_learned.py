@@ -1,0 +1,196 @@
+"""Learned contacts: what they write before training, what they read, and that they find the foot that slides."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+from torchrl.envs import TransformedEnv
+
+from tests.applications.legged.test_environment import trotting
+from torch_denkf.applications.legged import (
+    QUADRUPED,
+    LearnedContacts,
+    LeggedNoises,
+    last_rows,
+    legged_filter,
+    quadruped_env,
+    with_last_rows,
+)
+from torch_denkf.applications.legged.motion import LeggedMotionNoise
+
+RATE, SLIP = 0.2, 0.03
+KEYS = ("imu", "joints", "joint_rates", "contact")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return quadruped_env().model
+
+
+@pytest.fixture(scope="module")
+def log():
+    rows = trotting(quadruped_env(seed=3), 40)
+    return rows.select(*KEYS, "true").unsqueeze(0)
+
+
+def contacts_of(model, rows=5, **options):
+    return LearnedContacts(model, **QUADRUPED, rows=rows, rate=RATE, slip=SLIP, **options)
+
+
+def standing(model, runs):
+    """Two rows of a robot that stands still with all feet; the joints say that one foot of each run moves."""
+    base = quadruped_env(seed=0).reset().select(*KEYS)
+    log = torch.stack([base.expand(runs)] * 2, 1).clone()
+    log["imu"][..., :3] = 0
+    log["contact"][:] = True
+    log["joint_rates"] = torch.zeros_like(log["joint_rates"])
+    foot = torch.randint(4, (runs,))
+    moves = torch.nn.functional.one_hot(foot, 4).bool()
+    rates = (3 + 3 * torch.rand(runs, 1)) * torch.randn(runs, 1).sign()
+    knees = torch.arange(2, 16, 4)  # a knee for each leg
+    log["joint_rates"][..., knees] = (moves * rates).unsqueeze(1).expand(runs, 2, 4)
+    log["joint_rates"] += 0.1 * torch.randn(runs, 2, 16)
+    log["true"] = TensorDict({"velocity": torch.zeros(runs, 2, 3)}, [runs, 2])
+    return with_last_rows(log, 1), moves
+
+
+def test_before_training_all_feet_are_alike(model, log):
+    contacts = contacts_of(model)
+    out = contacts(with_last_rows(log, 5))
+    noise, slip = out["sensor", "noise"], out["legs", "slip"]
+    assert_close(noise, RATE**2 * torch.eye(12).expand(1, 40, 12, 12))
+    assert_close(slip, torch.full((1, 40, 4), SLIP**2))
+
+
+def test_each_foot_has_a_covariance_of_its_own(model, log):
+    contacts = contacts_of(model)
+    for weight in contacts.parameters():
+        torch.nn.init.normal_(weight, std=0.1)
+    contacts.standardise(with_last_rows(log, 5))
+    noise = contacts(with_last_rows(log, 5))["sensor", "noise"]
+    blocks = noise.unflatten(-1, (4, 3)).unflatten(-3, (4, 3))  # [..., foot, axis, foot, axis]
+    for one in range(4):
+        for other in range(4):
+            assert blocks[..., one, :, other, :].any() == (one == other)
+    assert torch.linalg.eigvalsh(noise).min() > 0
+    assert (blocks[..., 0, :, 0, :] - blocks[..., 0, :, 0, :].mT).abs().max() < 1e-7
+
+
+def test_feet_of_a_rigid_turn_say_one_velocity(model, log):
+    """With true joints and no foot that slides each foot says the base's velocity: here that is made up."""
+    contacts, kinematics = contacts_of(model, rows=1), contacts_of(model).kinematics
+    imu, joints = (log[key][0] for key in ("imu", "joints"))
+    velocity = torch.randn(40, 3)
+    # joint rates that move the feet as a standing foot moves: by least squares, four joints a leg
+    jacobian, feet = kinematics.jacobian(joints), kinematics(joints)
+    wanted = -velocity.unsqueeze(-2) - torch.linalg.cross(imu[:, None, :3].expand_as(feet), feet)
+    found = torch.linalg.lstsq(jacobian.mT, wanted.unsqueeze(-1)).solution.squeeze(-1)
+    rates = torch.zeros_like(joints)
+    rates.scatter_(-1, kinematics.column.flatten().expand(40, -1), found.flatten(-2))
+    features = contacts.features(imu, joints, rates, log["contact"][0])
+    assert_close(features[..., 4:7], velocity.unsqueeze(-2).expand(40, 4, 3), rtol=0, atol=1e-3)
+    stands = log["contact"][0].any(-1)
+    assert_close(features[stands][..., 7:10], velocity[stands].unsqueeze(-2).expand(-1, 4, 3), rtol=0, atol=1e-3)
+    assert torch.equal(features[..., 0].bool(), log["contact"][0])
+
+
+def test_the_newest_row_comes_last_and_the_first_stands_for_those_before(log):
+    last = with_last_rows(log, 3)["last", "imu"].unflatten(-1, (3, 6))
+    assert torch.equal(last[:, :, 2], log["imu"])
+    assert torch.equal(last[:, 5, 0], log["imu"][:, 3])
+    assert torch.equal(last[:, 1, 0], log["imu"][:, 0])
+
+
+def test_an_environment_keeps_the_rows_of_a_log():
+    env = TransformedEnv(quadruped_env(seed=4), last_rows(3))
+    row = env.reset()
+    rows = [row]
+    for step in range(6):
+        row = env.step(row.set("action", torch.full((12,), 0.1 * step)))["next"]
+        rows.append(row)
+    found = torch.stack([row.select(*KEYS, "last") for row in rows]).unsqueeze(0)
+    expected = with_last_rows(found.select(*KEYS), 3)
+    for key in KEYS:
+        assert torch.equal(found["last", key], expected["last", key]), key
+
+
+def test_a_foot_walks_as_its_noise_says():
+    noise = LeggedMotionNoise(2, 0.01, LeggedNoises(kinematics=0.5), slip_key="slip")
+    slip = torch.tensor([[4.0, 9.0]])
+    out = noise(TensorDict({"contact": torch.tensor([[True, False]]), "slip": slip}, [1]))["forecast", "noise"]
+    assert_close(out[0, 15:], torch.tensor([0.04] * 3 + [0.25] * 3))
+    timed = LeggedMotionNoise(2, "dt", LeggedNoises(kinematics=0.5), slip_key="slip")
+    more = {"contact": torch.tensor([[True, True]]), "slip": slip, "dt": torch.tensor([[0.5]])}
+    assert_close(timed(TensorDict(more, [1]))["forecast", "noise"][0, 15:], torch.tensor([2.0] * 3 + [4.5] * 3))
+
+
+@pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
+def test_untrained_they_are_the_noises(kind, model, log):
+    """Constant covariances are those of LeggedNoises(slip=, rate=)."""
+    rows, options = with_last_rows(log, 5), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
+    velocities = []
+    for noises, contacts in ((LeggedNoises(rate=RATE, slip=SLIP), None), (LeggedNoises(), contacts_of(model))):
+        filter = legged_filter(model, **QUADRUPED, noises=noises, contacts=contacts, **options)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            velocities.append(filter.sequence(rows.clone())["belief", "velocity"])
+    assert_close(*velocities, rtol=0, atol=2e-3)
+
+
+def test_they_find_the_foot_that_slides(model):
+    """Trained by the likelihood of the velocity that the feet tell together, weighted by their covariances."""
+    torch.manual_seed(0)
+    contacts = contacts_of(model, rows=1, num_cells=(32,))
+    log = standing(model, 256)[0][:, 1]
+    contacts.standardise(log)
+    each = contacts.features(*(log["last", key] for key in KEYS))[..., 4:7].unsqueeze(-1)
+    optimiser = torch.optim.Adam(contacts.parameters(), 0.01)
+    for _ in range(150):
+        cov = contacts(log)["sensor", "noise"].unflatten(-1, (4, 3)).unflatten(-3, (4, 3))
+        weight = torch.linalg.inv(cov.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))  # [runs, 4, 3, 3]
+        together = torch.linalg.inv(weight.sum(-3))
+        error = together @ (weight @ each).sum(-3)  # the base stands still
+        square = (error.mT @ weight.sum(-3) @ error).squeeze()
+        loss = 0.5 * (square + together.logdet()).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    test, moves = standing(model, 64)
+    noises = LeggedNoises(velocity=0.5, tilt=0.01, rate=RATE, slip=SLIP)
+    filters = [
+        legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", noises=noises, contacts=each)
+        for each in (contacts, None)
+    ]
+    with torch.no_grad():
+        slip = contacts(test.clone())["legs", "slip"][:, 1]
+        velocity = [filter.sequence(test.clone())["belief", "velocity"][:, 1] for filter in filters]
+    assert (slip.argmax(-1) == moves.int().argmax(-1)).float().mean() > 0.9
+    assert slip[moves].median() > 3 * slip[~moves].median()
+    learned, plain = (each.square().sum(-1).mean().sqrt() for each in velocity)
+    assert learned < 0.5 * plain
+
+
+def test_they_learn_through_the_filter(model, log):
+    contacts = contacts_of(model)
+    filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
+    out = filter.sequence(with_last_rows(log[:, :6], 5))
+    error, var = out["belief", "velocity"] - log["true", "velocity"][:, :6], out["belief", "velocity_var"]
+    (error.square() / var + var.log()).mean().backward()
+    gradients = {name: each.grad for name, each in contacts.named_parameters()}
+    last = max(name for name in gradients if name.endswith("weight"))
+    assert all(each.isfinite().all() for each in gradients.values())
+    assert gradients[last].any()
+    assert gradients["log_time"] != 0
+
+
+def test_without_rates_they_are_refused(model):
+    with pytest.raises(ValueError, match="rates_key"):
+        legged_filter(model, **QUADRUPED, dt=0.01, rates_key=None, contacts=contacts_of(model))
+
+
+def test_slip_must_be_positive(model):
+    with pytest.raises(ValueError, match="slip"):
+        LearnedContacts(model, **QUADRUPED, slip=0.0)
+    assert math.isfinite(contacts_of(model).log_time.item())
