@@ -6,11 +6,12 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from torch_denkf import FusedFilter, FusedSensor
-from torch_denkf.functional.manifolds import SE3
+from torch_denkf import FusedFilter, FusedSensor, ParticleFilter
+from torch_denkf.functional.manifolds import SE2, SE3
 from torch_denkf.fusion import message_rows
 from torch_denkf.modules import (
     AroundState,
+    ConstantNoise,
     ContinuousMotion,
     ContinuousNoise,
     EKFTransition,
@@ -19,6 +20,7 @@ from torch_denkf.modules import (
     Select,
 )
 from torch_denkf.motions import AttitudeMotion, ConstantTwist, Gravity, PoseOf
+from torch_denkf.smoothers import ParticleSmoother
 
 
 def glider(**options) -> FusedFilter:
@@ -118,9 +120,42 @@ def test_what_drives_is_the_mean_since_the_row_before(float64):
         message_rows([(0.0, "imu", [np.nan]), (1.0, "gps", [0.0])], driving=["imu"])
 
 
+def test_one_absurd_message_spoils_no_row_beyond_its_neighbours():
+    log = [(0.01 * k, "imu", [1.0]) for k in range(1000)]
+    log[10] = (0.1, "imu", [1e20])
+    rows = message_rows([*log, (9.0, "gps", [0.0])], driving=["imu"])
+    assert_close(rows["imu"][20:], torch.ones(len(rows) - 20, 1))
+
+
+def test_what_drives_may_speak_before_the_start_and_twice_at_a_time():
+    log = [(-1.0, "imu", [5.0]), (0.0, "imu", [7.0]), (0.0, "imu", [1.0]), (2.0, "imu", [1.0]), (1.0, "gps", [0.0])]
+    rows = message_rows(log, driving=["imu", "imu"], start=0.0, dtype=torch.float64)
+    assert rows["stamp"].flatten().tolist() == [0.0, 0.0, 1.0, 2.0]  # the message before the start is no row
+    assert rows["imu"].flatten().tolist() == [1.0, 1.0, 1.0, 1.0]  # of two at a time the last counts
+    assert rows["imu"].dtype == rows["dt"].dtype == torch.float64
+    late = message_rows([(1.0, "gps", [0.0]), (1.5, "wheel", [0.0])], delays={"gps": 0.8})
+    assert late["stamp"][0] == pytest.approx(0.2)  # when the first reading was taken
+
+
+def test_particles_go_back_over_a_step_of_no_length(float64):
+    """Two readings at one time: nothing moves between them, and the smoother finds each particle's own past."""
+    torch.manual_seed(0)
+    motion = ConstantTwist(SE2(), "dt", twist_noise=0.5)
+    start = AroundState([0.3] * 6, ensemble_size=50, state_key="start", space=motion.space)
+    noise = ConstantNoise([0.2] * 3, in_key="pose")
+    options = {"initial": start, "process_noise": motion.process_noise, "reading_space": SE2()}
+    filter = ParticleFilter(motion, None, PoseOf(motion.space), noise=noise, observation_key="pose", **options)
+    rows = message_rows([(0.1 * k, "pose", [0.0, 0.1 * k, 0.0]) for k in (0, 1, 1, 2)])
+    rows["observed"], rows["start"] = rows["pose_observed"], torch.zeros(len(rows), 6)
+    smoothed = ParticleSmoother(filter).sequence(rows)["smoothed"]
+    assert smoothed["mean"].isfinite().all()
+    assert_close(smoothed["ensemble"][0], smoothed["ensemble"][1], rtol=0, atol=1e-9)
+
+
 def test_a_sensor_that_says_two_things_at_once():
     rows = message_rows([(1.0, "gps", [1.0]), (1.0, "gps", [2.0]), (1.0, "wheel", [3.0]), (2.0, "gps", [4.0])])
-    assert rows["gps"].flatten().tolist() == [0.0, 1.0, 2.0, 4.0]
+    assert rows["gps"].flatten().tolist()[1:] == [1.0, 2.0, 4.0]
+    assert rows["gps"][0].isnan()  # what is not there is not taken for a reading by a motion
     assert rows["dt"].flatten().tolist() == [0.0, 0.0, 0.0, 1.0]
     assert rows["wheel_observed"].flatten().tolist() == [False, True, False, False]
     assert rows["gps"].dtype == torch.float32
@@ -143,6 +178,13 @@ def test_stamps_of_a_clock_that_counts_from_1970_keep_their_steps():
         ([(0.0, "gps", [1.0, 2.0], [[1.0, 2.0]])], {}, r"noise of \[1, 2\]"),
         ([(0.0, "gps", [1.0]), (1.0, "gps", [1.0, 2.0])], {}, "'gps' differ in size"),
         ([(0.0, "gps", [1.0]), (1.0, "gps", [1.0], [2.0])], {}, "'gps' differ in size"),
+        ([(0.0, "gps", [1.0], [-1.0])], {}, "Message 0, of 'gps', has a noise that is none"),
+        ([(0.0, "gps", [1.0, 2.0], [[1.0, 2.0], [2.0, 1.0]])], {}, "has a noise that is none"),
+        ([(0.0, "gps", [1.0], 0.3)], {}, r"noise of \[\]"),
+        ([(0.0, "gps", [1.0], [1.0, 2.0])], {}, r"noise of \[2\]"),
+        ([(0.0, "dt", [1.0])], {}, r"Two entries would be \['dt'\]"),
+        ([(0.0, "stamp", [1.0]), (0.0, "x", [1.0])], {"driving": ["stamp"]}, r"\['stamp'\]"),
+        ([(0.0, "x", [1.0], [1.0]), (0.0, "x_noise", [1.0])], {}, r"\['x_noise'\]"),
         ([(0.0, "gps", [1.0])], {"driving": ["imu"]}, r"driving names \['imu'\]"),
         ([(0.0, "gps", [1.0])], {"delays": {"imu": 0.1}}, r"delays names \['imu'\]"),
         ([(0.0, "gps", [1.0])], {"delays": {"gps": float("nan")}}, "delay of 'gps'"),

@@ -160,7 +160,9 @@ def test_noise_of_a_second_is_the_density_whatever_the_step():
 def test_noise_of_steps_that_differ(float64, make):
     """A module writes what ``noise_of_step`` says of each step; a step of no length adds none."""
     steps = torch.tensor([[0.0], [0.01], [3.0]])
-    found = make("dt").process_noise(TensorDict({"dt": steps}, [3]))["forecast", "noise"]
+    found = make("dt").process_noise(TensorDict({"dt": steps, ("belief", "mean"): torch.zeros(3, 1)}, [3]))[
+        "forecast", "noise"
+    ]
     expected = torch.tensor([make(1.0).noise_of_step(dt) for dt in steps.flatten().tolist()])
     assert_close(found, expected.square())
 

@@ -155,6 +155,9 @@ def test_errors_say_what_to_do():
         plot_bands(run, readings={2: torch.zeros(39)})
     with pytest.raises(ValueError, match="40 increasing seconds"):
         plot_bands(run, time=torch.zeros(40))
+    points = TensorDict({"belief": {"mean": torch.zeros(40, 4), "var": torch.ones(40, 3)}}, [40])
+    with pytest.raises(ValueError, match="pass space="):
+        plot_bands(points)
     with pytest.raises(ValueError, match='pass band="variance"'):
         plot_bands(kalman_runs()[0], band="ensemble")
     with pytest.raises(ValueError, match=r"in \(0, 1\); got 90"):

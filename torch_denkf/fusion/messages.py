@@ -30,16 +30,16 @@ def message_rows(
     things about one time gets two rows, the second with a ``dt`` of zero.
 
     A sensor's reading stands under its name, ``[T, O]``, and its mask under NAME_observed, as
-    :class:`~torch_denkf.fusion.FusedSensor` expects them. Where messages bring their noise, that stands under
-    NAME_noise: the name to give to ``FusedSensor(noise=...)``.
+    :class:`~torch_denkf.fusion.FusedSensor` expects them; rows without one hold NaN. Where messages bring their noise,
+    that stands under NAME_noise: the name to give to ``FusedSensor(noise=...)``.
 
     Args:
         messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp in seconds,
             the sensor's name, ``[O]`` numbers, and the reading's variances ``[O]`` or covariance ``[O, O]``,
             of tangents where it is a point of a space.
         driving: sensors that drive the motion, such as ``"imu"``. They have no mask: each row holds the mean since the
-            row before, on straight lines between the messages; before the first and behind the last it stays as it is
-            there. Messages of them that are not finite are left out.
+            row before, on straight lines between the messages, each of which counts for the moment of its stamp; before
+            the first and behind the last it stays as it is there. Messages of them that are not finite are left out.
         delays: by how many seconds a sensor's stamps are later than what it saw, by name.
         start: time of the first row, in seconds; by default that of the first reading. What was read before is left
             out.
@@ -49,8 +49,8 @@ def message_rows(
         The rows, with ``"stamp"`` ``[T, 1]`` in float64.
 
     Raises:
-        ValueError: if there is no message, one is malformed or has no finite stamp, the messages of a sensor differ in
-            size, or only some of them bring a noise.
+        ValueError: if there is no message, one is malformed or has no finite stamp, a noise is not positive, the
+            messages of a sensor differ in size, only some of them bring a noise, or two entries have one name.
         KeyError: if ``driving`` or ``delays`` name a sensor that has no message.
 
     Example:
@@ -79,9 +79,11 @@ def message_rows(
     times = np.concatenate([[first], moments[:, 0]])
     rows = {"stamp": times[:, None], "dt": np.diff(times, prepend=first)[:, None]}
     places = np.split(1 + place.reshape(-1), np.cumsum([len(each) for each in events]))
-    for (name, stream), at in zip(heard.items(), places, strict=False):
-        rows |= stream.rows(name, at, len(times))
-    rows |= {name: drive.means(times) for name, drive in drives.items()}
+    written = [stream.rows(name, at, len(times)) for (name, stream), at in zip(heard.items(), places, strict=False)]
+    for entries in (*written, *({name: drive.means(times)} for name, drive in drives.items())):
+        if twice := rows.keys() & entries.keys():
+            raise ValueError(f"Two entries would be {sorted(twice)}: call the sensor otherwise, whose name this is.")
+        rows |= entries
     dtype = dtype or torch.get_default_dtype()
     tensors = {name: torch.from_numpy(row) for name, row in rows.items()}
     kept = {name: row if name == "stamp" or row.dtype == torch.bool else row.to(dtype) for name, row in tensors.items()}
@@ -118,7 +120,7 @@ class _Stream:
 
     def rows(self, name: str, place: np.ndarray, count: int) -> dict[str, np.ndarray]:
         """Readings, their mask, and their noise, in the rows in which they stand."""
-        value, observed = np.zeros((count, *self.values.shape[1:])), np.zeros((count, 1), bool)
+        value, observed = np.full((count, *self.values.shape[1:]), np.nan), np.zeros((count, 1), bool)
         value[place], observed[place] = self.values, True
         found = {name: value, f"{name}_observed": observed}
         if self.noise is not None:
@@ -134,8 +136,12 @@ class _Stream:
         begin, end = times[:-1], times[1:]
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
-        area = np.concatenate([np.zeros_like(on[:1]), (np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2).cumsum(0)])
-        step, total = (end - begin)[:, None], np.diff(area[np.searchsorted(knots, times)], axis=0)
+        area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
+        # Each row sums its own pieces: one reading that is absurd must not spoil the rows that follow.
+        total = np.add.reduceat(area, np.searchsorted(knots, begin), 0) if len(begin) else np.zeros((0, on.shape[1]))
+        if len(begin):
+            total[-1] = area[np.searchsorted(knots, begin[-1]) : np.searchsorted(knots, end[-1])].sum(0)
+        step = (end - begin)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
 
@@ -157,16 +163,22 @@ def _by_sensor(messages: Iterable[Sequence[Any]]) -> dict[str, _Stream]:
             raise ValueError(
                 f"Message {number}, of {name!r}, has the stamp {stamp} and a value of {list(value.shape)}."
             )
-        noise = np.atleast_1d(np.asarray(message[3], float)) if len(message) > 3 else None
-        if noise is not None and (noise.shape != noise.shape[:1] * noise.ndim or noise.ndim > 2):
-            raise ValueError(
-                f"Message {number}, of {name!r}, has a noise of {list(noise.shape)}: give variances [O] or a "
-                "covariance [O, O]."
-            )
+        noise = np.asarray(message[3], float) if len(message) > 3 and message[3] is not None else None
+        if noise is not None:
+            _check_noise(f"Message {number}, of {name!r}, has a noise", noise, len(value))
         found.setdefault(name, []).append((stamp, value, noise))
     if not found:
         raise ValueError("There is no message.")
     return {name: _stream(name, sorted(each, key=lambda one: one[0])) for name, each in found.items()}
+
+
+def _check_noise(what: str, noise: np.ndarray, size: int) -> None:
+    square = noise.ndim == 2 and noise.shape[0] == noise.shape[1]
+    if not (noise.ndim == 1 or square) or not 0 < len(noise) <= size:  # a tangent may have fewer numbers than a point
+        raise ValueError(f"{what} of {list(noise.shape)}: give variances [O] or a covariance [O, O].")
+    least = np.linalg.eigvalsh(noise).min() if square else noise.min()
+    if not least > 0:
+        raise ValueError(f"{what} that is none: variances and covariances are positive; got {noise.tolist()}.")
 
 
 def _stream(name: str, messages: list[tuple[float, np.ndarray, np.ndarray | None]]) -> _Stream:

@@ -414,7 +414,10 @@ def _around_mean(
 
 def _check_variance(variance: Tensor, error: Tensor) -> None:
     if variance.shape != error.shape:
-        raise ValueError(f"variance must have the shape of the mean, {list(error.shape)}; got {list(variance.shape)}.")
+        raise ValueError(
+            f"variance must have the shape of the mean, {list(error.shape)}; got {list(variance.shape)}. If the states "
+            "are points of a space, pass space=."
+        )
     if bool((variance < 0).any()):
         raise ValueError(f"variances cannot be negative; the least is {variance.min().item():.3g}.")
 

@@ -102,13 +102,12 @@ class NoiseOfStep(SubModel):
     """
 
     def __init__(self, motion: Motion, out_key: NestedKey = ("forecast", "noise")):
-        super().__init__(nn.Identity(), keys_of_dt(motion.dt), [out_key])
-        self.noise_of_step = motion.noise_of_step
+        super().__init__(motion, [("belief", "mean"), *keys_of_dt(motion.dt)], [out_key])
 
-    def compute(self, dt):
+    def compute(self, mean, dt):
         """The variances of the step."""
-        dt = dt.squeeze(-1)
-        return torch.stack([torch.zeros_like(dt) + each for each in self.noise_of_step(dt)], -1).square()
+        dt = dt.to(mean.dtype).squeeze(-1)
+        return torch.stack([torch.zeros_like(dt) + each for each in self.module.noise_of_step(dt)], -1).square()
 
 
 def densities(name: str, value: float | Sequence[float] | Tensor, size: int) -> list[float]:

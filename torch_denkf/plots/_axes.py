@@ -129,7 +129,8 @@ def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
         seconds = time.detach().cpu().double().flatten().numpy()
     else:
         seconds = np.arange(steps) * (1.0 if time is None else float(time))
-    if len(seconds) != steps or bool((np.diff(seconds) <= 0).any()):
+    gaps = np.diff(seconds)  # a row may stand at the time of the one before
+    if len(seconds) != steps or bool((gaps < 0).any()) or (len(gaps) > 0 and not gaps.any()):
         raise ValueError(f"time must be {steps} increasing seconds, one a step, or the seconds between two")
     return seconds
 

@@ -90,6 +90,11 @@ def read_belief(
         if age is not None and (weight := run.get(("belief", "log_weight"), None)) is not None:
             parts.setdefault("log_weight", number(weight))  # particles of long ago weigh what they weigh now
     parts = _summarise(parts, space)
+    if space is None and "var" in parts and parts["var"].shape != parts["mean"].shape:
+        raise ValueError(
+            f"the mean is {list(parts['mean'].shape)} and the variance {list(parts['var'].shape)}: if the states are "
+            "points of a space, pass space="
+        )
     batch = parts["mean"].shape[:-1]
     known = torch.ones(batch, dtype=torch.bool)
     if age is not None:

@@ -25,6 +25,8 @@ from torch_denkf.smoothers.past import moments_of
 
 __all__ = ["ParticleSmoother"]
 
+_STILL = 1e-12  # variance in the place of none
+
 
 class ParticleSmoother(Smoother):
     r"""Backward weights of a particle filter: the particles stay, those that lead to what came later count for more.
@@ -139,7 +141,8 @@ def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor, space: Spac
         >>> log_density_of_pairs(torch.zeros(1, 2), torch.zeros(1, 2), torch.eye(2))
         tensor([[-1.8379]])
     """
-    factor = cholesky(cov)
+    moved = cov.diagonal(dim1=-2, dim2=-1)  # without noise, as in a step of no length, a value is its own mean
+    factor = cholesky(cov + torch.where(moved == 0, _STILL, 0.0).to(cov.dtype).diag_embed())
     if space is None:
         white = [torch.linalg.solve_triangular(factor, value.mT, upper=False).mT for value in (values, means)]
         away = white[0].unsqueeze(-3) - white[1].unsqueeze(-2)

@@ -166,7 +166,10 @@ def _track(car, frames, calibration, times, fps, height, pitch, repair, seed) ->
         done = step
         yield run.belief(number, clock.time, reading is not None, between)._replace(hidden=hidden)
     if run is None:
-        raise ValueError(f"there are no two frames at most {settings.longest} steps apart, which a path needs")
+        raise ValueError(
+            f"there are no two frames at most {settings.longest} steps apart, which a path needs; those that are black "
+            "all over do not count, see black_level"
+        )
 
 
 class _Seen(NamedTuple):
