@@ -64,7 +64,7 @@ class Study:
     runs: int = 4  # of the test, on each ground
     seconds: float = 8.0  # of such a run
     training_runs: int = 24  # of 6 s each
-    updates: int = 80  # of the learned contacts
+    updates: int = 70  # of the learned contacts
     lstm_updates: int = 500
     seed: int = 0
     smoke: bool = False  # a few short runs: does it run?
@@ -215,8 +215,9 @@ def simulated(study: Study) -> list[dict]:
     make = partial(quadruped, VALIDATION_RUNS, length, study.seed + 2)
     noises = chosen(make, "all grounds", feet_grid(study.smoke), study.out)
     training = quadruped(study.training_runs, length, study.seed + 1)
-    contacts = learned_contacts(training, noises, study.updates, min(40, training.log.shape[1] - 1))
-    lstm = trained_lstm(training, make(), contacts, study.lstm_updates)
+    validation = make()
+    contacts = learned_contacts(training, validation, noises, study.updates, min(50, training.log.shape[1] - 1))
+    lstm = trained_lstm(training, validation, contacts, study.lstm_updates)
     robots = {
         name: quadruped(study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(GROUNDS.items())

@@ -16,31 +16,45 @@ __all__ = ["LSTM", "VELOCITY", "learned_contacts", "trained_lstm"]
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
 _MOMENTS = [("belief", "mean"), ("belief", "cov")]
 _SETTLING = 10  # rows of a window that are not scored: its belief comes from another filter
-_AGAIN = 50  # updates after which windows get new beliefs to start from
+_AGAIN = 35  # updates after which windows get new beliefs to start from
 
 
-def learned_contacts(robot: Robot, noises: LeggedNoises, updates: int, window: int) -> LearnedContacts:
+def learned_contacts(
+    robot: Robot, validation: Robot, noises: LeggedNoises, updates: int, window: int
+) -> LearnedContacts:
     """Trains contacts through the extended filter, by the likelihood of the base's true velocity.
 
-    An update takes one window of all runs. It begins with the belief that the filter has there.
+    An update takes a window of each run. It begins with the belief that the filter had there when it last filtered all
+    runs. Those of validation are filtered with them, and what the network was when it did best there is kept.
 
     Args:
         robot: with the logs of the training.
-        noises: of the filter.
+        validation: with other logs of the same length.
+        noises: of the filter; the network begins with what they say of feet.
         updates: of the network.
         window: rows.
     """
-    contacts = LearnedContacts(robot.model, **robot.names, rows=ROWS)
+    contacts = LearnedContacts(robot.model, **robot.names, rows=ROWS, rate=noises.rate, slip=noises.slip)
     contacts.standardise(robot.log)
     filter = legged_filter(robot.model, **robot.names, dt=robot.dt, kind="EKF", noises=noises, contacts=contacts)
-    optimiser = torch.optim.Adam(contacts.parameters(), 5e-3)
+    optimiser = torch.optim.Adam(contacts.parameters(), 3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    for update in range(updates):
-        if update % _AGAIN == 0:
-            belief = _beliefs(filter, robot.log)
-        first = int(torch.randint(1, robot.log.shape[1] - window + 1, ()))
-        part = robot.log[:, first : first + window].clone()
-        part["previous", "belief"] = belief[:, first - 1 : first - 1 + window].clone()
+    best, kept, count = float("inf"), contacts.state_dict(), len(robot.log)
+    both = torch.cat([robot.log, validation.log])
+    for update in range(updates + 1):
+        if update % _AGAIN == 0 or update == updates:
+            belief = _beliefs(filter, both)
+            found = scores(validation, *(belief[key[1]][count:] for key in (VELOCITY, VAR)))
+            print(f"learned contacts, update {update}: validation {found}", flush=True)
+            if found["nll"] < best:
+                best, kept = found["nll"], {key: value.clone() for key, value in contacts.state_dict().items()}
+        if update == updates:
+            break
+        firsts = torch.randint(1, robot.log.shape[1] - window + 1, (count,)).tolist()
+        part = torch.stack([robot.log[run, first : first + window] for run, first in enumerate(firsts)])
+        part["previous", "belief"] = torch.stack(
+            [belief[run, first - 1 : first - 1 + window] for run, first in enumerate(firsts)]
+        ).select(*(key[1] for key in _MOMENTS))
         out = filter.sequence(part, keep=[VELOCITY, VAR])
         loss = _nll(out[VELOCITY], out[VAR], part["true", "velocity"])[:, min(_SETTLING, window // 2) :].mean()
         optimiser.zero_grad()
@@ -48,8 +62,9 @@ def learned_contacts(robot: Robot, noises: LeggedNoises, updates: int, window: i
         nn.utils.clip_grad_norm_(contacts.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-        if update % 10 == 0 or update == updates - 1:
+        if update % 10 == 0:
             print(f"learned contacts, update {update}: {loss.item():.3f}", flush=True)
+    contacts.load_state_dict(kept)
     return contacts.requires_grad_(False)
 
 
@@ -123,4 +138,4 @@ def _nll(velocity: Tensor, var: Tensor, true: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _beliefs(filter: Filter, log: TensorDict) -> TensorDict:
-    return filter.sequence(log.clone(), keep=_MOMENTS)["belief"]
+    return filter.sequence(log.clone(), keep=[*_MOMENTS, VELOCITY, VAR])["belief"]

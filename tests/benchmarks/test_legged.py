@@ -9,9 +9,9 @@ from benchmarks.common.arguments import ROOT
 from benchmarks.legged.start import turned
 from benchmarks.legged.study import ICUB, Study, chosen, in_the_air, page, run, scored, still
 from benchmarks.legged.task import FIRM, GROUNDS, base_pose, humanoid, quadruped, scores
-from benchmarks.legged.training import LSTM
+from benchmarks.legged.training import LSTM, learned_contacts
 from tests.real_data import SHARED
-from torch_denkf.applications.legged import LearnedContacts
+from torch_denkf.applications.legged import LearnedContacts, LeggedNoises
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.motion import legged_space
 from torch_denkf.applications.legged.readings import FeetInBody
@@ -96,6 +96,15 @@ def test_the_lstm_reads_what_the_contacts_read_of_one_row(robot):
     features = LSTM(contacts).read(robot.log)
     last = contacts.features(*(robot.log["last", key] for key in ("imu", "joints", "joint_rates", "contact")))
     assert torch.equal(features.unflatten(-1, (4, 16)), last[..., -16:])
+
+
+def test_contacts_begin_as_thresholds_and_in_validation_are_never_worse(robot):
+    """A single update may do harm; what was best in validation is kept."""
+    short = dataclasses.replace(robot, log=robot.log[:, :40], doubtful=robot.doubtful[:, :40], rows=slice(10, None))
+    noises = LeggedNoises(kinematics=0.03, rate=1.0)
+    contacts = learned_contacts(short, short, noises, 1, 15)
+    found = [scored(short, run(short, kind="EKF", noises=noises, contacts=each)[0]) for each in (None, contacts)]
+    assert found[1]["nll"] < found[0]["nll"] + 1e-4
 
 
 def test_the_page_has_every_row():
