@@ -145,7 +145,7 @@ TRACKED = {
     "text, looked at for black": ({"frames": [FRAME, "b"], "black_level": 3}, "frame 1 is a str"),
     "times": ({"times": ["a", "b", "c"]}, "times are those of the frames"),
     "a day": (
-        {"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1]},
+        {"frames": [FRAME] * 4, "times": [0.0, 0.1, 86400.0, 86400.1], "black_level": None},
         "steps without a frame before frame 2.*Its time is 86400",
     ),
 }

@@ -52,7 +52,7 @@ def test_each_comes_with_its_checksum_and_a_card(name):
         assert heading in card
     model = from_pretrained(name)
     assert not model.training
-    assert {type(value) for value in config["settings"].values()} <= {int, float, list, str, type(None)}
+    assert {type(value) for value in config["settings"].values()} <= {bool, int, float, list, str, type(None)}
 
 
 def test_what_is_saved_comes_back(tmp_path):
