@@ -196,7 +196,7 @@ def main() -> None:
     began = time.perf_counter()
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(study.seed)
-    count = 400 if study.smoke else ROWS
+    count = 250 if study.smoke else ROWS
     poses = truth(study.data, count)
     data = readings(study.data, "0027", CONDITIONS, count, study.seed)
     rows, paths, claims = [], {}, {}

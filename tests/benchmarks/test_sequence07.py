@@ -1,17 +1,14 @@
 """Intervals on simulated drives, what happens to corners, and a run of a few rows."""
 
-import sys
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from benchmarks.sequence07 import study
 from benchmarks.sequence07.filters import DT, POSE, SPACE, SWAYS, CarMotion, car_filter, pose_of, prepared
 from benchmarks.sequence07.study import Claim, and_one_more, claimed, run, windows
 from benchmarks.sequence07.task import EVERY, LOST, WRONG, chained, in_condition
-from tests.real_data import KITTI, SHARED
+from tests.real_data import SHARED
 from torch_denkf.functional.manifolds import SE3
 from torch_denkf.smoothers import RTSSmoother
 
@@ -104,16 +101,3 @@ def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
     steps = [SE3().compose(SE3().inverse(path[:, :-1]), path[:, 1:]) for path in (*paths, poses)]
     errors = [SE3().minus(step, steps[-1]).square().mean().sqrt() for step in steps[:-1]]
     assert errors[2] < 0.95 * min(errors[:2])
-
-
-@pytest.mark.skipif(not DRIVE.exists(), reason="the drive is not here")
-def test_a_run_of_a_few_rows(tmp_path, monkeypatch):
-    data = str(KITTI.parent)
-    monkeypatch.setattr(sys, "argv", ["sequence07", "--smoke", "--data", data, "--out", str(tmp_path)])
-    study.main()
-    rows = study.COLUMNS.read(tmp_path / "sequence07.csv")
-    assert {row["filter"] for row in rows} == {"OpenCV, RANSAC", "corners' motion alone", "EKF", "RTS smoother"}
-    assert all(row["translation"] < 6 for row in rows)
-    page = (tmp_path / "sequence07.md").read_text()
-    assert "## As it is" in page
-    assert (tmp_path / "sequence07.png").stat().st_size > 1e4
