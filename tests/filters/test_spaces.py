@@ -407,7 +407,10 @@ def frames_player(env):
     return env.base_env.player()
 
 
-@pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "perturbed", "particles"])
+SELDOM = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("EKF", "perturbed", "particles")]  # as the others
+
+
+@pytest.mark.parametrize("kind", ["UKF", "etkf", *SELDOM])
 def test_compiled_is_eager(kind):
     filter, data = make(kind), log(steps=5)
     data = with_noise(filter, data)
