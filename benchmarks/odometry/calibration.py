@@ -67,6 +67,8 @@ def main() -> None:
     torch.set_num_threads(1)
     car, names = from_pretrained(study.checkpoint), list_kitti_drives(study.root)
     squares = {name: lasting_square(car, study.root, name) for name in names}
+    made_by = command("odometry.calibration")
+    print(f"`{made_by}`. Each drive is scored with the doubt that the others say; empty: shorter than 100 m.\n")
     columns = "drive", "doubt by the others", "m/m", "devkit, %", "v held, %", "turn rate held, %"
     print("\n".join(head(*columns, "sensor: m/m", "devkit, %")))
     for name in names:
@@ -79,13 +81,13 @@ def main() -> None:
             for method in ("filter", "dead reckoning")
             for text in (
                 f"{found[method]['translation_m_per_m']:.3f}",
-                f"{found[method].get('devkit_t_rel_percent', float('nan')):.2f}",
+                f"{found[method]['devkit_t_rel_percent']:.2f}" if "devkit_t_rel_percent" in found[method] else "",
             )
         ]
         held = [f"{100 * found['filter'][f'coverage90_{key}']:.0f}" for key in ("v", "theta_dot")]
         print(line(name, f"{std:.3f}", *errors[:2], *held, *errors[2:]), flush=True)
     std = root_mean(squares)
-    record = {"command": command("odometry.calibration"), "drives": names, "doubt": std}
+    record = {"command": made_by, "drives": names, "doubt": std}
     save_pretrained(doubted(study.checkpoint, std), study.out, training={"calibration": record})
     print(f"by all drives: {std:.3f}; {study.out}")
 

@@ -118,6 +118,21 @@ def turned(turn, value):
     return torch.cat([SO3().compose(turn.expand_as(value[..., :4]), value[..., :4]), value[..., 4:]], -1)
 
 
+def turned_beliefs(filter, turn, data):
+    """What a filter believes of data, and what of the same in a world that is turned."""
+    other = data.clone()
+    for key in ("start", "pose"):
+        other[key] = turned(turn, data[key])
+    return filter.sequence(data), filter.sequence(other)
+
+
+def assert_turned(here, there, turn, atol):
+    """Means are turned, and nothing else."""
+    for key in ("belief", "smoothed"):
+        assert SPACE.minus(there[key, "mean"], turned(turn, here[key, "mean"])).abs().max() < atol
+        close(there[key], here[key], ["var"], atol=atol)
+
+
 # ------------------------------------------------------------------------------------------------------- closed forms
 
 

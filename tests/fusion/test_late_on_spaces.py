@@ -5,7 +5,21 @@ import torch
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import stepwise
-from tests.filters.test_spaces import MEAN, SPACE, STD, VAR, B, Orientation, Q, R, T, Turning, log, turned
+from tests.filters.test_spaces import (
+    MEAN,
+    SPACE,
+    STD,
+    VAR,
+    B,
+    Orientation,
+    Q,
+    R,
+    T,
+    Turning,
+    assert_turned,
+    log,
+    turned_beliefs,
+)
 from tests.smoothers.small_angles import PROCESS, SMALL, STARTS, assert_small_differences, linear, readings, rotating
 from tests.smoothers.test_smoothers_on_spaces import numbers
 from torch_denkf.functional.manifolds import SO3, Euclidean
@@ -104,13 +118,8 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
     filter = orientations("EKF" if kind == "gated" else kind, late_key="late")
     filter = Gated(filter, response="student", window=1, rate=1e-2) if kind == "gated" else filter
     data, turn = arriving(log(), LATE), SO3().exp(torch.tensor(turn))
-    other = data.clone()
-    for key in ("start", "pose"):
-        other[key] = turned(turn, data[key])
-    here, there = filter.sequence(data), filter.sequence(other)
-    for key in ("belief", "smoothed"):
-        assert SPACE.minus(there[key, "mean"], turned(turn, here[key, "mean"])).abs().max() < 1e-9
-        close(there[key], here[key], ["var"], atol=1e-9)
+    here, there = turned_beliefs(filter, turn, data)
+    assert_turned(here, there, turn, 1e-9)
 
 
 def test_weights_of_points_are_refused():

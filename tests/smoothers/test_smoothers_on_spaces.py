@@ -7,7 +7,21 @@ from torch import nn
 
 from tests.filters.beliefs_for_tests import close
 from tests.filters.factories import stepwise
-from tests.filters.test_spaces import DT, SPACE, STD, B, Orientation, Q, R, T, Turning, log, make, turned
+from tests.filters.test_spaces import (
+    DT,
+    SPACE,
+    STD,
+    B,
+    Orientation,
+    Q,
+    R,
+    T,
+    Turning,
+    assert_turned,
+    log,
+    make,
+    turned_beliefs,
+)
 from tests.smoothers.small_angles import PROCESS, STARTS, assert_small_differences, linear, noise, readings, rotating
 from torch_denkf.filters import EKF, UKF, ParticleFilter
 from torch_denkf.functional.gaussian import gaussian_log_prob
@@ -199,13 +213,8 @@ def test_the_iterated_smoother_of_many_members_is_that_of_moments():
 def test_a_turned_world_turns_the_iterated_smoother_and_nothing_else(turn):
     filter, turn = orientations_iterated(inflation=1.1, rotate=True), SO3().exp(torch.tensor(turn))
     data = filter.draw_noise(log())
-    other = data.clone()
-    for key in ("start", "pose"):
-        other[key] = turned(turn, data[key])
-    here, there = filter.sequence(data), filter.sequence(other)
-    for key in ("belief", "smoothed"):
-        assert SPACE.minus(there[key, "mean"], turned(turn, here[key, "mean"])).abs().max() < 1e-8
-        close(there[key], here[key], ["var"], atol=1e-8)
+    here, there = turned_beliefs(filter, turn, data)
+    assert_turned(here, there, turn, 1e-8)
     close(there["info"], here["info"], ["nis", "log_likelihood"], atol=1e-7)
 
 

@@ -82,7 +82,7 @@ def message_rows(
     written = [stream.rows(name, at, len(times)) for (name, stream), at in zip(heard.items(), places, strict=False)]
     for entries in (*written, *({name: drive.means(times)} for name, drive in drives.items())):
         if twice := rows.keys() & entries.keys():
-            raise ValueError(f"Two entries would be {sorted(twice)}: call the sensor otherwise, whose name this is.")
+            raise ValueError(f"{sorted(twice)} would be written twice: give the sensor of this name another one.")
         rows |= entries
     dtype = dtype or torch.get_default_dtype()
     tensors = {name: torch.from_numpy(row) for name, row in rows.items()}
@@ -133,15 +133,11 @@ class _Stream:
     def means(self, times: np.ndarray) -> np.ndarray:
         """Means between each of the ``times`` and the one before, on straight lines between the messages ``[T, O]``."""
         now = np.stack([np.interp(times, self.times, column) for column in self.values.T], 1)
-        begin, end = times[:-1], times[1:]
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
         area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
         # Each row sums its own pieces: one reading that is absurd must not spoil the rows that follow.
-        total = np.add.reduceat(area, np.searchsorted(knots, begin), 0) if len(begin) else np.zeros((0, on.shape[1]))
-        if len(begin):
-            total[-1] = area[np.searchsorted(knots, begin[-1]) : np.searchsorted(knots, end[-1])].sum(0)
-        step = (end - begin)[:, None]
+        total, step = np.add.reduceat(area, np.searchsorted(knots, times), 0)[:-1], np.diff(times)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
 

@@ -123,7 +123,7 @@ def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
     """Seconds of the steps ``[T]`` from the seconds between two, or the steps' numbers.
 
     Raises:
-        ValueError: for another number of times, and where they do not increase.
+        ValueError: for another number of times, and where they decrease, or are all the same.
     """
     if isinstance(time, Tensor):
         seconds = time.detach().cpu().double().flatten().numpy()

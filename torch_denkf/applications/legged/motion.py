@@ -11,6 +11,7 @@ from torch_denkf.functional.manifolds import SE23, Euclidean, Product, rotate
 from torch_denkf.modules import SubModel
 from torch_denkf.motions import InertialMotion
 from torch_denkf.motions.motion import Motion
+from torch_denkf.motions.time_step import keys_of_dt
 
 __all__ = ["LeggedMotion", "LeggedMotionNoise", "legged_space"]
 
@@ -92,7 +93,7 @@ class LeggedMotionNoise(SubModel):
         slip_key: NestedKey | None = None,
     ):
         self.dt, self.learned = dt, slip_key is not None
-        more = [key for key in (slip_key, None if isinstance(dt, (int, float)) else dt) if key is not None]
+        more = [*([] if slip_key is None else [slip_key]), *keys_of_dt(dt)]
         super().__init__(nn.Identity(), [contact_key, *more], [("forecast", "noise")])
         n = noises
         densities = [n.gyro, n.accelerometer, n.accelerometer / 3**0.5, n.gyro_walk, n.accelerometer_walk]
