@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
-from torch_denkf.applications.car import PairObservation, UnicycleMotion, UnicycleNoise, UnicycleTransition
-from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, with_history
+from torch_denkf.applications.car import UnicycleMotion, UnicycleNoise, UnicycleTransition
+from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransition, PairObservation, with_history
 from torch_denkf.filters import EKF, DEnKF
 from torch_denkf.modules import AroundState, ConstantNoise, EnsembleAnalysis, GaussianAround, Select, SubModel
 

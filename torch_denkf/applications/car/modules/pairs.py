@@ -78,7 +78,7 @@ class PairObservation(SubModel):
         history_key: see :func:`with_history`; ``None`` where the past is part of the state, see
             :class:`ClonedTransition`.
         steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
-            the key is not there. :func:`torch_denkf.applications.car.bridge_gaps` counts them.
+            the key is not there. ``kitti.gaps.bridge_gaps`` counts them.
         observed_key: optional mask ``[*B, 1]``.
         out_key: predicted observations ``[*B, E, 2]``.
         clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
