@@ -24,7 +24,7 @@ from torch_denkf.functional.inflation import inflate
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
-__all__ = ["Score", "Task", "lorenz96", "reacher", "ur5", "walks", "wheels"]
+__all__ = ["Score", "Task", "lorenz96", "manipulator", "reacher", "ur5", "walks", "wheels"]
 
 LEVEL = 0.9  # of the intervals
 WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
@@ -177,7 +177,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
-    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, whose motion learned from true states.
+    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
 
     Cosine, sine and velocity of its joints are 24 numbers, of which noisy encoders read 16.
     """
