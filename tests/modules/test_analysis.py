@@ -111,6 +111,8 @@ def test_a_single_reading(float64):
 def test_errors():
     assert_refused(ValueError, "'enkf'", EnsembleAnalysis, "enkf")
     assert_refused(ValueError, "rotate", EnsembleAnalysis, "sakov", rotate=True)
+    ones = torch.ones(2, 2), torch.ones(2, 2)
+    assert_refused(ValueError, 'taper is for scheme "sensor"', EnsembleAnalysis, "etkf", taper=ones)
 
 
 def test_inflation_multiplies_the_components_that_it_is_told(float64):

@@ -49,8 +49,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             learned observations, not one reading.
 
     Raises:
-        ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], and
-            factors of ``taper`` that are not finite or ask for a gradient.
+        ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], a
+            ``taper`` with ``"etkf"``, and factors of it that are not finite or ask for a gradient.
         KeyError: if an entry is missing.
 
     Example:
@@ -87,6 +87,8 @@ class EnsembleAnalysis(EnsembleUpdate):
             raise TypeError(f"taper is two tensors, [S, O] and [O, O], or None; got {type(taper).__name__}")
         if scheme not in ("sensor", "perturbed", "etkf", "sakov"):
             raise ValueError(f'scheme is "sensor", "perturbed", "etkf" or "sakov"; got {scheme!r}.')
+        if taper is not None and scheme == "etkf":
+            raise ValueError('taper is for scheme "sensor", "perturbed" or "sakov"; "etkf" has none.')
         if rotate and scheme != "etkf":
             raise ValueError(f'rotate=True belongs to scheme="etkf"; got {scheme!r}.')
         super().__init__(
