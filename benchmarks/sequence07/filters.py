@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.sequence07.chosen import FILTER, SLIP, SLIP_KEPT
+from benchmarks.sequence07.chosen import FILTER, OFFSET, OFFSET_NOISE, REST, SLIP, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
@@ -29,47 +29,55 @@ __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
-#: in rad/s; the slip.
-SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
-POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
+#: in rad/s; by how many pixels disparities are too large; the slip, and the part of it that lasts, in rad/m and m/m.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(1), Euclidean(6), Euclidean(6))
+POSE, TWIST, BIAS, OFF, UNREAD = slice(0, 7), slice(7, 13), slice(17, 20), slice(20, 21), 12
 SWAYS = [0, 1, 2, 5]  # of the twist
+SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which a car turns less, and by what factor
 #: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
-START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
-RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3 + [OFFSET]
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3 + [0.04]
 
 
 class CarMotion(Motion):
     """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
-    The pose also moves by the slip, which is what corners do not show of the twist, because the same corners are wrong
-    for many rows. No sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+    The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
+    many rows, until the tracker finds new ones, and a lens is wrong for the whole drive. No sensor reads it, so it
+    changes what a filter claims and not where the filter thinks it is.
 
     The pose trails so that the row's own readings correct the twist before it moves the pose.
     """
 
     def __init__(self):
-        keys = {"kept": 6, "swing": 4}
+        keys = {"kept": 6, "swing": 4, "slip_kept": 1}
         super().__init__(SPACE, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
 
-    def move(self, state, kept, swing, *, dt):
+    def move(self, state, kept, swing, slip_kept, *, dt):
         """The pose moved by twist and slip; the twist that is kept."""
-        pose, twist, change, bias, slip = self.space.points(state)
+        pose, twist, change, bias, offset, slip, rest = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
-        moved = SE3().plus(pose, (twist + slip) * dt)
-        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, SLIP_KEPT * slip], -1)
+        moved = SE3().plus(pose, (twist + (slip + rest) * twist[..., 5:]) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, offset, slip_kept * slip, rest], -1)
+
+
+def shown(ensemble: Tensor, dt: Tensor, by_offset: Tensor) -> Tensor:
+    """The motion ``[*B, E, 7]`` that corners show: where the twist leads in the time of a row, and the offset's part."""
+    off = by_offset.unsqueeze(-2) * ensemble[..., OFF]
+    return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2) + off)
 
 
 class LastMotion(SubModel):
     """The motion since the row before, ``[*B, E, 7]``: a point of SE3."""
 
     def __init__(self):
-        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt", "by_offset"], [("forecast", "observation")])
 
-    def compute(self, ensemble, dt):
-        """Where the twist leads in the time of a row."""
-        return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+    def compute(self, ensemble, dt, by_offset):
+        """What corners show."""
+        return shown(ensemble, dt, by_offset)
 
 
 class WhitenedMotion(SubModel):
@@ -79,14 +87,25 @@ class WhitenedMotion(SubModel):
     """
 
     def __init__(self):
-        keys = [("forecast", "ensemble"), "dt", "motion", "motion_noise"]
+        keys = [("forecast", "ensemble"), "dt", "by_offset", "motion", "motion_noise"]
         super().__init__(nn.Identity(), keys, [("forecast", "observation")])
 
-    def compute(self, ensemble, dt, motion, cov):
+    def compute(self, ensemble, dt, by_offset, motion, cov):
         """The tangent between both motions, by the root of its covariance."""
-        moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
+        moved = shown(ensemble, dt, by_offset)
         away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
         return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
+
+
+class Offset(SubModel):
+    """What the corners tell of their disparities' offset, ``[*B, E, 1]``: in standard deviations."""
+
+    def __init__(self):
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "offset_root"], [("forecast", "observation")])
+
+    def compute(self, ensemble, root):
+        """The offset, times the root of what is known of it."""
+        return root.unsqueeze(-2) * ensemble[..., OFF]
 
 
 class TurnRate(SubModel):
@@ -132,10 +151,18 @@ def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
 
 def process_noise() -> MappedNoise:
     """What a row adds: noise of the twist, of the bias, of the slip."""
-    through = torch.zeros(25, 15, dtype=torch.float64)
+    through = torch.zeros(32, 15, dtype=torch.float64)
     through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
-    through[16:, 6:] = torch.eye(9)
+    through[16:19, 6:9], through[20:26, 9:] = torch.eye(3), torch.eye(6)
     return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
+
+
+def speed_before(data: TensorDict) -> Tensor:
+    """The last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
+    rows = torch.arange(data.shape[-1]).unsqueeze(-1)
+    last = torch.where(data["motion_observed"], rows, 0).cummax(-2).values
+    last = torch.cat([last[..., :1, :], last[..., :-1, :]], -2)
+    return (data["motion"][..., 6:] / data["dt"]).gather(-2, last).abs()
 
 
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
@@ -144,7 +171,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, with its own pose, ``[*B, 26]``; by default at the origin, standing still.
+        start: state of the first row, with its own pose, ``[*B, 33]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -156,9 +183,12 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
         numbers = torch.stack([torch.as_tensor(values[name], dtype=torch.float64) for name in names], -1)
         return (numbers.unsqueeze(-2) if numbers.ndim > 1 else numbers).expand(*data.shape, len(names))
 
-    walks = several("pitch", "yaw", "roll", "side", "down", "ahead")
+    walks = several("pitch", "yaw", "roll", "side", "down", "ahead").clone()
+    walks[..., :5] *= (speed_before(data) / SLOW).clamp(*STILL)  # a car that stands does not turn
     bias = torch.full_like(walks[..., :3], 1e-5)
-    slip = (1 - SLIP_KEPT**2) ** 0.5 * torch.tensor(SLIP, dtype=torch.float64).expand(*data.shape, 6)
+    seen_before = data["motion_observed"].roll(1, -2)
+    data["slip_kept"] = torch.where(seen_before, SLIP_KEPT, 0.0)  # the tracker has found new corners
+    slip = (1 - data["slip_kept"].square()).sqrt() * torch.tensor(SLIP, dtype=torch.float64)
     data["process"] = torch.cat([walks, bias, slip], -1).square()
     data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll", "swing_ahead")
     share = several("kept_pitch", "kept_yaw", "kept_roll", "kept_side", "kept_side")
@@ -166,10 +196,11 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
     scale = several("scale").square().unsqueeze(-1)
     data["motion_noise"] = scale * data["motion_cov"] + torch.diag_embed(floor)
+    data["offset_observed"] = data["motion_observed"]
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 26).contiguous()
+    data["start"] = origin.expand(*data.shape, 33).contiguous()
     return data
 
 
@@ -187,8 +218,9 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
     sensors = {
         "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
         "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
+        "offset": FusedSensor(Offset(), [OFFSET_NOISE]),
     }
-    std = [*(RESTART if again else START), *SLIP]
+    std = [*(RESTART if again else START), *SLIP, *REST]
     motion, noise = CarMotion(), process_noise()
     if kind == "DEnKF":
         initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)

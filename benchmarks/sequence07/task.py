@@ -81,15 +81,24 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
 def readings(
     folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
 ) -> TensorDict:
-    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps."""
+    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
+
+    The camera triggers regularly, and its stamps tremble by a millisecond: each row is given the median step.
+    """
     found = drive(folder, name, count)
     rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
-    motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
+    given = calibrated(found.camera), CornerNoise(**CORNERS)
+    motion = corner_motions(rows, *given)
+    alone = corner_motions(rows, *given, start=motion.motion, steps=2, memory=False)
     out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
+    out["dt"] = found.rows["dt"].median().expand(out["dt"].shape).clone()
     out["motion"], out["motion_cov"] = motion.motion, motion.cov
+    out["by_offset"], out["offset"], out["offset_root"] = alone.by_offset, alone.offset, alone.offset_root
     hidden = ~out["motion_observed"].squeeze(-1)
     out["motion"][hidden] = SE3().neutral(out["motion"])
     out["motion_cov"][hidden] = torch.eye(6, dtype=torch.float64)
+    for key in ("by_offset", "offset", "offset_root"):
+        out[key][hidden] = 0
     return out
 
 
