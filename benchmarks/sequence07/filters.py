@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Literal
 
@@ -9,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.sequence07.chosen import FILTER, OFFSET, OFFSET_NOISE, REST, SLIP, SLIP_KEPT
+from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, OFFSET, OFFSET_NOISE, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
@@ -29,9 +30,10 @@ __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
-#: in rad/s; by how many pixels disparities are too large; the slip, and the part of it that lasts, in rad/m and m/m.
-SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(1), Euclidean(6), Euclidean(6))
-POSE, TWIST, BIAS, OFF, UNREAD = slice(0, 7), slice(7, 13), slice(17, 20), slice(20, 21), 12
+#: in rad/s; by how many pixels disparities are too large; the slip in rad/m and m/m.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(1), Euclidean(6))
+POSE, TWIST, BIAS, OFF = slice(0, 7), slice(7, 13), slice(17, 20), slice(20, 21)
+SLIP = [math.hypot(*both) for both in zip(HALVES, LENS, strict=True)]
 SWAYS = [0, 1, 2, 5]  # of the twist
 SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which a car turns less, and by what factor
 #: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
@@ -44,8 +46,8 @@ class CarMotion(Motion):
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
     The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
-    many rows, until the tracker finds new ones, and a lens is wrong for the whole drive. No sensor reads it, so it
-    changes what a filter claims and not where the filter thinks it is.
+    many rows, until the tracker finds new ones. No sensor reads it, so it changes what a filter claims and not where the
+    filter thinks it is.
 
     The pose trails so that the row's own readings correct the twist before it moves the pose.
     """
@@ -56,11 +58,11 @@ class CarMotion(Motion):
 
     def move(self, state, kept, swing, slip_kept, *, dt):
         """The pose moved by twist and slip; the twist that is kept."""
-        pose, twist, change, bias, offset, slip, rest = self.space.points(state)
+        pose, twist, change, bias, offset, slip = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
-        moved = SE3().plus(pose, (twist + (slip + rest) * twist[..., 5:]) * dt)
-        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, offset, slip_kept * slip, rest], -1)
+        moved = SE3().plus(pose, (twist + slip * twist[..., 5:]) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, offset, slip_kept * slip], -1)
 
 
 def shown(ensemble: Tensor, dt: Tensor, by_offset: Tensor) -> Tensor:
@@ -151,9 +153,9 @@ def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
 
 def process_noise() -> MappedNoise:
     """What a row adds: noise of the twist, of the bias, of the slip."""
-    through = torch.zeros(32, 15, dtype=torch.float64)
+    through = torch.zeros(26, 15, dtype=torch.float64)
     through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
-    through[16:19, 6:9], through[20:26, 9:] = torch.eye(3), torch.eye(6)
+    through[16:19, 6:9], through[20:, 9:] = torch.eye(3), torch.eye(6)
     return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
 
 
@@ -171,7 +173,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, with its own pose, ``[*B, 33]``; by default at the origin, standing still.
+        start: state of the first row, with its own pose, ``[*B, 27]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -200,7 +202,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 33).contiguous()
+    data["start"] = origin.expand(*data.shape, 27).contiguous()
     return data
 
 
@@ -220,7 +222,7 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
         "offset": FusedSensor(Offset(), [OFFSET_NOISE]),
     }
-    std = [*(RESTART if again else START), *SLIP, *REST]
+    std = [*(RESTART if again else START), *SLIP]
     motion, noise = CarMotion(), process_noise()
     if kind == "DEnKF":
         initial = AroundState(std, ensemble_size=members, state_key="start", space=SPACE)

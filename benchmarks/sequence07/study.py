@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import Columns, head, line, write_page
-from benchmarks.sequence07.filters import POSE, SPACE, UNREAD, car_filter, pose_of, prepared
+from benchmarks.sequence07.filters import POSE, SPACE, car_filter, pose_of, prepared
 from benchmarks.sequence07.pictures import draw
 from benchmarks.sequence07.task import CONDITIONS, ROWS, chained, naive, readings, truth
 from torch_denkf import Filter
@@ -74,7 +74,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
 
     Args:
         data: what a filter reads, ``[C, T]``.
-        states: means of a filter that has read it, ``[C, T, 33]``. A window starts from its twist.
+        states: means of a filter that has read it, ``[C, T, 27]``. A window starts from its twist.
         poses: true poses ``[T, 7]``.
 
     Returns:
@@ -85,7 +85,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
     first = torch.arange(EVERY, data.shape[1] - length + 1, EVERY)
     rows = first.unsqueeze(-1) + torch.arange(length)
     origin = SPACE.neutral(states[:, first]).expand_as(states[:, first]).clone()
-    origin[..., POSE.stop : -UNREAD] = states[:, first, POSE.stop : -UNREAD]
+    origin[..., POSE.stop : -6] = states[:, first, POSE.stop : -6]
     part = prepared(data[:, rows], start=origin)
     for key in ("motion_observed", "gyro_observed", "offset_observed"):  # the start's own reading is in its belief
         part[key] = part[key].clone()
