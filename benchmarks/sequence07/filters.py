@@ -46,8 +46,8 @@ class CarMotion(Motion):
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
     The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
-    many rows, until the tracker finds new ones. No sensor reads it, so it changes what a filter claims and not where the
-    filter thinks it is.
+    many rows, until the tracker finds new ones. No sensor reads it, so it changes what a filter claims and not where
+    the filter thinks it is.
 
     The pose trails so that the row's own readings correct the twist before it moves the pose.
     """
@@ -66,7 +66,7 @@ class CarMotion(Motion):
 
 
 def shown(ensemble: Tensor, dt: Tensor, by_offset: Tensor) -> Tensor:
-    """The motion ``[*B, E, 7]`` that corners show: where the twist leads in the time of a row, and the offset's part."""
+    """The motion ``[*B, E, 7]`` that corners show: where the twist leads in a row, and the offset's part."""
     off = by_offset.unsqueeze(-2) * ensemble[..., OFF]
     return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2) + off)
 
