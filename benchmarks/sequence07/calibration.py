@@ -1,9 +1,9 @@
 """Finds the numbers of ``chosen.py`` by drive 0022, which has no poses.
 
 ``python -m benchmarks.sequence07.calibration`` finds first the lens and then the corners' noise, by the likelihood of
-the corners themselves. Then what is wrong for many rows, by two halves of the corners. Last the filter's noises, by the
-likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from ``chosen.py``: fill in
-what the parts before have found.
+the corners themselves. Then what is wrong for many rows, by halves of the corners and by KITTI's lens. Last the
+filter's noises, by the likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from
+``chosen.py``: fill in what the parts before have found.
 """
 
 from __future__ import annotations
@@ -165,6 +165,18 @@ def other_lens(folder: Path = FOLDER) -> None:
 
 
 @torch.no_grad()
+def offset_noise(folder: Path = FOLDER) -> None:
+    """How much more the sets of corners differ in the disparities' offset than their rows say, each as if alone."""
+    data = readings(folder, "0022")[0]
+    root, told = data["offset_root"].squeeze(-1), data["offset"].squeeze(-1)
+    mean = (root * told).sum() / root.square().sum()
+    away = root * (told - root * mean)
+    sets = (~data["motion_observed"].squeeze(-1)).cumsum(0)
+    by_set = torch.zeros(len(data), dtype=away.dtype).index_add(0, sets, away)
+    print("OFFSET_NOISE", round((by_set.square().sum() / root.square().sum()).sqrt().item(), 2))
+
+
+@torch.no_grad()
 def filter_likelihoods(tried: list[dict], data: TensorDict, skip: int = 20) -> Tensor:
     """Log-likelihood of all readings ``[T]`` under the extended Kalman filter, for each of several choices ``[B]``."""
     data = data.expand(len(tried), *data.shape).contiguous()
@@ -211,6 +223,6 @@ def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    for part in (lens, corners, slip, other_lens, noises):
+    for part in (lens, corners, slip, other_lens, offset_noise, noises):
         if part.__name__ in sys.argv[1:] or not sys.argv[1:]:
             part()

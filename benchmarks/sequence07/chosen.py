@@ -57,5 +57,5 @@ SLIP_KEPT = 0.957
 
 #: By how many pixels all disparities may be off on another day: by how many they are with KITTI's lens. And by what the
 #: rows' word for it is worse than they say, because the same corners are in many rows.
-OFFSET = 0.38
+OFFSET = CAMERA["disparity_offset"][0]
 OFFSET_NOISE = 2.4
