@@ -152,28 +152,13 @@ def slip(folder: Path = FOLDER, seed: int = 0) -> None:
 
 @torch.no_grad()
 def other_lens(folder: Path = FOLDER) -> None:
-    """What KITTI's lens does to each meter: the lens of another day may be as far off.
-
-    The disparities' offset is not part of it, because the filter reads it.
-    """
+    """What KITTI's lens does to each meter: the lens of another day may be as far off."""
     found = drive(folder, "0022")
-    lenses = calibrated(found.camera), replace(found.camera, disparity_offset=CAMERA["disparity_offset"][:1])
+    lenses = calibrated(found.camera), found.camera
     motions = [corner_motions(found.rows, lens, CornerNoise(**CORNERS)).motion for lens in lenses]
     use = found.rows["motion_observed"].squeeze(-1) & (motions[0][:, 6] > LEAST)
     error = SE3().minus(*motions) / motions[0][:, 6:]
     print("LENS", [float(f"{value:.2g}") for value in error[use].square().mean(0).sqrt().tolist()])
-
-
-@torch.no_grad()
-def offset_noise(folder: Path = FOLDER) -> None:
-    """How much more the sets of corners differ in the disparities' offset than their rows say, each as if alone."""
-    data = readings(folder, "0022")[0]
-    root, told = data["offset_root"].squeeze(-1), data["offset"].squeeze(-1)
-    mean = (root * told).sum() / root.square().sum()
-    away = root * (told - root * mean)
-    sets = (~data["motion_observed"].squeeze(-1)).cumsum(0)
-    by_set = torch.zeros(len(data), dtype=away.dtype).index_add(0, sets, away)
-    print("OFFSET_NOISE", round((by_set.square().sum() / root.square().sum()).sqrt().item(), 2))
 
 
 @torch.no_grad()
@@ -223,6 +208,6 @@ def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    for part in (lens, corners, slip, other_lens, offset_noise, noises):
+    for part in (lens, corners, slip, other_lens, noises):
         if part.__name__ in sys.argv[1:] or not sys.argv[1:]:
             part()

@@ -52,10 +52,5 @@ FILTER = {
 #: share is left a row later. HALVES: by how much the motions of two halves of the corners differ. LENS: what the lens
 #: that was found changes of KITTI's, because that of another day is as far off.
 HALVES = (0.00015, 0.00017, 0.00023, 0.0058, 0.0045, 0.011)
-LENS = (0.00013, 0.00067, 0.00012, 0.0093, 0.0031, 0.014)
+LENS = (0.00013, 0.00069, 0.00012, 0.0097, 0.0035, 0.028)
 SLIP_KEPT = 0.957
-
-#: By how many pixels all disparities may be off on another day: by how many they are with KITTI's lens. And by what the
-#: rows' word for it is worse than they say, because the same corners are in many rows.
-OFFSET = CAMERA["disparity_offset"][0]
-OFFSET_NOISE = 2.4

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, OFFSET, OFFSET_NOISE, SLIP_KEPT
+from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
@@ -20,25 +20,24 @@ from torch_denkf.modules import (
     MappedNoise,
     NoisyTransition,
     SubModel,
-    UKFTransition,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
 
 __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
-Kind = Literal["EKF", "UKF", "DEnKF"]
+Kind = Literal["EKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
-#: in rad/s; by how many pixels disparities are too large; the slip in rad/m and m/m.
-SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(1), Euclidean(6))
-POSE, TWIST, BIAS, OFF = slice(0, 7), slice(7, 13), slice(17, 20), slice(20, 21)
+#: in rad/s; the slip in rad/m and m/m.
+SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
+POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
 SLIP = [math.hypot(*both) for both in zip(HALVES, LENS, strict=True)]
 SWAYS = [0, 1, 2, 5]  # of the twist
 SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which a car turns less, and by what factor
 #: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
-START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3 + [OFFSET]
-RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3 + [0.04]
+START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
+RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
 
 
 class CarMotion(Motion):
@@ -58,28 +57,22 @@ class CarMotion(Motion):
 
     def move(self, state, kept, swing, slip_kept, *, dt):
         """The pose moved by twist and slip; the twist that is kept."""
-        pose, twist, change, bias, offset, slip = self.space.points(state)
+        pose, twist, change, bias, slip = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
         moved = SE3().plus(pose, (twist + slip * twist[..., 5:]) * dt)
-        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, offset, slip_kept * slip], -1)
-
-
-def shown(ensemble: Tensor, dt: Tensor, by_offset: Tensor) -> Tensor:
-    """The motion ``[*B, E, 7]`` that corners show: where the twist leads in a row, and the offset's part."""
-    off = by_offset.unsqueeze(-2) * ensemble[..., OFF]
-    return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2) + off)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, slip_kept * slip], -1)
 
 
 class LastMotion(SubModel):
     """The motion since the row before, ``[*B, E, 7]``: a point of SE3."""
 
     def __init__(self):
-        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt", "by_offset"], [("forecast", "observation")])
+        super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
 
-    def compute(self, ensemble, dt, by_offset):
-        """What corners show."""
-        return shown(ensemble, dt, by_offset)
+    def compute(self, ensemble, dt):
+        """Where the twist leads in the time of a row."""
+        return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
 
 
 class WhitenedMotion(SubModel):
@@ -89,25 +82,14 @@ class WhitenedMotion(SubModel):
     """
 
     def __init__(self):
-        keys = [("forecast", "ensemble"), "dt", "by_offset", "motion", "motion_noise"]
+        keys = [("forecast", "ensemble"), "dt", "motion", "motion_noise"]
         super().__init__(nn.Identity(), keys, [("forecast", "observation")])
 
-    def compute(self, ensemble, dt, by_offset, motion, cov):
+    def compute(self, ensemble, dt, motion, cov):
         """The tangent between both motions, by the root of its covariance."""
-        moved = shown(ensemble, dt, by_offset)
+        moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
         away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
         return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
-
-
-class Offset(SubModel):
-    """What the corners tell of their disparities' offset, ``[*B, E, 1]``: in standard deviations."""
-
-    def __init__(self):
-        super().__init__(nn.Identity(), [("forecast", "ensemble"), "offset_root"], [("forecast", "observation")])
-
-    def compute(self, ensemble, root):
-        """The offset, times the root of what is known of it."""
-        return root.unsqueeze(-2) * ensemble[..., OFF]
 
 
 class TurnRate(SubModel):
@@ -153,9 +135,9 @@ def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
 
 def process_noise() -> MappedNoise:
     """What a row adds: noise of the twist, of the bias, of the slip."""
-    through = torch.zeros(26, 15, dtype=torch.float64)
+    through = torch.zeros(25, 15, dtype=torch.float64)
     through[6:12, :6], through[12:16, :6] = torch.eye(6), torch.eye(6)[SWAYS]
-    through[16:19, 6:9], through[20:, 9:] = torch.eye(3), torch.eye(6)
+    through[16:, 6:] = torch.eye(9)
     return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
 
 
@@ -173,7 +155,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     Args:
         readings: ``[*B, T]``.
         values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, with its own pose, ``[*B, 27]``; by default at the origin, standing still.
+        start: state of the first row, with its own pose, ``[*B, 26]``; by default at the origin, standing still.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -198,11 +180,10 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
     floor = several("floor_turn", "floor_turn", "floor_turn", "floor_move", "floor_move", "floor_move").square()
     scale = several("scale").square().unsqueeze(-1)
     data["motion_noise"] = scale * data["motion_cov"] + torch.diag_embed(floor)
-    data["offset_observed"] = data["motion_observed"]
     data["whitened"] = torch.zeros_like(data["motion"][..., :6])
     data["gyro_noise"] = several("gyro", "gyro", "gyro").square()
     origin = SPACE.neutral(data["motion"]) if start is None else start.unsqueeze(-2)
-    data["start"] = origin.expand(*data.shape, 27).contiguous()
+    data["start"] = origin.expand(*data.shape, 26).contiguous()
     return data
 
 
@@ -220,7 +201,6 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
     sensors = {
         "gyro": FusedSensor(TurnRate(), Given("gyro_noise", ("sensor", "noise"), 3)),
         "motion": FusedSensor(LastMotion(), Given("motion_noise", ("sensor", "noise"), 6), reading_space=SE3(), **seen),
-        "offset": FusedSensor(Offset(), [OFFSET_NOISE]),
     }
     std = [*(RESTART if again else START), *SLIP]
     motion, noise = CarMotion(), process_noise()
@@ -231,8 +211,5 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
     else:
         initial = GaussianAround(std, state_key="start", space=SPACE)
-        if kind == "UKF":
-            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
-        else:
-            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
+        filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
     return filter if gate is None else Gated(filter, **gate)

@@ -74,7 +74,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
 
     Args:
         data: what a filter reads, ``[C, T]``.
-        states: means of a filter that has read it, ``[C, T, 27]``. A window starts from its twist.
+        states: means of a filter that has read it, ``[C, T, 26]``. A window starts from its twist.
         poses: true poses ``[T, 7]``.
 
     Returns:
@@ -87,7 +87,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
     origin = SPACE.neutral(states[:, first]).expand_as(states[:, first]).clone()
     origin[..., POSE.stop : -6] = states[:, first, POSE.stop : -6]
     part = prepared(data[:, rows], start=origin)
-    for key in ("motion_observed", "gyro_observed", "offset_observed"):  # the start's own reading is in its belief
+    for key in ("motion_observed", "gyro_observed"):  # the start's own reading is in its belief
         part[key] = part[key].clone()
         part[key][:, :, 0] = False
     true = poses[rows]
@@ -200,7 +200,7 @@ def main() -> None:
     poses = truth(study.data, count)
     data = readings(study.data, "0027", CONDITIONS, count, study.seed)
     rows, paths, claims = [], {}, {}
-    models = [("EKF", "EKF", "RTS smoother", {}), ("UKF", "UKF", "", {})]
+    models = [("EKF", "EKF", "RTS smoother", {})]
     for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
         options = {"members": members, "localisation": "significance"}
         models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))

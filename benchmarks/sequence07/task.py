@@ -87,18 +87,13 @@ def readings(
     """
     found = drive(folder, name, count)
     rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
-    given = calibrated(found.camera), CornerNoise(**CORNERS)
-    motion = corner_motions(rows, *given)
-    alone = corner_motions(rows, *given, start=motion.motion, steps=2, memory=False)
+    motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
     out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
     out["dt"] = found.rows["dt"].median().expand(out["dt"].shape).clone()
     out["motion"], out["motion_cov"] = motion.motion, motion.cov
-    out["by_offset"], out["offset"], out["offset_root"] = alone.by_offset, alone.offset, alone.offset_root
     hidden = ~out["motion_observed"].squeeze(-1)
     out["motion"][hidden] = SE3().neutral(out["motion"])
     out["motion_cov"][hidden] = torch.eye(6, dtype=torch.float64)
-    for key in ("by_offset", "offset", "offset_root"):
-        out[key][hidden] = 0
     return out
 
 

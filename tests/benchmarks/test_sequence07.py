@@ -5,18 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from benchmarks.sequence07.filters import (
-    DT,
-    OFF,
-    OFFSET_NOISE,
-    POSE,
-    SPACE,
-    SWAYS,
-    CarMotion,
-    car_filter,
-    pose_of,
-    prepared,
-)
+from benchmarks.sequence07.filters import DT, POSE, SPACE, SWAYS, CarMotion, car_filter, pose_of, prepared
 from benchmarks.sequence07.study import Claim, and_one_more, claimed, run, windows
 from benchmarks.sequence07.task import EVERY, LOST, WRONG, chained, in_condition
 from tests.real_data import SHARED
@@ -41,19 +30,17 @@ def driven(count=240, runs=4, seed=0, slips=True):
     data["gyro_observed"] = torch.ones(runs, count, 1, dtype=torch.bool)
     data["motion_observed"] = (torch.arange(count) % 9 > 0).reshape(1, count, 1).expand(runs, count, 1).clone()
     data["motion"][..., 6] = 6.0 * DT  # for the speed before a row
-    data["by_offset"] = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -0.03]).expand(runs, count, 6)
-    data["offset_root"] = torch.full((runs, count, 1), 3.0)
     believed, motion = prepared(data), CarMotion()
     state = SPACE.perturb(
-        SPACE.neutral(torch.zeros(27)).expand(runs, 27), car_filter("EKF").initial.std, torch.randn(runs, 26)
+        SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25)
     )
     state[:, 12] += 6.0
-    state[:, OFF.stop :] *= slips
+    state[:, 20:] *= slips
     states = [state]
     for row in range(1, count + 1):
         at = min(row, count - 1)
         noise = believed["process"][:, at].sqrt() * torch.randn(runs, 15)
-        parts = noise[:, :6], noise[:, SWAYS], noise[:, 6:9], torch.zeros(runs, 1), slips * noise[:, 9:]
+        parts = noise[:, :6], noise[:, SWAYS], noise[:, 6:9], slips * noise[:, 9:]
         step = torch.cat([torch.zeros(runs, 6), *parts], -1)
         dt = torch.full((runs, 1), DT if row > 1 else 0.0)
         state = SPACE.plus(
@@ -64,9 +51,7 @@ def driven(count=240, runs=4, seed=0, slips=True):
     poses, states = states[:, 1:, POSE], states[:, :-1]
     root = torch.linalg.cholesky(believed["motion_noise"])
     error = (root @ torch.randn(runs, count, 6, 1)).squeeze(-1)
-    shown = SE3().exp(states[..., 7:13] * DT + data["by_offset"] * states[..., OFF])
-    data["motion"] = SE3().plus(shown, error)
-    data["offset"] = data["offset_root"] * states[..., OFF] + OFFSET_NOISE * torch.randn(runs, count, 1)
+    data["motion"] = SE3().plus(SE3().exp(states[..., 7:13] * DT), error)
     gyro = believed["gyro_noise"].sqrt() * torch.randn(runs, count, 3)
     data["gyro"] = states[..., 7:10] + states[..., 17:20] + gyro
     return data, poses

@@ -97,21 +97,6 @@ def test_what_a_rectification_has_left_is_taken_off():
     assert_close(CAMERA.corners(pixels), torch.tensor([[900.0, 250.0, 20.0]]))
 
 
-def test_corners_tell_by_how_much_all_disparities_are_off():
-    noise = CornerNoise(0.05, 0.0, 0.05, 0.0, 0.2, 0.0, 0.0, freedom=1e6)
-    before, after, seen, _ = drawn(batch=400, noise=noise)
-    lasts = torch.zeros_like(before)
-    lasts[..., 2] = 0.2 * torch.randn_like(lasts[..., 2])  # of each corner, in both rows
-    off = torch.tensor([0.0, 0.0, 0.25])
-    right, wrong = (corner_motion(before + lasts + o, after + lasts + o, seen, CAMERA, noise) for o in (0 * off, off))
-    assert_close((wrong.offset / wrong.offset_root).mean(), off[2], rtol=0.05, atol=0)
-    assert_close(right.offset.mean(), torch.tensor(0.0), rtol=0, atol=0.15)
-    assert_close(right.offset.std(), torch.tensor(1.0), rtol=0.1, atol=0)
-    moved = SE3().minus(wrong.motion, right.motion).mean(0)
-    assert_close(moved, (0.25 * right.by_offset).mean(0), rtol=0.05, atol=2e-4)
-    assert moved[5] < -0.004, "too large a disparity makes the way shorter"
-
-
 def test_wrong_disparities_do_not_make_the_way_shorter():
     """Least squares on points that are wrong shorten the way, here by 6 of 10,000."""
     noise = CornerNoise(0.06, 0.0, 0.05, 0.0, 0.45, 0.0, freedom=200.0)

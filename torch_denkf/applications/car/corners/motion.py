@@ -72,10 +72,6 @@ class CornerMotion(NamedTuple):
         weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
         stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
         stereo_var: of it.
-        by_offset: by how much the motion changes with each pixel that all disparities are too large, ``[*B, 6]``.
-        offset: what the corners tell of these pixels, whatever the motion: ``offset_root`` times them, with a variance
-            of 1, ``[*B, 1]``.
-        offset_root: see there.
     """
 
     motion: Tensor
@@ -84,9 +80,6 @@ class CornerMotion(NamedTuple):
     weight: Tensor
     stereo: Tensor
     stereo_var: Tensor
-    by_offset: Tensor
-    offset: Tensor
-    offset_root: Tensor
 
 
 def corner_motion(
@@ -157,15 +150,10 @@ def corner_motion(
     constant = torch.lgamma((freedom + 3) / 2) - torch.lgamma(freedom / 2) - 1.5 * (freedom * math.pi).log()
     density = density + constant
     mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
-    moves = torch.linalg.solve(information, (weighted @ (own - through).unsqueeze(-1)).sum(-3))
-    apart = (own - through).unsqueeze(-1) - jacobian @ moves.unsqueeze(-3)  # what no motion explains
-    of_offset = weight[..., None, None] * apart.mT @ inverse
-    root = ((of_offset @ apart).sum(-3).squeeze(-1) + 1e-6).sqrt()
-    told = moves.squeeze(-1), (of_offset @ left.unsqueeze(-1)).sum(-3).squeeze(-1) / root, root
     gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # of the error that stays
     error = (gain @ left.unsqueeze(-1))[..., 0, 0]
     var = stays - stays * (gain @ (own - through).unsqueeze(-1))[..., 0, 0]
-    return CornerMotion(pose, torch.linalg.inv(information), mean, weight, error, var, *told)
+    return CornerMotion(pose, torch.linalg.inv(information), mean, weight, error, var)
 
 
 def corner_motions(
