@@ -29,12 +29,12 @@ def driven(count=240, runs=4, seed=0, slips=True):
     data["gyro"] = torch.zeros(runs, count, 3)
     data["gyro_observed"] = torch.ones(runs, count, 1, dtype=torch.bool)
     data["motion_observed"] = (torch.arange(count) % 9 > 0).reshape(1, count, 1).expand(runs, count, 1).clone()
-    data["motion"][..., 6] = 6.0 * DT  # for the speed before a row
+    data["motion"][..., 6] = 8.0 * DT  # for the speed before a row
     believed, motion = prepared(data), CarMotion()
     state = SPACE.perturb(
         SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25)
     )
-    state[:, 12] += 6.0
+    state[:, 12] = 8.0 + torch.randn(runs)
     state[:, 20:] *= slips
     states = [state]
     for row in range(1, count + 1):
