@@ -1,9 +1,9 @@
 """Finds the numbers of ``chosen.py`` by drive 0022, which has no poses.
 
 ``python -m benchmarks.sequence07.calibration`` finds first the lens and then the corners' noise, by the likelihood of
-the corners themselves. Then what is wrong for many rows, by two halves of the corners. Last the filter's noises, by the
-likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from ``chosen.py``: fill in
-what the parts before have found.
+the corners themselves. Then what is wrong for many rows, by halves of the corners and by KITTI's lens. Last the
+filter's noises, by the likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from
+``chosen.py``: fill in what the parts before have found.
 """
 
 from __future__ import annotations
@@ -113,12 +113,15 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
     print(f"other rows {scores(values.unsqueeze(0), slice(rows, None)).item():.4f}")
 
 
+LEAST = 0.3  # m that a row moves; errors are those of each meter
+
+
 @torch.no_grad()
 def slip(folder: Path = FOLDER, seed: int = 0) -> None:
     """Errors that last: the corners are split at random, each with all its rows, and each half shows a motion.
 
     The mean of both has half the error of their difference. Its square and how much of it is left some rows later are
-    those of a process that forgets a share from row to row.
+    those of a process that forgets a share from row to row, and all where the tracker finds new corners.
     """
     found, random = drive(folder, "0022"), torch.Generator().manual_seed(seed)
     rows, motions = found.rows, []
@@ -132,17 +135,30 @@ def slip(folder: Path = FOLDER, seed: int = 0) -> None:
         some["seen"] = rows["seen"] & part
         use = use & (some["seen"].sum(-1) >= 8)
         motions.append(corner_motions(some, calibrated(found.camera), CornerNoise(**CORNERS)).motion)
-    error = SE3().minus(*motions) / 2 / rows["dt"]
+    use = use & (motions[0][:, 6] > LEAST)
+    error = SE3().minus(*motions) / 2 / motions[0][:, 6:]
     limit = 10 * error[use].abs().median(0).values  # a half may follow another car
     use = use & (error.abs() < limit).all(-1)
+    corners = (~rows["motion_observed"].squeeze(-1)).cumsum(0)
 
     def product(lag: int) -> Tensor:
-        both = use[lag:] & use[: len(use) - lag]
+        both = use[lag:] & use[: len(use) - lag] & (corners[lag:] == corners[: len(use) - lag])
         return (error[lag:] * error[: len(use) - lag])[both].mean(0)
 
     kept = (product(6) / product(1)).mean() ** (1 / 5)
     std = (product(1) / kept).sqrt()
-    print("SLIP", [float(f"{value:.2g}") for value in std.tolist()], "SLIP_KEPT", round(kept.item(), 3))
+    print("HALVES", [float(f"{value:.2g}") for value in std.tolist()], "SLIP_KEPT", round(kept.item(), 3))
+
+
+@torch.no_grad()
+def other_lens(folder: Path = FOLDER) -> None:
+    """What KITTI's lens does to each meter: the lens of another day may be as far off."""
+    found = drive(folder, "0022")
+    lenses = calibrated(found.camera), found.camera
+    motions = [corner_motions(found.rows, lens, CornerNoise(**CORNERS)).motion for lens in lenses]
+    use = found.rows["motion_observed"].squeeze(-1) & (motions[0][:, 6] > LEAST)
+    error = SE3().minus(*motions) / motions[0][:, 6:]
+    print("LENS", [float(f"{value:.2g}") for value in error[use].square().mean(0).sqrt().tolist()])
 
 
 @torch.no_grad()
@@ -192,6 +208,6 @@ def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    for part in (lens, corners, slip, noises):
+    for part in (lens, corners, slip, other_lens, noises):
         if part.__name__ in sys.argv[1:] or not sys.argv[1:]:
             part()

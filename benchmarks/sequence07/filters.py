@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Literal
 
@@ -9,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.sequence07.chosen import FILTER, SLIP, SLIP_KEPT
+from benchmarks.sequence07.chosen import FILTER, HALVES, LENS, SLIP_KEPT
 from torch_denkf import Filter, FusedFilter, FusedSensor
 from torch_denkf.functional.manifolds import SE3, Euclidean, Product
 from torch_denkf.modules import (
@@ -19,20 +20,21 @@ from torch_denkf.modules import (
     MappedNoise,
     NoisyTransition,
     SubModel,
-    UKFTransition,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
 
 __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
-Kind = Literal["EKF", "UKF", "DEnKF"]
+Kind = Literal["EKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
-#: in rad/s; the slip.
+#: in rad/s; the slip in rad/m and m/m.
 SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
 POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
+SLIP = [math.hypot(*both) for both in zip(HALVES, LENS, strict=True)]
 SWAYS = [0, 1, 2, 5]  # of the twist
+SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which a car turns less, and by what factor
 #: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
 START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
 RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
@@ -42,23 +44,24 @@ class CarMotion(Motion):
     """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
 
     A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
-    The pose also moves by the slip, which is what corners do not show of the twist, because the same corners are wrong
-    for many rows. No sensor reads it, so it changes what a filter claims and not where the filter thinks it is.
+    The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
+    many rows, until the tracker finds new ones. No sensor reads it, so it changes what a filter claims and not where
+    the filter thinks it is.
 
     The pose trails so that the row's own readings correct the twist before it moves the pose.
     """
 
     def __init__(self):
-        keys = {"kept": 6, "swing": 4}
+        keys = {"kept": 6, "swing": 4, "slip_kept": 1}
         super().__init__(SPACE, "dt_before", keys, ("belief", "ensemble"), ("forecast", "ensemble"))
 
-    def move(self, state, kept, swing, *, dt):
+    def move(self, state, kept, swing, slip_kept, *, dt):
         """The pose moved by twist and slip; the twist that is kept."""
         pose, twist, change, bias, slip = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
-        moved = SE3().plus(pose, (twist + slip) * dt)
-        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, SLIP_KEPT * slip], -1)
+        moved = SE3().plus(pose, (twist + slip * twist[..., 5:]) * dt)
+        return torch.cat([moved, after, (after - twist)[..., SWAYS], bias, slip_kept * slip], -1)
 
 
 class LastMotion(SubModel):
@@ -138,6 +141,14 @@ def process_noise() -> MappedNoise:
     return MappedNoise(Given("process", ("forecast", "noise"), 15), through)
 
 
+def speed_before(data: TensorDict) -> Tensor:
+    """The last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
+    rows = torch.arange(data.shape[-1]).unsqueeze(-1)
+    last = torch.where(data["motion_observed"], rows, 0).cummax(-2).values
+    last = torch.cat([last[..., :1, :], last[..., :-1, :]], -2)
+    return (data["motion"][..., 6:] / data["dt"]).gather(-2, last).abs()
+
+
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
     """Readings with the noises that a filter is to believe.
 
@@ -156,9 +167,12 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
         numbers = torch.stack([torch.as_tensor(values[name], dtype=torch.float64) for name in names], -1)
         return (numbers.unsqueeze(-2) if numbers.ndim > 1 else numbers).expand(*data.shape, len(names))
 
-    walks = several("pitch", "yaw", "roll", "side", "down", "ahead")
+    walks = several("pitch", "yaw", "roll", "side", "down", "ahead").clone()
+    walks[..., :5] *= (speed_before(data) / SLOW).clamp(*STILL)  # a car that stands does not turn
     bias = torch.full_like(walks[..., :3], 1e-5)
-    slip = (1 - SLIP_KEPT**2) ** 0.5 * torch.tensor(SLIP, dtype=torch.float64).expand(*data.shape, 6)
+    seen_before = data["motion_observed"].roll(1, -2)
+    data["slip_kept"] = torch.where(seen_before, SLIP_KEPT, 0.0)  # the tracker has found new corners
+    slip = (1 - data["slip_kept"].square()).sqrt() * torch.tensor(SLIP, dtype=torch.float64)
     data["process"] = torch.cat([walks, bias, slip], -1).square()
     data["swing"] = several("swing_pitch", "swing_yaw", "swing_roll", "swing_ahead")
     share = several("kept_pitch", "kept_yaw", "kept_roll", "kept_side", "kept_side")
@@ -197,8 +211,5 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
     else:
         initial = GaussianAround(std, state_key="start", space=SPACE)
-        if kind == "UKF":
-            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
-        else:
-            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
+        filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
     return filter if gate is None else Gated(filter, **gate)

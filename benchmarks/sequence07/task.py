@@ -81,11 +81,15 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
 def readings(
     folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
 ) -> TensorDict:
-    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps."""
+    """What a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
+
+    The camera triggers regularly, and its stamps tremble by a millisecond: each row is given the median step.
+    """
     found = drive(folder, name, count)
     rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
     motion = corner_motions(rows, calibrated(found.camera), CornerNoise(**CORNERS))
     out = rows.select("gyro", "gyro_observed", "motion_observed", "dt", "time", "step")
+    out["dt"] = found.rows["dt"].median().expand(out["dt"].shape).clone()
     out["motion"], out["motion_cov"] = motion.motion, motion.cov
     hidden = ~out["motion_observed"].squeeze(-1)
     out["motion"][hidden] = SE3().neutral(out["motion"])

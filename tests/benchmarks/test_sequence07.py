@@ -20,7 +20,7 @@ def _double(float64):
     return
 
 
-def driven(count=240, runs=4, seed=0):
+def driven(count=240, runs=4, seed=0, slips=True):
     """Drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
     torch.manual_seed(seed)
     data = TensorDict({"motion": SE3().neutral(torch.zeros(7)).expand(runs, count, 7).clone()}, [runs, count])
@@ -29,17 +29,23 @@ def driven(count=240, runs=4, seed=0):
     data["gyro"] = torch.zeros(runs, count, 3)
     data["gyro_observed"] = torch.ones(runs, count, 1, dtype=torch.bool)
     data["motion_observed"] = (torch.arange(count) % 9 > 0).reshape(1, count, 1).expand(runs, count, 1).clone()
+    data["motion"][..., 6] = 8.0 * DT  # for the speed before a row
     believed, motion = prepared(data), CarMotion()
     state = SPACE.perturb(
         SPACE.neutral(torch.zeros(26)).expand(runs, 26), car_filter("EKF").initial.std, torch.randn(runs, 25)
     )
-    state[:, 12] += 6.0
+    state[:, 12] = 8.0 + torch.randn(runs)
+    state[:, 20:] *= slips
     states = [state]
     for row in range(1, count + 1):
-        noise = believed["process"][:, 0].sqrt() * torch.randn(runs, 15)
-        step = torch.cat([torch.zeros(runs, 6), noise[:, :6], noise[:, SWAYS], noise[:, 6:]], -1)
+        at = min(row, count - 1)
+        noise = believed["process"][:, at].sqrt() * torch.randn(runs, 15)
+        parts = noise[:, :6], noise[:, SWAYS], noise[:, 6:9], slips * noise[:, 9:]
+        step = torch.cat([torch.zeros(runs, 6), *parts], -1)
         dt = torch.full((runs, 1), DT if row > 1 else 0.0)
-        state = SPACE.plus(motion.move(state, believed["kept"][:, 0], believed["swing"][:, 0], dt=dt), step)
+        state = SPACE.plus(
+            motion.move(state, *(believed[key][:, at] for key in ("kept", "swing", "slip_kept")), dt=dt), step
+        )
         states.append(state)
     states = torch.stack(states, 1)
     poses, states = states[:, 1:, POSE], states[:, :-1]
@@ -94,7 +100,7 @@ def test_corners_are_lost_or_wrong_as_a_condition_says():
 
 
 def test_a_smoothed_step_is_nearer_than_a_reading_and_than_a_filtered_step():
-    data, poses = driven(120)
+    data, poses = driven(120, slips=False)
     out = run(RTSSmoother(car_filter("EKF")), prepared(and_one_more(data)))
     paths = [chained(one["motion"], one["motion_observed"].squeeze(-1), one["dt"]) for one in data]
     paths = [torch.stack(paths), pose_of(out)[0], pose_of(out, "smoothed")[0]]
