@@ -20,13 +20,14 @@ from torch_denkf.modules import (
     MappedNoise,
     NoisyTransition,
     SubModel,
+    UKFTransition,
 )
 from torch_denkf.monitoring import Gated
 from torch_denkf.motions.motion import Motion
 
 __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
-Kind = Literal["EKF", "DEnKF"]
+Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
 #: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
 #: in rad/s; the slip in rad/m and m/m.
@@ -211,5 +212,8 @@ def car_filter(kind: Kind, members: int = 64, *, gate: dict | None = None, again
         filter = FusedFilter(NoisyTransition(motion, noise, space=SPACE), sensors, initial=initial, analysis=made)
     else:
         initial = GaussianAround(std, state_key="start", space=SPACE)
-        filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
+        if kind == "UKF":
+            filter = FusedFilter(UKFTransition(motion, noise, space=SPACE), sensors, initial=initial)
+        else:
+            filter = FusedFilter(motion, sensors, initial=initial, process_noise=noise)
     return filter if gate is None else Gated(filter, **gate)

@@ -200,7 +200,7 @@ def main() -> None:
     poses = truth(study.data, count)
     data = readings(study.data, "0027", CONDITIONS, count, study.seed)
     rows, paths, claims = [], {}, {}
-    models = [("EKF", "EKF", "RTS smoother", {})]
+    models = [("EKF", "EKF", "RTS smoother", {}), ("UKF", "UKF", "", {})]
     for members, smoother in ((32, ""), (64, "EnRTS, 64 members")):
         options = {"members": members, "localisation": "significance"}
         models.append((f"DEnKF, {members} members", "DEnKF", smoother, options))
