@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -38,7 +38,7 @@ SURPRISE = 2.0  # on what the motion missed in the episodes that it was trained 
 LEVEL = 1.645  # standard deviations of a 90 % interval
 READ, AFTER = 30, (30, 90, 300)  # rows that are read before the camera is off; rows without it
 OFFSET = math.radians(5.0)  # standard deviation of an encoder's offset
-EPISODES, DRAWS = (1, 5, 10), 20  # after which the offset is scored; orders of the episodes
+EPISODES, DRAWS = (1, 5, 10), 60  # after which the offset is scored; orders of the episodes
 
 
 @dataclass(frozen=True)
@@ -130,24 +130,27 @@ class Arm:
         return MomentPrior(mean, torch.block_diag(poses.mT.cov(), rate if not begins else 0.1 * rate))
 
     @cached_property
-    def camera(self) -> tuple[FadingBias, Tensor]:
-        """How the camera errs on episodes that its sensor has not seen: for an episode, for a while, and at random."""
-        return lasting([self.readings(role) for role in ("tune", "validation")], "camera")
+    def unseen(self) -> list[TensorDict]:
+        """Readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
+        return [self.readings(role) for role in ("tune", "validation")]
 
-    @cached_property
-    def regression(self) -> tuple[FadingBias, Tensor]:
-        """How the joints differ from the regression on the commands."""
-        return lasting([self.readings(role) for role in ("tune", "validation")], "regression")
+    def errors(self, name: str, kind: str = "episodes") -> tuple[FadingBias | None, Tensor]:
+        """What lasts of a sensor's errors, ``"episodes"`` for a part that is an episode's, and what is white."""
+        errors = [torch.where(one[f"{name}_observed"], one[name] - one["state"], torch.nan) for one in self.unseen]
+        every = pad_sequence([error for one in errors for error in one], batch_first=True, padding_value=torch.nan)
+        if kind == "white":
+            return None, every.square().nanmean((0, 1)).sqrt()
+        return FadingBias.from_residuals(every, per_run=kind == "episodes", trainable=False)
 
-    def filter(self, *names: str, begins: bool = True, offset: bool = False) -> FusedFilter:
-        """A filter of some sensors: ``"camera"``, ``"encoder"``, ``"regression"``."""
+    def filter(self, *names: str, begins: bool = True, offset: bool = False, kind: str = "episodes") -> FusedFilter:
+        """A filter of sensors of the data; for the kind see :meth:`errors`. Encoders are right, or have an offset."""
         sensors, read = {}, Select(list(range(SIZE)))
         for name in names:
             if name == "encoder":
                 error = FadingBias([OFFSET] * SIZE, 1e7, trainable=False) if offset else None
                 sensors[name] = FusedSensor(read, [ENCODER] * SIZE, sensor_error=error)
             else:
-                error, white = getattr(self, name)
+                error, white = self.errors(name, kind)
                 sensors[name] = FusedSensor(read, white, sensor_error=error)
         motion = LearnedTransition(self.motion, residual=False)
         return FusedFilter(motion, sensors, initial=self.start(begins), process_noise=self.noise)
@@ -167,13 +170,6 @@ def lagged(commands: Tensor) -> Tensor:
     rows = torch.arange(len(commands))
     parts = [commands[(rows - lag).clamp_min(0)] for lag in range(COMMANDS)]
     return torch.cat([*parts, torch.ones(len(commands), 1)], -1)
-
-
-def lasting(readings: list[TensorDict], name: str) -> tuple[FadingBias, Tensor]:
-    """Errors that last for an episode, and some that fade; standard deviations of the white rest."""
-    errors = [torch.where(one[f"{name}_observed"], one[name] - one["state"], torch.nan) for one in readings]
-    every = pad_sequence([error for one in errors for error in one], batch_first=True, padding_value=torch.nan)
-    return FadingBias.from_residuals(every, per_run=True, trainable=False)
 
 
 @torch.no_grad()
@@ -205,17 +201,18 @@ def held(data: TensorDict, name: str, start: Tensor) -> Tensor:
 
 
 def combined(arm: Arm, data: TensorDict) -> Tensor:
-    """Least squares of each joint on the last readings of camera and encoder, from other episodes."""
+    """Least squares of each joint on camera and encoder, and the camera when that was read, from other episodes."""
     start = torch.stack([state[0] for state, _ in arm.known]).mean(0)
 
     def both(one: TensorDict) -> Tensor:
-        parts = [held(one, name, start) for name in ("camera", "encoder")]
-        return torch.stack([*parts, torch.ones_like(parts[0])], -1)
+        camera, encoder = (held(one, name, start) for name in ("camera", "encoder"))
+        then = hold_last(camera, one["encoder_observed"], camera[:, 0])
+        return torch.stack([camera, encoder, then, torch.ones_like(camera)], -1)
 
-    known = [encoders(arm.readings(role), 1.0) for role in ("tune", "validation")]
+    known = [encoders(one, 1.0) for one in arm.unseen]
     inputs = torch.cat([both(one)[one["valid"].squeeze(-1)] for one in known])
     wanted = torch.cat([one["state"][one["valid"].squeeze(-1)] for one in known])
-    weights = torch.linalg.lstsq(inputs.transpose(0, 1), wanted.mT.unsqueeze(-1)).solution.squeeze(-1)  # [7, 3]
+    weights = torch.linalg.lstsq(inputs.transpose(0, 1), wanted.mT.unsqueeze(-1)).solution.squeeze(-1)  # [7, 4]
     return (both(data) * weights).sum(-1)
 
 
@@ -242,7 +239,9 @@ def rates(arm: Arm) -> list[str]:
     add("encoders, 1 Hz", "last reading", lambda one: (held(one, "encoder", start), None), False)
     add("encoders, 1 Hz", "filter", lambda one: run(arm.filter("encoder"), one), False)
     add("camera, encoders, 1 Hz", "best linear combination", lambda one: (combined(arm, one), None))
-    add("camera, encoders, 1 Hz", "filter", lambda one: run(arm.filter("camera", "encoder"), one))
+    for kind, by in (("white", ", errors white"), ("one", ", errors of one time"), ("episodes", "")):
+        model = arm.filter("camera", "encoder", kind=kind)
+        add("camera, encoders, 1 Hz", "filter" + by, partial(run, model))
     data["encoder_observed"] = dark["encoder_observed"] = encoders(data, 5.0)["encoder_observed"]
     add("encoders, 0.2 Hz", "last reading", lambda one: (held(one, "encoder", start), None), False)
     add("encoders, 0.2 Hz", "filter", lambda one: run(arm.filter("encoder"), one), False)

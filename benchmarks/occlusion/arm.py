@@ -24,7 +24,7 @@ from benchmarks.g1.together import LEVEL, RATE, SIZE, Arm, Together, run, unfore
 from torch_denkf import EKF
 from torch_denkf.envs import OccludingBox
 from torch_denkf.functional import crps_gaussian
-from torch_denkf.modules import ConstantNoise, DiagonalNoise, LearnedTransition, MappedNoise, Select, Visibility
+from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, Select, Visibility
 from torch_denkf.objectives import SensorLoss
 from torch_denkf.training import hold_last
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
@@ -37,7 +37,7 @@ COPIES = 4  # of each training episode, with boxes at other times
 class Behind(Together):
     """A real arm behind a box."""
 
-    width: float = 0.36  # of the box, in widths of the picture; its height is as much
+    widths: tuple[float, ...] = (0.36, 0.7)  # of a box, in widths of the picture; its height is as much
     updates: int = 600  # of what filters learn from single frames
 
 
@@ -47,17 +47,17 @@ class Box:
     Args:
         arm: the arm, its camera and its motion.
         study: the study.
+        width: of the box.
     """
 
-    def __init__(self, arm: Arm, study: Behind):
-        self.arm, self.study = arm, study
-        height, width = study.size
-        self.side = (study.width * width / height, study.width)
+    def __init__(self, arm: Arm, study: Behind, width: float):
+        self.arm, self.study, self.width = arm, study, width
+        self.side = (min(width * study.size[1] / study.size[0], 1.0), width)
 
     def readings(self, role: str, copies: int = 1) -> TensorDict:
         """What the camera reads ``[N * copies, T]``; ``"visible"`` is 0 behind the box, NaN where it may see a part."""
         arm, study = self.arm, self.study
-        file = study.out / "codes" / f"{arm.sensor.name}-{role}-behind-{study.width}.pt"
+        file = study.out / "codes" / f"{arm.sensor.name}-{role}-behind-{self.width}.pt"
         codes = torch.cat([arm.codes(role)] * copies)
         if not file.exists():
             write_checkpoint(file, self._hide(codes.clone(), role, copies))
@@ -65,13 +65,7 @@ class Box:
         codes["code"] = torch.where(hidden["boxed"].unsqueeze(-1), hidden["code"], codes["code"])
         out = arm.read(codes)
         out["boxed"], out["visible"] = hidden["boxed"].unsqueeze(-1), hidden["visible"].unsqueeze(-1)
-        out["observed"] = out.pop("camera_observed")
         return out
-
-    @property
-    def features(self) -> int:
-        """Of the camera's encoding."""
-        return encoding_size(self.arm.sensor.trained[0])
 
     @cached_property
     def away(self) -> tuple[Damped, MappedNoise]:
@@ -81,24 +75,22 @@ class Box:
         return motion, unforeseen(motion, pairs)
 
     def filter(self, *knows: str) -> EKF:
-        """A filter of the camera that knows some of ``"errors last"``, ``"noise"``, ``"visibility"`` and ``"home"``."""
+        """A filter of the camera that knows some of ``"errors last"``, ``"visibility"`` and ``"home"``."""
         arm, initial = self.arm, self.arm.start()
-        bias, white = arm.camera
-        if "errors last" not in knows:
-            white = (white.square() + bias.std.square().unflatten(0, (-1, SIZE)).sum(0)).sqrt()
-        features = {"in_features": self.features, "num_cells": (16,), "in_key": "encoding"}
-        noise = DiagonalNoise(SIZE, r=white, **features) if "noise" in knows else ConstantNoise(white, in_key="camera")
+        bias, white = arm.errors("camera", "episodes" if "errors last" in knows else "white")
         motion, q = (arm.motion, arm.noise) if "home" in knows else self.away
         return EKF(
             LearnedTransition(motion, residual=False),
             None,
             Select(list(range(SIZE))),
-            noise,
+            ConstantNoise(white, in_key="camera"),
             process_noise=q,
             initial=initial,
             observation_key="camera",
-            sensor_error=bias if "errors last" in knows else None,
-            visibility=Visibility(self.features, encoding_key="encoding") if "visibility" in knows else None,
+            sensor_error=bias,
+            visibility=Visibility(encoding_size(arm.sensor.trained[0]), encoding_key="encoding")
+            if "visibility" in knows
+            else None,
         )
 
     @torch.no_grad()
@@ -145,26 +137,20 @@ class Damped(nn.Module):
 
 
 def fit(filter: EKF, train: TensorDict, chosen: TensorDict, updates: int) -> None:
-    """Trains what a filter says of single frames; of what it was on the way, the best on other episodes is kept."""
-    terms = {"noise": float("noise" in filter.module), "visible": float("visibility" in filter.module)}
-    learned = [filter[name] for name in ("noise", "visibility") if name in filter.module]
-    loss = SensorLoss(filter, sensor=0.0, **terms)
-    loss.set_keys(sensor="camera")
-    parameters = [p for module in learned for p in module.parameters()]
-    if not parameters:
-        return
-    optimiser = torch.optim.AdamW(parameters, 2e-3, weight_decay=0.1)
+    """Trains the head on single frames; of what it was on the way, the best on other episodes is kept."""
+    loss, learned = SensorLoss(filter, sensor=0.0, visible=1.0), filter["visibility"]
+    optimiser = torch.optim.AdamW(learned.parameters(), 2e-3, weight_decay=0.1)
     best, kept = math.inf, None
     for update in range(updates):
         if update % 20 == 0:
             with torch.no_grad():
-                now = sum(float(value) for value in loss(chosen).values())
+                now = float(loss(chosen)["loss_visible"])
             if now < best:
-                best, kept = now, deepcopy(filter.state_dict())
+                best, kept = now, deepcopy(learned.state_dict())
         optimiser.zero_grad()
-        sum(loss(train[torch.randint(len(train), (512,))]).values()).backward()
+        loss(train[torch.randint(len(train), (512,))])["loss_visible"].backward()
         optimiser.step()
-    filter.load_state_dict(kept)
+    learned.load_state_dict(kept)
 
 
 def cells(mean: Tensor, std: Tensor | None, data: TensorDict) -> list[str]:
@@ -186,47 +172,69 @@ def cells(mean: Tensor, std: Tensor | None, data: TensorDict) -> list[str]:
     return out
 
 
-KNOWS = {
-    "nothing": (),
-    "home": ("home",),
-    "home, noise": ("home", "noise"),
-    "home, errors last": ("home", "errors last"),
-    "home, visibility": ("home", "visibility"),
-    "errors last, visibility": ("errors last", "visibility"),
-    "home, errors last, visibility": ("home", "errors last", "visibility"),
-}
+#: What a filter knows of the arm and of its camera.
+KNOWS = (
+    (),
+    ("home",),
+    ("errors last",),
+    ("home", "errors last"),
+    ("home", "errors last", "visibility"),
+)
 
 
-def main() -> None:
-    """Trains what is learned, and writes the table."""
-    study = parse(Behind)
-    torch.set_num_threads(1)
-    box = Box(Arm(study), study)
+def table(box: Box) -> list[str]:
+    """Trains what is learned, and tests."""
+    study, arm = box.study, box.arm
     train, chosen, test = box.readings("tune", COPIES), box.readings("validation", COPIES), box.readings("test")
-    seen = train["encoding"][train["observed"].squeeze(-1)]
+    seen = train["encoding"][train["camera_observed"].squeeze(-1)]
     loc, scale = seen.mean(0), seen.std(0).clamp_min(1e-3)
     for data in (train, chosen, test):
         data["encoding"] = standardised(data["encoding"], loc, scale)
+        data["observed"] = data["camera_observed"]
     frames = [data[data["observed"].squeeze(-1)] for data in (train, chosen)]
-    lines = head(
-        "knows", *(f"{when}: {what}" for when in ("seen", "box", "after") for what in ("error", "held", "CRPS"))
-    )
+    columns = (f"{when}: {what}" for when in ("seen", "box", "after") for what in ("error", "held", "CRPS"))
+    lines = head("the filter knows", *columns)
 
     def add(name: str, mean: Tensor, std: Tensor | None) -> None:
         lines.append(line(name, *cells(mean, std, test)))
         print(lines[-1], flush=True)
 
-    start = box.arm.start().mean[:SIZE]
-    add("reading, held", hold_last(test["camera"], test["observed"], start.expand_as(test["camera"][:, 0])), None)
-    for name, knows in KNOWS.items():
+    start = arm.start().mean[:SIZE]
+    add("(last reading)", hold_last(test["camera"], test["observed"], start.expand_as(test["camera"][:, 0])), None)
+    for knows in KNOWS:
         torch.manual_seed(study.seed)
         filter = box.filter(*knows)
-        fit(filter, *frames, study.updates)
-        add(name, *run(filter, test))
-    told = test.copy()
-    told["observed"] = test["observed"] & ~test["boxed"]
-    add("home, errors last, told of the box", *run(box.filter("home", "errors last"), told))
-    write_page("\n".join([*lines, "", *made_by("occlusion.arm"), ""]), study.page)
+        if "visibility" in knows:
+            fit(filter, *frames, study.updates)
+        add(", ".join(knows) or "nothing", *run(filter, test))
+    with torch.no_grad():
+        for data in (train, chosen, test):
+            sees = filter["visibility"](data.select("encoding"))["sensor", "visible"] > 0.5
+            data["behind"] = data["camera"]
+            data["behind_observed"] = data["observed"] & ~sees
+            data["camera_observed"] = data["observed"] & sees
+    lasts = "home, errors last"
+    add(f"{lasts}, no reading where the head sees a box", *run(arm.filter("camera"), test))
+    boxed = test["boxed"] & test["observed"]
+    found = [100 * test["behind_observed"][at].float().mean() for at in (boxed, test["observed"] & ~boxed)]
+    told = test.copy().set("camera_observed", test["observed"] & ~boxed)
+    add(f"{lasts}, told: no reading where the box is", *run(arm.filter("camera"), told))
+    arm.unseen = [train, chosen]
+    add(f"{lasts}, other ones where the head sees a box", *run(arm.filter("camera", "behind"), test))
+    says = (
+        f"The head sees a box in {found[0]:.0f} % of the frames that have one, and in {found[1]:.0f} % of the others."
+    )
+    return [*lines, "", says]
+
+
+def main() -> None:
+    """Writes the tables."""
+    study = parse(Behind)
+    torch.set_num_threads(1)
+    lines = []
+    for width in study.widths:
+        lines += [f"**A box of {width:.0%} of the picture's width**", "", *table(Box(Arm(study), study, width)), ""]
+    write_page("\n".join([*lines, *made_by("occlusion.arm"), ""]), study.page)
 
 
 if __name__ == "__main__":
