@@ -20,7 +20,7 @@ from benchmarks.common.tables import head, line, write_page
 from benchmarks.g1.readings import standardised
 from benchmarks.g1.recordings import ARM as JOINTS
 from benchmarks.g1.sensors import code_of, encoding_size
-from benchmarks.g1.together import LEVEL, RATE, SIZE, Arm, Together, run, unforeseen
+from benchmarks.g1.together import LEVEL, RATE, SIZE, Arm, Together, run, scored, unforeseen
 from torch_denkf import EKF
 from torch_denkf.envs import OccludingBox
 from torch_denkf.functional import crps_gaussian
@@ -155,8 +155,7 @@ def fit(filter: EKF, train: TensorDict, chosen: TensorDict, updates: int) -> Non
 
 def cells(mean: Tensor, std: Tensor | None, data: TensorDict) -> list[str]:
     """Errors, intervals and CRPS while the hand is seen, while a box is before it, and in the second after."""
-    boxed, valid = data["boxed"].squeeze(-1), data["valid"].squeeze(-1).clone()
-    valid[:, 0] = False
+    boxed, valid = data["boxed"].squeeze(-1), scored(data)
     after = torch.zeros_like(boxed)
     for back in range(1, RATE + 1):
         after[:, back:] |= boxed[:, :-back]
