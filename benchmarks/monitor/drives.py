@@ -163,6 +163,14 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
     return shortest_spans(TensorDict({"state": spans[0]["state"], "spans": TensorDict(values, size)}, size[:1]))
 
 
+def from_truth(reading: TensorDict) -> TensorDict:
+    """Readings ``[N]`` that begin at the true pose."""
+    row = reading.copy()
+    row["start"] = row["state"].clone()
+    row["start"][0] = first_state(row)
+    return mark_start(row)
+
+
 @torch.no_grad()
 def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed: int = 0) -> list[TensorDict]:
     """Beliefs on readings ``[N]`` each, ``[draws, N]``, from the true pose on; those of one length run side by side."""
@@ -171,12 +179,7 @@ def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed
         groups[len(reading)].append(place)
     out: dict[int, TensorDict] = {}
     for places in groups.values():
-        rows = []
-        for place in places:
-            row = readings[place].copy()
-            row["start"] = row["state"].clone()
-            row["start"][0] = first_state(row)
-            rows.append(mark_start(row))
+        rows = [from_truth(readings[place]) for place in places]
         keys = set.intersection(*(set(row.keys(True, True)) for row in rows))
         batch = TensorDict.stack([row.select(*keys) for row in rows for _ in range(draws)])
         torch.manual_seed(seed)

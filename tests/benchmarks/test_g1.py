@@ -17,6 +17,7 @@ from benchmarks.g1.scores import blackout, scores
 from benchmarks.g1.sensors import Statistics, code_of, encoding_size, paper_sensor, read_code
 from benchmarks.g1.tables import COLUMNS, markdown, named
 from benchmarks.g1.targets import ARM, HAND
+from benchmarks.g1.together import encoders, lagged
 from benchmarks.g1.training import run_filter
 from torch_denkf.data import LeRobotReplay
 from torch_denkf.fusion import FusedFilter, FusedSensor
@@ -321,3 +322,17 @@ def test_table_reads_back_and_is_written(tmp_path):
     assert back[1]["elbow_deg"] == pytest.approx(math.degrees(0.01), rel=1e-3)
     page = markdown(back, "made")
     assert "0.57 / 100 %" in page  # the mean of 0, 0.57 and 1.15 degrees
+
+
+def test_the_last_commands_stand_side_by_side():
+    rows = lagged(torch.arange(20.0).unsqueeze(-1).expand(-1, 7))
+    assert rows[9, ::7].tolist() == [9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0]
+    assert rows.shape == (20, 57)
+    assert rows[1, ::7].tolist() == [1.0, *[0.0] * 7, 1.0]
+
+
+def test_encoders_are_read_when_they_are_due():
+    data = TensorDict({"state": torch.ones(2, 100, 7), "valid": torch.ones(2, 100, 1).bool()}, [2, 100])
+    out = encoders(data, 1.0)
+    assert out["encoder_observed"][0].flatten().nonzero().flatten().tolist() == [0, 30, 60, 90]
+    assert (out["encoder"] - 1).rad2deg().std().item() == pytest.approx(0.1, rel=0.1)

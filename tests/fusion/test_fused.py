@@ -3,8 +3,10 @@
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
+from scipy.linalg import block_diag
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
@@ -24,6 +26,7 @@ from torch_denkf.modules import (
     EKFAnalysis,
     EKFTransition,
     EnsembleAnalysis,
+    FadingBias,
     GaussianPrior,
     LearnedObservation,
     LearnedTransition,
@@ -549,6 +552,74 @@ def test_covariances_of_readings_side_by_side(float64):
     assert_close(outs[0]["belief", "mean"], outs[1]["belief", "mean"], rtol=0, atol=1e-10)
 
 
+def with_lasting_errors(members=None, *, joint=False, delay=0):
+    """Two sensors of the linear system, each with lasting errors, around one that has none."""
+    F, Q, H, R = linear_system()
+    sensors = {
+        "first": FusedSensor(
+            LinearObservation(H[:1]), R[:1].sqrt(), sensor_error=FadingBias([0.8], 6.0, trainable=False)
+        ),
+        "wheel": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
+        "second": FusedSensor(
+            LinearObservation(H[1:]), R[1:].sqrt(), delay=delay, sensor_error=FadingBias([1.5], 1e6, trainable=False)
+        ),
+    }
+    cov = torch.diag(torch.tensor([1.0, 2.0]))
+    if members is None:
+        noise, initial = known_noise(), MomentPrior(torch.tensor([1.0, -1.0]), cov)
+    else:
+        noise, initial = Q.diagonal().sqrt(), GaussianPrior([1.0, -1.0], cov.diagonal().sqrt(), ensemble_size=members)
+    return FusedFilter(NoisyLinear(F), sensors, initial=initial, process_noise=noise, joint=joint)
+
+
+def lasting_errors_in_numpy(frames, Q):
+    """Mean and covariance of a textbook Kalman filter whose state ends with both errors; predict, then update."""
+    F, _, H, R = (value.numpy() for value in linear_system())
+    decay = np.exp([-1 / 6, -1e-6])
+    f = block_diag(F, np.diag(decay))
+    q = block_diag(Q.numpy(), np.diag(np.array([0.8, 1.5]) ** 2 * (1 - decay**2)))
+    rows = [("first", [*H[0], 1, 0], R[0]), ("wheel", [*H[0], 0, 0], R[0]), ("second", [*H[1], 0, 1], R[1])]
+    means, covs = [], []
+    for run in frames:
+        mean, cov = np.array([1.0, -1.0, 0, 0]), np.diag([1.0, 2.0, 0.64, 2.25])
+        for t, frame in enumerate(run):
+            if t:
+                mean, cov = f @ mean, f @ cov @ f.T + q
+            for name, h, r in rows:
+                if frame[f"{name}_observed"]:
+                    h = np.array(h)
+                    gain = cov @ h / (h @ cov @ h + r)
+                    mean, cov = mean + gain * (frame[name].item() - h @ mean), cov - np.outer(gain, h @ cov)
+        means.append(mean)
+        covs.append(cov)
+    return torch.tensor(np.stack(means)), torch.tensor(np.stack(covs))
+
+
+def lasting_readings():
+    frames = readings()
+    frames["wheel"], frames["wheel_observed"] = frames["first"] + 0.3, frames["second_observed"]
+    return frames
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("delay", [0, DELAY])
+def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, joint, delay):
+    frames, late = lasting_readings(), torch.full((T,), delay)
+    mean, cov = lasting_errors_in_numpy(arrived(frames, late, T - 1), linear_system()[1])
+    out = with_lasting_errors(joint=joint, delay=delay).sequence(arriving(frames, late))["belief"][:, -1]
+    assert_close(out["mean"], mean, rtol=0, atol=1e-9)
+    assert_close(out["cov"], cov, rtol=0, atol=1e-9)
+
+
+def test_errors_that_last_in_an_ensemble(float64):
+    frames = lasting_readings()
+    mean, cov = lasting_errors_in_numpy(frames, linear_system()[1].diagonal().diag())
+    torch.manual_seed(0)
+    out = with_lasting_errors(20000).sequence(frames)["belief"][:, -1]
+    assert_close(out["mean"], mean, rtol=0, atol=0.03)
+    assert_close(out["var"], cov.diagonal(dim1=-2, dim2=-1), rtol=0.05, atol=0)
+
+
 def test_what_is_refused():
     F, Q, H, R = linear_system(torch.float32)
     moments, members = MomentPrior(torch.zeros(2), torch.eye(2)), GaussianPrior([0.0] * 2, [1.0] * 2, ensemble_size=4)
@@ -574,6 +645,9 @@ def test_what_is_refused():
         FusedFilter(NoisyLinear(F), {"a": FusedSensor(LinearObservation(H), R, late_key="age")}, initial=members)
     with pytest.raises(TypeError, match="carries a past already"):
         FixedLag(FusedFilter(LinearTransition(F, Q), one, initial=moments, lag=3), 2)
+    lasting = {"a": FusedSensor(LinearObservation(H), R, sensor_error=FadingBias([1.0] * 2, 5.0))}
+    with pytest.raises(ValueError, match="needs a transition of ensembles"):
+        FusedFilter(LinearTransition(F, Q), lasting, initial=moments)
     own = {"a": FusedSensor(LinearObservation(H), R, analysis=EKF)}
     with pytest.raises(ValueError, match="analysis of their own"):
         FusedFilter(NoisyLinear(F), own, initial=members, joint=True)

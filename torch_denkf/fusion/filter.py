@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Unpack
 
@@ -15,6 +16,7 @@ from torch_denkf.filters.base import Filter
 from torch_denkf.filters.options import FilterOptions
 from torch_denkf.fusion._updates import Updates
 from torch_denkf.fusion.joint_moments import JOINT_PAST, JointForecast, PresentOfJoint, joint_space
+from torch_denkf.fusion.parts import OfOwnErrors
 from torch_denkf.fusion.sensor import FusedSensor, wire
 from torch_denkf.modules import (
     EKFAnalysis,
@@ -29,6 +31,7 @@ from torch_denkf.modules import (
 from torch_denkf.modules._ensemble import EnsembleUpdate
 from torch_denkf.modules._gaussian import GaussianAnalysis, GaussianTransition
 from torch_denkf.modules._running import check_module, declared, writes
+from torch_denkf.modules.bias import biased_parts
 from torch_denkf.smoothers.past import ENSEMBLE_PAST, EnsemblePast, LaggedBelief, with_past
 from torch_denkf.smoothers.past_moments import CrossTransition
 
@@ -79,7 +82,8 @@ class FusedFilter(Filter):
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
-            twice, or an analysis inflates or relaxes where that is refused.
+            twice, an analysis inflates or relaxes where that is refused, or a sensor has errors that last and the
+            transition moves a mean and a covariance.
         TypeError: for particles, sensors that are no dict, or an analysis that cannot correct earlier states.
 
     Example:
@@ -118,6 +122,7 @@ class FusedFilter(Filter):
             raise ValueError("FusedFilter needs at least one sensor: sensors={name: FusedSensor(...)}.")
         gaussian = _is_gaussian(initial)
         lag = _lag_of(sensors, lag)
+        transition, process_noise, initial, sensors = _with_errors(transition, process_noise, initial, sensors)
         transition = _moving(transition, process_noise, initial, gaussian)
         modules: OrderedDict[str, TensorDictModuleBase] = OrderedDict()
         wired = {}
@@ -189,6 +194,28 @@ def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
     if lag is not None and lag < longest:
         raise ValueError(f"A reading comes up to {longest} steps late, beyond lag={lag}.")
     return longest if lag is None else lag
+
+
+def _with_errors(transition, process_noise, initial, sensors):
+    """Transition, process noise, initial belief and sensors of the state with the sensors' lasting errors behind it."""
+    total = sum(len(sensor.sensor_error) for sensor in sensors.values() if sensor.sensor_error is not None)
+    if not total:
+        return transition, process_noise, initial, sensors
+    if isinstance(transition, LinearTransition | GaussianTransition):
+        raise ValueError(
+            f"sensor_error needs a transition of ensembles and process_noise=...; {type(transition).__name__} moves a "
+            "mean and a covariance. LearnedTransition(torch.nn.Linear(...), residual=False) is a linear one."
+        )
+    made, begin = {}, 0
+    for name, sensor in sensors.items():
+        observation, end = sensor.observation, begin
+        if sensor.sensor_error is not None:
+            parts = biased_parts(sensor.sensor_error, transition, observation, process_noise, initial)
+            transition, observation, process_noise, initial = parts
+            end += len(sensor.sensor_error)
+        made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))
+        begin = end
+    return transition, process_noise, initial, made
 
 
 def _moving(transition, process_noise, initial, gaussian):

@@ -17,7 +17,7 @@ from torch_denkf.modules._call import Call, Entries
 from torch_denkf.modules._running import check_module, marks_of, reads, run_module, writes
 from torch_denkf.modules.carried import InPlaceOf
 
-__all__ = ["JoinedObservation", "JoinedReading", "Renamed", "StateObservation"]
+__all__ = ["JoinedObservation", "JoinedReading", "OfOwnErrors", "Renamed", "StateObservation"]
 
 
 class Renamed(InPlaceOf):
@@ -54,6 +54,33 @@ class Renamed(InPlaceOf):
         inside.update({key: entries[name] for key, name in self.names.items() if name in entries})
         written = run_module(self.module, inside, call)
         return {self.names.get(key, key): value for key, value in written.items()}
+
+
+class OfOwnErrors(InPlaceOf):
+    """An observation model of one sensor, of a state that holds the lasting errors of several behind its system.
+
+    Args:
+        observation: of the system, and of the sensor's own errors behind it, where it has some.
+        own: numbers of these among all errors.
+        total: how many errors the state holds.
+    """
+
+    def __init__(self, observation: TensorDictModuleBase, own: Sequence[int], total: int):
+        check_module("observation", observation)
+        needed, optional = reads(observation)
+        super().__init__(observation, needed, observation.out_keys, optional_keys=optional)
+        self.own, self.total = list(own), total
+
+    def noise_sizes(self, *values):
+        """Those of the model inside."""
+        return self.module.noise_sizes(*values)
+
+    def on_entries(self, entries, call):
+        """The predicted observations."""
+        key = unravel_key(self.in_keys[0])
+        system, errors = self.required(entries, key).tensor_split([-self.total], -1)
+        state = torch.cat([system, errors[..., self.own]], -1)
+        return run_module(self.module, {**entries, key: state}, call)
 
 
 class StateObservation(InPlaceOf):

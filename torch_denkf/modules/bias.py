@@ -79,7 +79,9 @@ class FadingBias(nn.Module):
                 self.register_buffer(name, value.clone())
 
     @classmethod
-    def from_residuals(cls, residuals: Tensor, *, trainable: bool = True) -> tuple[FadingBias, Tensor]:
+    def from_residuals(
+        cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
+    ) -> tuple[FadingBias, Tensor]:
         r"""The biases that explain how long a sensor's errors last, and what is left: white noise.
 
         The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
@@ -91,9 +93,12 @@ class FadingBias(nn.Module):
             residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
                 was not trained on; NaN where there is none. Their mean is not taken off.
             trainable: see the class.
+            per_run: whether the errors also have a part that is the same for a whole run, as those of a learned sensor
+                in new surroundings have. There are then 2 K biases, K that last 100 times as long as a run and K that
+                fade. It takes about ten runs. One time for both kinds fits neither.
 
         Returns:
-            K biases; and the standard deviations of the white part ``[K]``, for the noise of the reading.
+            K biases, or 2 K; and the standard deviations of the white part ``[K]``, for the noise of the reading.
 
         Raises:
             ValueError: if the shape is another, a component has fewer than 100 pairs of neighbours, or its errors do
@@ -114,8 +119,10 @@ class FadingBias(nn.Module):
             raise ValueError(f"residuals must be [N, T, K], T at least 3; got {list(residuals.shape)}")
         values = residuals.detach().double()
         known = ~values.isnan()
-        found = [_fit(*_autocovariance(values[..., k], known[..., k]), k) for k in range(values.shape[-1])]
-        std, time, white = (residuals.new_tensor(column) for column in zip(*found, strict=True))
+        found = [_fit(*_autocovariance(values[..., k], known[..., k]), k, per_run) for k in range(values.shape[-1])]
+        std, time, white, whole = (residuals.new_tensor(column) for column in zip(*found, strict=True))
+        if per_run:
+            std, time = torch.cat([whole, std]), torch.cat([torch.full_like(time, 100.0 * values.shape[1]), time])
         return cls(std, time, trainable=trainable), white
 
     def __len__(self) -> int:
@@ -385,24 +392,34 @@ def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(products) / count.clamp_min(1), count
 
 
-def _fit(covariance: Tensor, count: Tensor, component: int) -> tuple[float, float, float]:
-    """Standard deviation and time of the lasting part, and the standard deviation of the white one."""
+def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tuple[float, float, float, float]:
+    """Standard deviation and time of the fading part, standard deviations of the white and of a run's part."""
     if count[1] < 100:
         raise ValueError(f"component {component} has {int(count[1])} pairs of neighbouring residuals; it takes 100")
     longest = len(covariance)
-    times = torch.logspace(math.log10(0.5), math.log10(100 * longest), 2000, dtype=torch.double)
-    lags, size, last = torch.arange(longest, dtype=torch.double), 0.0, longest
-    for _ in range(3):
+    # What fades more slowly than half a run cannot be told from what is the same for all of it.
+    slowest = longest / 2 if per_run else 100 * longest
+    times = torch.logspace(math.log10(0.5), math.log10(slowest), 2000, dtype=torch.double)
+    lags, size, whole, last = torch.arange(longest, dtype=torch.double), 0.0, 0.0, longest
+    for _ in range(1 if per_run else 3):
         shape = torch.exp(-lags[1:last] / times.unsqueeze(-1))
-        weight, seen = count[1:last], covariance[1:last]
+        weight = count[1:last] / count[1:last].sum()
+        level, seen = torch.zeros_like(times), covariance[1:last].expand(len(times), -1)
+        if per_run:  # the least squares of both parts, or of what fades alone where the other would be negative
+            middle, mean = (weight * shape).sum(-1), (weight * seen).sum(-1)
+            centred = shape - middle.unsqueeze(-1)
+            sizes = ((weight * centred * seen).sum(-1) / (weight * centred.square()).sum(-1)).clamp_min(0)
+            level = (mean - sizes * middle).clamp_min(0)
+            seen = seen - level.unsqueeze(-1)
         sizes = ((weight * shape * seen).sum(-1) / (weight * shape.square()).sum(-1)).clamp_min(0)
         best = (weight * (seen - sizes.unsqueeze(-1) * shape).square()).sum(-1).argmin()
-        size, time = float(sizes[best]), float(times[best])
+        size, time, whole = float(sizes[best]), float(times[best]), float(level[best])
         last = min(longest, max(4, math.ceil(3 * time) + 1))  # later lags are of chance alone
     # Within three standard errors of what white noise shows from one step to the next there is nothing to estimate.
-    if not size * math.exp(-1 / time) > 3 * float(covariance[0]) / math.sqrt(float(count[1])):
+    if not size * math.exp(-1 / time) + whole > 3 * float(covariance[0]) / math.sqrt(float(count[1])):
         raise ValueError(f"the residuals of component {component} do not last: take them for white noise")
-    return math.sqrt(size), time, math.sqrt(max(float(covariance[0]) - size, 1e-6 * size))
+    least, white = 1e-6 * (size + whole), float(covariance[0]) - size - whole
+    return math.sqrt(max(size, least)), time, math.sqrt(max(white, least)), math.sqrt(max(whole, least))
 
 
 def _split(state: Tensor, bias: FadingBias, module: nn.Module) -> tuple[Tensor, Tensor]:
