@@ -7,9 +7,6 @@ from tensordict import TensorDict
 
 from torch_denkf.filters import EKF, UKF, DEnKF, KalmanFilter
 from torch_denkf.modules import (
-    BiasedNoise,
-    BiasedObservation,
-    BiasedTransition,
     CholeskyNoise,
     ConstantNoise,
     EnsembleAnalysis,
@@ -21,6 +18,7 @@ from torch_denkf.modules import (
     NoisyTransition,
     Select,
 )
+from torch_denkf.modules.bias import BiasedNoise, BiasedObservation, BiasedTransition
 
 Q, R, STEPS = 0.02, 0.3, 40  # standard deviations: of the rate in a step, of the reading's white error
 STD, TIME = [0.8, 0.5], [3.0, 20.0]  # of a fast bias and a slow one, of the same reading

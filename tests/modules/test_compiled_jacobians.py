@@ -14,8 +14,6 @@ from torch_denkf.applications.car.modules.pairs import ClonedTransition, PairObs
 from torch_denkf.fusion.parts import JoinedObservation, StateObservation
 from torch_denkf.inductor import options_for_processors
 from torch_denkf.modules import (
-    BiasedObservation,
-    BiasedTransition,
     ConstantNoise,
     ContinuousMotion,
     EKFAnalysis,
@@ -31,6 +29,7 @@ from torch_denkf.modules import (
     run_module,
 )
 from torch_denkf.modules._call import Call
+from torch_denkf.modules.bias import BiasedObservation, BiasedTransition
 
 B, S = 3, 9  # the unicycle's five and two steps of its past; or three times three numbers
 SEEN = ("forecast", "observed")

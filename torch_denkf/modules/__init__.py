@@ -7,7 +7,7 @@ from torch_denkf.modules._base import SubModel
 from torch_denkf.modules._running import reads, run_module
 from torch_denkf.modules.analysis import EnsembleAnalysis
 from torch_denkf.modules.belief import AroundState, FromSensor, GaussianPrior
-from torch_denkf.modules.bias import BiasedNoise, BiasedObservation, BiasedTransition, FadingBias
+from torch_denkf.modules.bias import FadingBias
 from torch_denkf.modules.check import check_analysis
 from torch_denkf.modules.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond
 from torch_denkf.modules.ekf import EKFAnalysis, EKFTransition
@@ -60,9 +60,6 @@ __all__ = [
     "CholeskyNoise",
     "MappedNoise",
     "FadingBias",
-    "BiasedTransition",
-    "BiasedNoise",
-    "BiasedObservation",
     "as_process_noise",
     "EKFTransition",
     "EKFAnalysis",
