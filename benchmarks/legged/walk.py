@@ -22,6 +22,7 @@ EVERY = 5  # rows of 0.01 s for which an action holds
 PACE, LIFT = 1.5, 0.4  # strides a second; by how much a leg that swings is lifted
 NOMINAL = 0.4  # m of stride for each m/s that is commanded: what the gait needs at a friction of 0.5
 LIMIT = (0.15, 0.15, 0.15)  # of what an action adds: forwards and to the left in m, turn in rad
+MOTOR, STRENGTH, LOAD = 1000.0, (0.8, 2.5), (0.0, 40.0)  # stiffness in Nm; factors on it; kg on the robot's back
 FASTEST = (0.35, 0.2)  # of commands, m/s
 WIDTH = 0.15  # m/s off at which the reward falls to 1 / e
 _ANGLES = math.pi / 4 * torch.tensor([1.0, -1.0, -3.0, 3.0])  # of the legs: front left, front right, back right, left
@@ -60,7 +61,7 @@ class Walk(EnvBase):
     def __init__(self, count: int, ground: Ground, seed: int):
         super().__init__(batch_size=[count])
         self.ground, self.robots = ground, [quadruped_env(seed=1000 * seed + number) for number in range(count)]
-        self.dt = self.robots[0].dt
+        self.dt, self.mass = self.robots[0].dt, float(self.robots[0].model.body_mass[1])
         spec = self.robots[0].observation_spec.expand(count)
         more = {"command": Unbounded((count, 2)), "phase": Unbounded((count, 2))}
         self.observation_spec = Composite({**dict(spec.items()), **more}, shape=[count])
@@ -72,11 +73,14 @@ class Walk(EnvBase):
         self.random = np.random.default_rng(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
-        for robot in self.robots:
-            low, high = (math.log(each) for each in self.ground.friction)
-            robot.model.geom_friction[:, 0] = math.exp(self.random.uniform(low, high))
-            robot.model.geom_solref[:, 0] = self.random.uniform(*self.ground.softness)
         count = len(self.robots)
+        for robot in self.robots:
+            model, draw = robot.model, self.random.uniform
+            model.geom_friction[:, 0] = math.exp(draw(*map(math.log, self.ground.friction)))
+            model.geom_solref[:, 0] = draw(*self.ground.softness)
+            model.actuator_gainprm[:, 0] = MOTOR * math.exp(draw(*map(math.log, STRENGTH)))
+            model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+            model.body_mass[1] = self.mass + draw(*LOAD)
         self.row, self.until = 0, np.zeros((count, 2), dtype=int)  # when command and force change
         self.command, self.pull = torch.zeros(count, 2), self.random.uniform(*self.ground.pushes, count)
         return self._with_command(torch.stack([robot._reset() for robot in self.robots]))
