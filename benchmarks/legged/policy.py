@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import torch
@@ -21,6 +22,7 @@ from benchmarks.common.arguments import made_by, parse
 from benchmarks.common.tables import head, line, write_page
 from benchmarks.control.arms import Arm, Inputs
 from benchmarks.control.ppo import PPO, Settings
+from benchmarks.legged.pictures import Camera
 from benchmarks.legged.task import ROWS, Ground, Robot
 from benchmarks.legged.training import LSTM, VAR, VELOCITY, trained_lstm
 from benchmarks.legged.walk import EVERY, FASTEST, Walk, acted, play, up_of
@@ -29,6 +31,7 @@ from torch_denkf.applications.legged import QUADRUPED, LearnedContacts, legged_f
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.functional.manifolds import rotate
+from torch_denkf.plots import write_video
 from torch_denkf.transforms import DEnKFTransform
 
 TRUE, INPUT = ("true", "velocity"), "input"
@@ -236,6 +239,24 @@ def tests(laboratory: Laboratory, policies: dict[str, PPO]) -> dict[str, dict[st
     return found
 
 
+def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
+    """A robot on slippery ground with the command, the true velocity, and what is believed of it."""
+    alone = Laboratory(replace(laboratory.study, robots=1))
+    env = alone.env("belief", list(GROUNDS)[1], laboratory.study.seed + 600)
+    robot, frames, rows = env.base_env.robots[0], [], count()
+    camera = Camera(robot.model, robot.data)
+
+    def watch(row: TensorDict) -> None:
+        if next(rows) % every == 0:
+            command = torch.cat([row["command"][0], torch.zeros(1)])
+            arrows = {"white": command, "limegreen": row[TRUE][0], "dodgerblue": row[VELOCITY][0]}
+            frames.append(camera.frame(arrows, row[VAR][0].sqrt()))
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        play(env, policy.policy, round(100 * laboratory.study.test_seconds), ["command"], watch)
+    write_video(laboratory.study.out / "walk.gif", frames, 100 / every)
+
+
 def page(found: dict[str, dict[str, dict[str, Tensor]]], study: Study) -> str:
     """The tables."""
     text = [
@@ -286,6 +307,7 @@ def main() -> None:
         policies[SPREAD] = laboratory.trained(SPREAD, study.spread_batches)
     found = tests(laboratory, policies)
     write_page(page(found, study), study.out / "policy.md")
+    film(laboratory, policies[TRUTH])
 
 
 if __name__ == "__main__":

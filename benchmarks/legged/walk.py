@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -122,7 +123,13 @@ def up_of(turn: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def play(env: EnvBase, policy: TensorDictModuleBase, rows: int, keep: list) -> TensorDict:
+def play(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    rows: int,
+    keep: list,
+    watch: Callable[[TensorDict], None] = lambda row: None,
+) -> TensorDict:
     """Some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
 
     Args:
@@ -130,6 +137,7 @@ def play(env: EnvBase, policy: TensorDictModuleBase, rows: int, keep: list) -> T
         policy: writes ``"action"``.
         rows: T.
         keep: keys before and after a step.
+        watch: is shown each row.
     """
     row, found = env.reset(), []
     for number in range(rows):
@@ -138,6 +146,7 @@ def play(env: EnvBase, policy: TensorDictModuleBase, rows: int, keep: list) -> T
         row = env.step(row.update(acted))
         found.append(row.select(*keep, *policy.out_keys, ("next", "reward"), *(("next", key) for key in keep)))
         row = row["next"].exclude("reward")
+        watch(row)
     return torch.stack(found, 1)
 
 
