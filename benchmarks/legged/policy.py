@@ -158,7 +158,7 @@ class Laboratory:
         with torch.no_grad():
             for name, value in agent.actor.named_parameters():
                 if name.endswith("log_std"):
-                    value.fill_(-0.7)
+                    value.fill_(-1.2)
         return agent
 
     def trained(self, arm: str, batches: int) -> PPO:
@@ -176,7 +176,8 @@ class Laboratory:
         for number in range(first, batches):
             torch.manual_seed(1000 * self.study.seed + number)
             began = time.process_time()
-            data = acted(play(env, agent.policy, round(100 * self.study.seconds), [INPUT]))
+            with set_exploration_type(ExplorationType.RANDOM):
+                data = acted(play(env, agent.policy, round(100 * self.study.seconds), [INPUT]))
             agent.update(data)
             reward, spent = data["next", "reward"].mean().item(), time.process_time() - began
             print(f"{arm}, batch {number + 1}: reward {reward:.3f}, {spent:.1f} s", flush=True)
@@ -198,7 +199,8 @@ class Laboratory:
             torch.manual_seed(number)
             env = self.env(TRUTH, next(iter(GROUNDS)), self.study.seed + 900 + number)
             keep = [*READ, "true"]
-            log = play(env, agent.policy, round(100 * self.study.seconds), keep)["next"].select(*keep)
+            with set_exploration_type(ExplorationType.RANDOM):
+                log = play(env, agent.policy, round(100 * self.study.seconds), keep)["next"].select(*keep)
             rows = slice(min(100, log.shape[1] // 2), None)
             doubtful = torch.zeros(log.shape, dtype=torch.bool)
             logs.append(Robot("quadruped", self.model, QUADRUPED, 0.01, log, rows, doubtful))

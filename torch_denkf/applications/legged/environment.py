@@ -140,7 +140,7 @@ class LeggedEnv(EnvBase):
         return readings
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self.data.ctrl[:] = tensordict["action"].numpy()
+        self.data.ctrl[:] = tensordict["action"].detach().numpy()
         if self.pushes:
             self._push()
         readings = self._move()
