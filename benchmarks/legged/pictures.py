@@ -9,10 +9,9 @@ from statistics import NormalDist
 import mujoco
 import numpy as np
 import torch
+from matplotlib.colors import to_rgba
 from tensordict import TensorDict
 from torch import Tensor
-
-from matplotlib.colors import to_rgba
 
 from benchmarks.common.plots import plt, save
 from benchmarks.legged.task import LEVEL, Robot
@@ -79,7 +78,7 @@ class Camera:
         self.renderer.update_scene(self.data, self.view)
         axes, half = np.empty(9), NormalDist().inv_cdf((1 + LEVEL) / 2)
         mujoco.mju_quat2Mat(axes, self.data.qpos[3:7])
-        start = self.data.qpos[:3] + [0.0, 0.0, 0.3]
+        start = self.data.qpos[:3] + np.array([0.0, 0.0, 0.3])
         for color, velocity in arrows.items():
             tip = start + self.LONG * axes.reshape(3, 3) @ velocity.double().numpy()
             arrow = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), start, axes, to_rgba(color))

@@ -1,14 +1,15 @@
 """A policy that was trained with the base's true velocity, and walks on what is believed of it.
 
-    python -m benchmarks.legged.policy --out runs/walk
+python -m benchmarks.legged.policy --out runs/walk
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 
 import torch
@@ -19,13 +20,13 @@ from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_explorati
 from torchrl.envs.transforms import Transform, UnaryTransform
 
 from benchmarks.common.arguments import made_by, parse
-from benchmarks.common.tables import head, line, write_page
+from benchmarks.common.tables import Columns, head, line, pick, write_page
 from benchmarks.control.arms import Arm, Inputs
 from benchmarks.control.ppo import PPO, Settings
 from benchmarks.legged.pictures import Camera
 from benchmarks.legged.task import ROWS, Ground, Robot
 from benchmarks.legged.training import LSTM, VAR, VELOCITY, trained_lstm
-from benchmarks.legged.walk import EVERY, FASTEST, Walk, acted, play, up_of
+from benchmarks.legged.walk import FASTEST, Walk, acted, play, up_of
 from torch_denkf._files import replacing
 from torch_denkf.applications.legged import QUADRUPED, LearnedContacts, legged_filter
 from torch_denkf.applications.legged.kinematics import LegKinematics
@@ -48,6 +49,13 @@ ARMS = (TRUTH, "zero", "integrated inertial sensor", "LSTM", "belief", SPREAD)
 #: What velocities in m/s, up, turns in rad/s, joints in rad, commands in m/s and the gait's phase are divided by.
 SCALE = (*[0.3] * 3, 0.2, 0.2, 1.0, *[0.5] * 3, *[0.5] * 16, 0.3, 0.2, 1.0, 1.0)
 SPREADS = (0.05,) * 3  # m/s
+SCORES = ("return", "error", "falls", "off")
+COLUMNS = Columns(
+    names=("ground", "arm", "robot", *SCORES),
+    text=("ground", "arm"),
+    whole=("robot",),
+    order=lambda row: (list(GROUNDS).index(row["ground"]), ARMS.index(row["arm"]), row["robot"]),
+)
 
 
 @dataclass(frozen=True)
@@ -223,22 +231,25 @@ def scored(data: TensorDict) -> dict[str, Tensor]:
     return {"return": data["next", "reward"].sum((1, 2)) / 100, "error": wrong, "falls": fell, "off": off}
 
 
-def tests(laboratory: Laboratory, policies: dict[str, PPO]) -> dict[str, dict[str, dict[str, Tensor]]]:
-    """Scores by ground and arm; robots, commands and forces are the same for all arms."""
-    study, found = laboratory.study, {}
-    for number, ground in enumerate(GROUNDS):
-        found[ground] = {}
-        for arm in ARMS:
-            policy = policies.get(arm, policies[TRUTH] if arm != SPREAD else None)
-            if policy is None:
-                continue
-            env = laboratory.env(arm, ground, study.seed + 500 + number)
-            torch.manual_seed(0)
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                data = play(env, policy.policy, round(100 * study.test_seconds), ["true", "command", INPUT])
-            found[ground][arm] = scored(data)
-            print(ground, arm, {key: value.mean().item() for key, value in found[ground][arm].items()}, flush=True)
-    return found
+def tested(laboratory: Laboratory, policies: dict[str, PPO]) -> list[dict]:
+    """A row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
+    study, file = laboratory.study, laboratory.study.out / "policy.csv"
+    rows = COLUMNS.read(file) if file.exists() else []
+    for (number, ground), arm in product(enumerate(GROUNDS), ARMS):
+        policy = policies.get(arm if arm == SPREAD else TRUTH)
+        if policy is None or pick(rows, ground=ground, arm=arm):
+            continue
+        env = laboratory.env(arm, ground, study.seed + 500 + number)
+        torch.manual_seed(0)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            data = play(env, policy.policy, round(100 * study.test_seconds), ["true", "command", INPUT])
+        found = scored(data)
+        print(ground, arm, {key: value.mean().item() for key, value in found.items()}, flush=True)
+        for robot in range(study.robots):
+            scores = {key: value[robot].item() for key, value in found.items()}
+            rows.append({"ground": ground, "arm": arm, "robot": robot, **scores})
+        COLUMNS.write(rows, file)
+    return rows
 
 
 def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
@@ -259,31 +270,33 @@ def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
     write_video(laboratory.study.out / "walk.gif", frames, 100 / every)
 
 
-def page(found: dict[str, dict[str, dict[str, Tensor]]], study: Study) -> str:
+def page(rows: list[dict], study: Study) -> str:
     """The tables."""
     text = [
         "# A policy that walks on the belief of its base's velocity",
         "",
-        f"The return is the sum of rewards of {study.test_seconds:g} s, {study.test_seconds:g} at most. \"Of the "
+        f'The return is the sum of rewards of {study.test_seconds:g} s, {study.test_seconds:g} at most. "Of the '
         "truth's\" is the share of the return that the same policy has on the true velocity; after it stands the "
         "standard error of the mean of the robots' differences. The velocity's error is how far the base is from its "
         "command, forwards and sideways; that of the estimate, how far what the policy reads is from the truth, all "
         "three axes. Both are root mean squares.",
     ]
     titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
-    for ground, arms in found.items():
+    for ground in GROUNDS:
         text += ["", f"## {ground.capitalize()}", "", *head(*titles)]
-        truth = arms[TRUTH]["return"]
-        for arm, scores in arms.items():
-            share = 100 * scores["return"] / truth.mean()
-            spread = (share - 100 * truth / truth.mean()).std() / math.sqrt(len(truth))
-            cells = [f"{scores['return'].mean():.2f}", f"{share.mean():.1f} ± {spread:.1f}"]
-            cells += [f"{scores[key].square().mean().sqrt():.3f}" for key in ("error", "off")]
-            text.append(line(arm, *cells, f"{scores['falls'].sum():.0f} of {len(truth)}"))
+        truth = torch.tensor([row["return"] for row in pick(rows, ground=ground, arm=TRUTH)])
+        for arm in ARMS:
+            if not (mine := pick(rows, ground=ground, arm=arm)):
+                continue
+            returned, wrong, falls, off = (torch.tensor([row[key] for row in mine]) for key in SCORES)
+            spread = ((returned - truth) / truth.mean()).std() / math.sqrt(len(truth))
+            cells = [f"{returned.mean():.2f}", f"{100 * returned.mean() / truth.mean():.1f} ± {100 * spread:.1f}"]
+            cells += [f"{each.square().mean().sqrt():.3f}" for each in (wrong, off)]
+            text.append(line(arm, *cells, f"{falls.sum():.0f} of {len(truth)}"))
     text += [
         "",
-        f"{study.robots} robots a ground, each with friction, motors, load, commands, forces and biases of its own, the "
-        f"same for all rows. One training each: {study.batches} batches of {study.robots} episodes of "
+        f"{study.robots} robots a ground, each with friction, motors, load, commands, forces and biases of its own, "
+        f"the same for all rows. One training each: {study.batches} batches of {study.robots} episodes of "
         f"{study.seconds:g} s with the true velocity, {study.spread_batches} on the belief with its spread. Commands "
         f"are up to {FASTEST[0]:g} m/s forwards and {FASTEST[1]:g} m/s sideways.",
         "",
@@ -297,19 +310,21 @@ def main() -> None:
     """Trains, tests, and writes the page and the video."""
     study = parse(Study)
     if study.smoke:
-        tiny = {"robots": 2, "seconds": 0.2, "test_seconds": 0.2, "batches": 1, "spread_batches": 1, "lstm_updates": 1}
-        study = replace(study, out=study.out.with_name(f"{study.out.name}-smoke"), **tiny)
+        tiny = {"robots": 2, "seconds": 0.1, "test_seconds": 0.1, "batches": 1, "spread_batches": 1, "lstm_updates": 1}
+        study = replace(study, out=Path(tempfile.mkdtemp()), **tiny)
     study.out.mkdir(parents=True, exist_ok=True)
     laboratory = Laboratory(study)
     policies = {TRUTH: laboratory.trained(TRUTH, study.batches)}
     laboratory.network = laboratory.lstm(policies[TRUTH])
     if not study.smoke:
         laboratory.compiled()
+    rows = tested(laboratory, policies)
     if study.spread_batches:
         policies[SPREAD] = laboratory.trained(SPREAD, study.spread_batches)
-    found = tests(laboratory, policies)
-    write_page(page(found, study), study.out / "policy.md")
-    film(laboratory, policies[TRUTH])
+        rows = tested(laboratory, policies)
+    write_page(page(rows, study), study.out / "policy.md")
+    if not study.smoke:
+        film(laboratory, policies[TRUTH])
 
 
 if __name__ == "__main__":

@@ -48,9 +48,9 @@ def gait(phase: Tensor, stride: Tensor) -> Tensor:
 class Walk(EnvBase):
     """Robots side by side, 100 rows a second. An ``"action"`` ``[3]`` in [-1, 1] adds to the strides of their gait.
 
-    Emits what each robot reads, the truth, and ``"command"`` ``[2]``, the velocity that is wanted in the base's axes, in
-    m/s, which changes every 2 to 4 s; and ``"phase"`` ``[2]``, cosine and sine, of the gait. The reward of a row is 1
-    where the base moves as commanded and does not turn. Friction and floor are drawn at the reset.
+    Emits what each robot reads, the truth, and ``"command"`` ``[2]``, the velocity that is wanted in the base's axes,
+    in m/s, which changes every 2 to 4 s; and ``"phase"`` ``[2]``, cosine and sine, of the gait. The reward of a row is
+    1 where the base moves as commanded and does not turn. Friction, floor, motors and load are drawn at the reset.
 
     Args:
         count: robots, B.

@@ -114,7 +114,8 @@ def test_scores_and_page():
         "falls": [0.0] * 3,
         "off": pytest.approx([0.5] * 3),
     }
-    half = {**found, "return": found["return"] / 2, "falls": torch.ones(3)}
-    text = page({GROUND: {TRUTH: found, "zero": half}}, Study())
+    rows = [{"ground": GROUND, "arm": TRUTH, **{key: value[0].item() for key, value in found.items()}}] * 3
+    half = [{**row, "arm": "zero", "return": 0.5, "falls": 1.0} for row in rows]
+    text = page(rows + half, Study())
     assert "| truth | 1.00 | 100.0 ± 0.0 | 0.500 | 0.500 | 0 of 3 |" in text
     assert "| zero | 0.50 | 50.0 ± 0.0 | 0.500 | 0.500 | 3 of 3 |" in text
