@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
@@ -43,9 +44,9 @@ GROUNDS = {
     "slippery, friction 0.2": Ground((0.2, 0.2), (0.01, 0.01), (0.0, 60.0)),
     "soft": Ground((0.5, 1.0), (0.05, 0.05), (0.0, 60.0)),
 }
-TRUTH, SPREAD = "truth", "belief with its spread"
-#: Where the policy that was trained with the truth gets the velocity from, and who else there is.
-ARMS = (TRUTH, "zero", "integrated inertial sensor", "LSTM", "belief", SPREAD)
+TRUTH, SPREAD, GAIT = "truth", "belief with its spread", "nothing: the gait alone"
+#: Where the policy that was trained with the truth gets the velocity from; another policy; and none.
+ARMS = (TRUTH, "belief", "LSTM", "zero", "integrated inertial sensor", SPREAD, GAIT)
 #: What velocities in m/s, up, turns in rad/s, joints in rad, commands in m/s and the gait's phase are divided by.
 SCALE = (*[0.3] * 3, 0.2, 0.2, 1.0, *[0.5] * 3, *[0.5] * 16, 0.3, 0.2, 1.0, 1.0)
 SPREADS = (0.05,) * 3  # m/s
@@ -88,7 +89,7 @@ class Reads(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         td, axes = next_tensordict, self.sensor[:4]
-        if self.arm == TRUTH:
+        if self.arm in (TRUTH, GAIT):
             up, velocity = up_of(td["true", "orientation"]), td[TRUE]
         else:
             up, velocity = rotate(axes, up_of(td["belief", "mean"][..., :4])), td[VELOCITY]
@@ -152,7 +153,7 @@ class Laboratory:
         env = TransformedEnv(Walk(self.study.robots, GROUNDS[ground], seed))
         if arm == "integrated inertial sensor":
             env.append_transform(UnaryTransform(["contact"], ["contact"], fn=torch.zeros_like))  # no foot ever stands
-        if arm != TRUTH:
+        if arm not in (TRUTH, GAIT):
             env.append_transform(DEnKFTransform(self.filter, packaged=self.step))
         if arm == "LSTM":
             env.append_transform(Estimates(self.network))
@@ -231,18 +232,18 @@ def scored(data: TensorDict) -> dict[str, Tensor]:
     return {"return": data["next", "reward"].sum((1, 2)) / 100, "error": wrong, "falls": fell, "off": off}
 
 
-def tested(laboratory: Laboratory, policies: dict[str, PPO]) -> list[dict]:
+def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) -> list[dict]:
     """A row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
     study, file = laboratory.study, laboratory.study.out / "policy.csv"
     rows = COLUMNS.read(file) if file.exists() else []
     for (number, ground), arm in product(enumerate(GROUNDS), ARMS):
-        policy = policies.get(arm if arm == SPREAD else TRUTH)
+        policy = policies.get(arm if arm in (SPREAD, GAIT) else TRUTH)
         if policy is None or pick(rows, ground=ground, arm=arm):
             continue
         env = laboratory.env(arm, ground, study.seed + 500 + number)
         torch.manual_seed(0)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            data = play(env, policy.policy, round(100 * study.test_seconds), ["true", "command", INPUT])
+            data = play(env, policy, round(100 * study.test_seconds), ["true", "command", INPUT])
         found = scored(data)
         print(ground, arm, {key: value.mean().item() for key, value in found.items()}, flush=True)
         for robot in range(study.robots):
@@ -279,7 +280,7 @@ def page(rows: list[dict], study: Study) -> str:
         "truth's\" is the share of the return that the same policy has on the true velocity; after it stands the "
         "standard error of the mean of the robots' differences. The velocity's error is how far the base is from its "
         "command, forwards and sideways; that of the estimate, how far what the policy reads is from the truth, all "
-        "three axes. Both are root mean squares.",
+        "three axes. Both are root mean squares. The gait alone takes its strides from the command, without any policy.",
     ]
     titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
     for ground in GROUNDS:
@@ -292,6 +293,7 @@ def page(rows: list[dict], study: Study) -> str:
             spread = ((returned - truth) / truth.mean()).std() / math.sqrt(len(truth))
             cells = [f"{returned.mean():.2f}", f"{100 * returned.mean() / truth.mean():.1f} ± {100 * spread:.1f}"]
             cells += [f"{each.square().mean().sqrt():.3f}" for each in (wrong, off)]
+            cells[-1] = "" if arm == GAIT else cells[-1]
             text.append(line(arm, *cells, f"{falls.sum():.0f} of {len(truth)}"))
     text += [
         "",
@@ -314,17 +316,19 @@ def main() -> None:
         study = replace(study, out=Path(tempfile.mkdtemp()), **tiny)
     study.out.mkdir(parents=True, exist_ok=True)
     laboratory = Laboratory(study)
-    policies = {TRUTH: laboratory.trained(TRUTH, study.batches)}
-    laboratory.network = laboratory.lstm(policies[TRUTH])
+    agent = laboratory.trained(TRUTH, study.batches)
+    laboratory.network = laboratory.lstm(agent)
+    still = TensorDictModule(lambda command: torch.zeros(len(command), 3), ["command"], ["action"])
+    policies = {TRUTH: agent.policy, GAIT: still}
     if not study.smoke:
         laboratory.compiled()
     rows = tested(laboratory, policies)
     if study.spread_batches:
-        policies[SPREAD] = laboratory.trained(SPREAD, study.spread_batches)
+        policies[SPREAD] = laboratory.trained(SPREAD, study.spread_batches).policy
         rows = tested(laboratory, policies)
     write_page(page(rows, study), study.out / "policy.md")
     if not study.smoke:
-        film(laboratory, policies[TRUTH])
+        film(laboratory, agent)
 
 
 if __name__ == "__main__":
