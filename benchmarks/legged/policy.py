@@ -44,7 +44,7 @@ GROUNDS = {
     "slippery, friction 0.2": Ground((0.2, 0.2), (0.01, 0.01), (0.0, 60.0)),
     "soft": Ground((0.5, 1.0), (0.05, 0.05), (0.0, 60.0)),
 }
-TRUTH, SPREAD, GAIT = "truth", "belief with its spread", "nothing: the gait alone"
+TRUTH, SPREAD, GAIT = "truth", "belief and spread, trained on them", "nothing: the gait alone"
 #: Where the policy that was trained with the truth gets the velocity from; another policy; and none.
 ARMS = (TRUTH, "belief", "LSTM", "zero", "integrated inertial sensor", SPREAD, GAIT)
 #: What velocities in m/s, up, turns in rad/s, joints in rad, commands in m/s and the gait's phase are divided by.
@@ -277,10 +277,11 @@ def page(rows: list[dict], study: Study) -> str:
         "# A policy that walks on the belief of its base's velocity",
         "",
         f'The return is the sum of rewards of {study.test_seconds:g} s, {study.test_seconds:g} at most. "Of the '
-        "truth's\" is the share of the return that the same policy has on the true velocity; after it stands the "
-        "standard error of the mean of the robots' differences. The velocity's error is how far the base is from its "
+        "truth's\" is the share of the return on the true velocity of the policy that was trained with it; after it "
+        "stands the standard error of the mean of the robots' differences. The velocity's error is how far the base is from its "
         "command, forwards and sideways; that of the estimate, how far what the policy reads is from the truth, all "
-        "three axes. Both are root mean squares. The gait alone takes its strides from the command, without any policy.",
+        "three axes. Both are root mean squares. The gait alone takes its strides from the command, without any "
+        "policy.",
     ]
     titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
     for ground in GROUNDS:
@@ -299,7 +300,7 @@ def page(rows: list[dict], study: Study) -> str:
         "",
         f"{study.robots} robots a ground, each with friction, motors, load, commands, forces and biases of its own, "
         f"the same for all rows. One training each: {study.batches} batches of {study.robots} episodes of "
-        f"{study.seconds:g} s with the true velocity, {study.spread_batches} on the belief with its spread. Commands "
+        f"{study.seconds:g} s with the true velocity, {study.spread_batches} on the belief and its spread. Commands "
         f"are up to {FASTEST[0]:g} m/s forwards and {FASTEST[1]:g} m/s sideways.",
         "",
         *made_by("legged.policy"),

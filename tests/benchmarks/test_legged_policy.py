@@ -8,7 +8,20 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from benchmarks.legged.policy import ARMS, INPUT, READ, SCALE, SPREAD, TRUE, TRUTH, Laboratory, Study, page, scored
+from benchmarks.legged.policy import (
+    ARMS,
+    GAIT,
+    INPUT,
+    READ,
+    SCALE,
+    SPREAD,
+    TRUE,
+    TRUTH,
+    Laboratory,
+    Study,
+    page,
+    scored,
+)
 from benchmarks.legged.training import LSTM, VELOCITY
 from benchmarks.legged.walk import EVERY, acted, gait, play
 from torch_denkf.applications.legged import QUADRUPED, LearnedContacts, quadruped_env
@@ -32,7 +45,7 @@ def still(forwards=0.0):
 
 
 def played(laboratory, arm, rows=20, forwards=0.0):
-    keep = [*READ, "true", "command", INPUT, *([VELOCITY] if arm != TRUTH else [])]
+    keep = [*READ, "true", "command", INPUT, *([] if arm in (TRUTH, GAIT) else [VELOCITY])]
     return play(laboratory.env(arm, GROUND, 3), still(forwards), rows, keep)
 
 
