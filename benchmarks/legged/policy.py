@@ -279,8 +279,8 @@ def page(rows: list[dict], study: Study) -> str:
         f'The return is the sum of rewards of {study.test_seconds:g} s, {study.test_seconds:g} at most. "Of the '
         "truth's\" is the share of the return on the true velocity of the policy that was trained with it; after it "
         "stands the standard error of the mean of the robots' differences. The velocity's error is how far the base is "
-        "from its command, forwards and sideways; that of the estimate, how far what the policy reads is from the truth, "
-        "all three axes. Both are root mean squares. The gait alone takes its strides from the command, without any "
+        "from its command, forwards and sideways; that of the estimate, how far what the policy reads is from the "
+        "truth, all three axes. Both are root mean squares. The gait alone takes its strides from the command, without any "
         "policy.",
     ]
     titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
