@@ -280,8 +280,8 @@ def page(rows: list[dict], study: Study) -> str:
         "truth's\" is the share of the return on the true velocity of the policy that was trained with it; after it "
         "stands the standard error of the mean of the robots' differences. The velocity's error is how far the base is "
         "from its command, forwards and sideways; that of the estimate, how far what the policy reads is from the "
-        "truth, all three axes. Both are root mean squares. The gait alone takes its strides from the command, without any "
-        "policy.",
+        "truth, all three axes. Both are root mean squares. The gait alone takes its strides from the command, without "
+        "any policy.",
     ]
     titles = ("velocity by", "return", "of the truth's, %", "velocity's error, m/s", "estimate's error, m/s", "falls")
     for ground in GROUNDS:
