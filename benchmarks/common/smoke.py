@@ -31,7 +31,7 @@ def programs() -> list[str]:
     """Modules and files."""
     found = {file.parent.name for file in ROOT.glob("benchmarks/*/__main__.py")} - set(ELSEWHERE)
     studies = [*LONG, *sorted(found - set(LONG))]
-    return [f"benchmarks.{name}" for name in studies] + sorted(
+    return [f"benchmarks.{name}" for name in (*studies, "legged.policy")] + sorted(
         f"examples/{file.name}" for file in ROOT.glob("examples/*.py")
     )
 

@@ -1,4 +1,4 @@
-"""The velocity of a robot on slippery ground, as two filters believe it."""
+"""The velocity of a robot on slippery ground, as two filters believe it; and a walk with what is believed of it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from statistics import NormalDist
 
+import mujoco
+import numpy as np
 import torch
+from matplotlib.colors import to_rgba
 from tensordict import TensorDict
+from torch import Tensor
 
 from benchmarks.common.plots import plt, save
 from benchmarks.legged.task import LEVEL, Robot
 
-__all__ = ["draw"]
+__all__ = ["Camera", "draw"]
 
 
 def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds: tuple[float, float] = (2, 6)) -> None:
@@ -44,3 +48,49 @@ def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds
     axes[3].imshow(contact.T, aspect="auto", extent=(*seconds, 4.5, 0.5), cmap="Greys", interpolation="nearest")
     axes[3].set(ylabel="feet that stand", xlabel="time, s", yticks=[1, 2, 3, 4])
     save(figure, path)
+
+
+class Camera:
+    """Frames of a robot, which it follows, with arrows above its base.
+
+    Args:
+        model: of the robot.
+        data: its state, which is looked at when a frame is taken.
+        size: of a frame, height and width.
+    """
+
+    LONG = 2.0  # m of an arrow for 1 m/s
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int] = (240, 400)):
+        self.renderer, self.data, self.view = mujoco.Renderer(model, *size), data, mujoco.MjvCamera()
+        self.view.type, self.view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, int(model.jnt_bodyid[0])
+        self.view.distance, self.view.azimuth, self.view.elevation = 3.2, 130.0, -40.0
+        for flag in (mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SHADOW):
+            self.renderer.scene.flags[flag] = 0
+
+    def frame(self, arrows: Mapping[str, Tensor], std: Tensor) -> np.ndarray:
+        """A picture ``[H, W, 3]``.
+
+        Args:
+            arrows: velocities ``[3]`` in the base's axes, by their colour.
+            std: of the last one, which is drawn as an ellipsoid of 90 % intervals at its tip.
+        """
+        self.renderer.update_scene(self.data, self.view)
+        axes, half = np.empty(9), NormalDist().inv_cdf((1 + LEVEL) / 2)
+        mujoco.mju_quat2Mat(axes, self.data.qpos[3:7])
+        start = self.data.qpos[:3] + np.array([0.0, 0.0, 0.3])
+        for color, velocity in arrows.items():
+            tip = start + self.LONG * axes.reshape(3, 3) @ velocity.double().numpy()
+            arrow = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), start, axes, to_rgba(color))
+            # MuJoCo draws half of an arrow's length.
+            mujoco.mjv_connector(arrow, mujoco.mjtGeom.mjGEOM_ARROW, 0.025, start, 2 * tip - start)
+        radii = self.LONG * half * std.double().numpy()
+        self._geom(mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, tip, axes, to_rgba(color, 0.35))
+        return self.renderer.render()
+
+    def _geom(self, kind, size, place, axes, color) -> mujoco.MjvGeom:
+        scene = self.renderer.scene
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, size, place, axes, np.array(color, dtype=np.float32))
+        scene.ngeom += 1
+        return geom

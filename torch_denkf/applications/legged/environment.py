@@ -140,7 +140,7 @@ class LeggedEnv(EnvBase):
         return readings
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self.data.ctrl[:] = tensordict["action"].numpy()
+        self.data.ctrl[:] = tensordict["action"].detach().numpy()
         if self.pushes:
             self._push()
         readings = self._move()
@@ -186,12 +186,11 @@ class LeggedEnv(EnvBase):
     def _forces(self) -> np.ndarray:
         """What presses each foot, in N."""
         found, six = np.zeros(len(self.feet)), np.empty(6)
-        for number, contact in enumerate(self.data.contact):
-            bodies = self.model.geom_bodyid[list(contact.geom)]
-            for place, body in enumerate(self.feet):
-                if body in bodies:
-                    mujoco.mj_contactForce(self.model, self.data, number, six)
-                    found[place] += six[0]
+        bodies = self.model.geom_bodyid[self.data.contact.geom]  # [contacts, 2]
+        for place, body in enumerate(self.feet):
+            for number in np.flatnonzero((bodies == body).any(1)):
+                mujoco.mj_contactForce(self.model, self.data, number, six)
+                found[place] += six[0]
         return found
 
 
