@@ -2,18 +2,118 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf.applications.legged.noises import LeggedNoises
-from torch_denkf.functional.manifolds import SE23, Euclidean, Product, rotate
+from torch_denkf.functional.manifolds import SE23, Euclidean, Product, Space, _blocks, _RotationAndVectors, rotate
 from torch_denkf.modules import SubModel
 from torch_denkf.motions import InertialMotion
 from torch_denkf.motions.motion import Motion
 from torch_denkf.motions.time_step import keys_of_dt
 
 __all__ = ["LeggedMotion", "LeggedMotionNoise", "legged_space"]
+
+
+@dataclass(frozen=True)
+class _Turned(_RotationAndVectors):
+    """A rotation, and K vectors that it turns."""
+
+    vectors: int
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """4 and three for each vector."""
+        return 4 + 3 * self.vectors
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """3 and three for each vector."""
+        return 3 + 3 * self.vectors
+
+
+@dataclass(frozen=True)
+class InvariantSpace(Space):
+    """The points of :func:`legged_space`, whose errors are turns and steps of the world about its origin."""
+
+    feet: int
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """16 + 3 F."""
+        return 16 + 3 * self.feet
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """15 + 3 F."""
+        return 15 + 3 * self.feet
+
+    @property
+    def group(self):
+        return _Turned(2 + self.feet)
+
+    def _split(self, value, pose):
+        first, biases, feet = value[..., :pose], value[..., pose : pose + 6], value[..., pose + 6 :]
+        return torch.cat([first, feet], -1), biases
+
+    def _join(self, moved, biases, pose):
+        return torch.cat([moved[..., :pose], biases, moved[..., pose:]], -1)
+
+    def compose(self, first, second):
+        (one, b1), (other, b2) = self._split(first, 10), self._split(second, 10)
+        return self._join(self.group.compose(other, one), b1 + b2, 10)
+
+    def inverse(self, point):
+        one, b = self._split(point, 10)
+        return self._join(self.group.inverse(one), -b, 10)
+
+    def exp(self, tangent):
+        one, b = self._split(tangent, 9)
+        return self._join(self.group.exp(one), b, 10)
+
+    def log(self, point):
+        one, b = self._split(point, 10)
+        return self._join(self.group.log(one), b, 9)
+
+    def _matrix(self, block):
+        six = torch.eye(6, dtype=block.dtype, device=block.device).expand(*block.shape[:-2], 6, 6)
+        full = _blocks([block[..., :, :], six])
+        n = block.shape[-1]
+        order = [*range(9), *range(n, n + 6), *range(9, n)]
+        return full[..., order, :][..., order]
+
+    def right_jacobian(self, tangent):
+        return self._matrix(self.group.right_jacobian(-self._split(tangent, 9)[0]))
+
+    def adjoint(self, point):
+        return self._matrix(self.group.adjoint(self.group.inverse(self._split(point, 10)[0])))
+
+    def to_world(self, point):
+        return self._matrix(self.group.adjoint(self._split(point, 10)[0]))
+
+    def neutral(self, like=None):
+        return legged_space(self.feet).neutral(like)
+
+    def normalise(self, point):
+        return legged_space(self.feet).normalise(point)
+
+    def near(self, points, weights=None):
+        return legged_space(self.feet).near(points, weights)
+
+
+class WorldNoise(SubModel):
+    def __init__(self, noise, space):
+        super().__init__(noise, [("forecast", "mean"), *noise.in_keys], [("forecast", "noise")])
+        self.space = space
+        self.noise = noise
+
+    def compute(self, mean, *more):
+        var = self.noise.compute(*more)
+        a = self.space.to_world(mean)
+        return a @ (var.unsqueeze(-1) * a.mT)
 
 
 def legged_space(feet: int) -> Product:
