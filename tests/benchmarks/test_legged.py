@@ -13,7 +13,7 @@ from benchmarks.legged.training import LSTM, learned_contacts
 from tests.real_data import SHARED
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import legged_space
+from torch_denkf.applications.legged.motion import LeggedSpace
 from torch_denkf.applications.legged.readings import FeetInBody
 from torch_denkf.functional.manifolds import SO3, rotate
 
@@ -141,7 +141,7 @@ def test_a_turned_world_looks_the_same_to_its_feet():
     torch.manual_seed(0)
     state, turn = torch.randn(5, 28), SO3().exp(torch.randn(5, 3))
     state[:, :4] = SO3().exp(torch.randn(5, 3))
-    seen = FeetInBody(legged_space(4)).compute(state.unsqueeze(-2))
+    seen = FeetInBody(LeggedSpace(4)).compute(state.unsqueeze(-2))
     moved = turned(state, turn)
-    assert (FeetInBody(legged_space(4)).compute(moved.unsqueeze(-2)) - seen).abs().max() < 1e-5
+    assert (FeetInBody(LeggedSpace(4)).compute(moved.unsqueeze(-2)) - seen).abs().max() < 1e-5
     assert (rotate(turn, state[:, 4:7]) - moved[:, 4:7]).abs().max() < 1e-6

@@ -13,7 +13,7 @@ from tensordict import NestedKey
 
 from torch_denkf.applications.legged.kinematics import LegKinematics
 from torch_denkf.applications.legged.learned import SLIP, LearnedContacts, Variances
-from torch_denkf.applications.legged.motion import InvariantSpace, LeggedMotion, LeggedMotionNoise, WorldNoise, legged_space
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
 from torch_denkf.applications.legged.noises import LeggedNoises
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
 from torch_denkf.applications.legged.velocity import BaseVelocity, StartEnsemble, StartMoments
@@ -24,7 +24,6 @@ from torch_denkf.modules._running import named_modules_of
 
 __all__ = ["legged_filter"]
 
-INVARIANT = True
 _FAR = 0.1  # m: how far a foot may be at the start from where its joints say; its first reading tells
 
 
@@ -52,7 +51,7 @@ def legged_filter(
     ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
     ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's
     orientation, velocity and position in the world, its biases, and the feet, see
-    :func:`~torch_denkf.applications.legged.motion.legged_space`. The world's origin is where the base starts, its
+    :class:`~torch_denkf.applications.legged.motion.LeggedSpace`. The world's origin is where the base starts, its
     heading is zero there. The robot must stand still at the start.
 
     The sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: what it reads at a
@@ -84,24 +83,23 @@ def legged_filter(
         ValueError: on an unknown ``kind``, or ``contacts`` without ``rates_key``.
 
     Source:
-        Bloesch et al. 2012, RSS VIII (feet in the state). Errors are turns and steps in the sensor's axes; the
-        right-invariant filter of Hartley et al. 2020, IJRR 39, has them in the world's.
+        Bloesch et al. 2012, RSS VIII (feet in the state); Hartley et al. 2020, IJRR 39 (errors in the world's axes:
+        ``kind="EKF"`` is their right-invariant filter, with the feet's rates as further readings).
     """
     if kind not in ("DEnKF", "EKF", "UKF"):
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
     if contacts is not None and rates_key is None:
         raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
-    count, space = len(kinematics.feet), legged_space(len(kinematics.feet))
-    if INVARIANT:
-        space = InvariantSpace(count)
+    count, space = len(kinematics.feet), LeggedSpace(len(kinematics.feet))
     readings = LegReadings(
         kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
     motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key)
-    process = LeggedMotionNoise(count, dt, n, contact_key=contact_key, slip_key=None if contacts is None else SLIP)
-    if INVARIANT and kind != "DEnKF":
-        process = WorldNoise(process, space)
+    slip_key = None if contacts is None else SLIP
+    process = LeggedMotionNoise(
+        count, dt, n, ensemble=kind == "DEnKF", contact_key=contact_key, slip_key=slip_key
+    )
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])
@@ -110,7 +108,7 @@ def legged_filter(
         initial = StartEnsemble(std, n.velocity, ensemble_size=ensemble_size, **around)
         more: dict[str, Any] = {} if threshold is None else {"localisation": "significance", "threshold": threshold}
         analysis = partial(EnsembleAnalysis, "etkf", **more)
-        transition = NoisyTransition(motion, process, space=legged_space(count))
+        transition = NoisyTransition(motion, process, space=process.space)
     else:
         initial = StartMoments(std, n.velocity, **around)
         transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
@@ -126,6 +124,6 @@ def legged_filter(
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
     per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0
-    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key, space=space if INVARIANT else None)
+    velocity = BaseVelocity(kinematics.base, per_reading, ensemble=kind == "DEnKF", imu_key=imu_key)
     modules = OrderedDict(legs=readings, **dict(named_modules_of(fused)), velocity=velocity)
     return Filter(modules, initial=initial, **options)

@@ -9,35 +9,32 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf.applications.legged.noises import LeggedNoises
-from torch_denkf.functional.manifolds import SE23, Euclidean, Product, Space, _blocks, _RotationAndVectors, rotate
+from torch_denkf.functional.manifolds import SE23, Euclidean, Opposite, Product, Space, Turned, rotate
 from torch_denkf.modules import SubModel
 from torch_denkf.motions import InertialMotion
 from torch_denkf.motions.motion import Motion
 from torch_denkf.motions.time_step import keys_of_dt
 
-__all__ = ["LeggedMotion", "LeggedMotionNoise", "legged_space"]
+__all__ = ["LeggedMotion", "LeggedMotionNoise", "LeggedSpace"]
 
 
 @dataclass(frozen=True)
-class _Turned(_RotationAndVectors):
-    """A rotation, and K vectors that it turns."""
+class LeggedSpace(Space):
+    """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
 
-    vectors: int
+    A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
+    the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
 
-    @property
-    def point_dim(self) -> int:  # type: ignore[override]
-        """4 and three for each vector."""
-        return 4 + 3 * self.vectors
+    A tangent has 15 + 3 F numbers in the same order, of which the first three turn the world about its origin: velocity,
+    position and feet turn with the sensor. So what the joints say of the feet does not change, and a filter that starts
+    with a wrong idea of where up is takes in no false news of it.
 
-    @property
-    def tangent_dim(self) -> int:  # type: ignore[override]
-        """3 and three for each vector."""
-        return 3 + 3 * self.vectors
+    Args:
+        feet: F.
 
-
-@dataclass(frozen=True)
-class InvariantSpace(Space):
-    """The points of :func:`legged_space`, whose errors are turns and steps of the world about its origin."""
+    Source:
+        Hartley, Ghaffari, Eustice & Grizzle 2020, IJRR 39.
+    """
 
     feet: int
 
@@ -52,77 +49,59 @@ class InvariantSpace(Space):
         return 15 + 3 * self.feet
 
     @property
-    def group(self):
-        return _Turned(2 + self.feet)
-
-    def _split(self, value, pose):
-        first, biases, feet = value[..., :pose], value[..., pose : pose + 6], value[..., pose + 6 :]
-        return torch.cat([first, feet], -1), biases
-
-    def _join(self, moved, biases, pose):
-        return torch.cat([moved[..., :pose], biases, moved[..., pose:]], -1)
+    def in_groups(self) -> Product:
+        """The same with the biases at the end."""
+        return Product(Opposite(Turned(2 + self.feet)), Euclidean(6))
 
     def compose(self, first, second):
-        (one, b1), (other, b2) = self._split(first, 10), self._split(second, 10)
-        return self._join(self.group.compose(other, one), b1 + b2, 10)
+        """The second, then the first; biases add up."""
+        return _in_order(self.in_groups.compose(_in_groups(first, 10), _in_groups(second, 10)), 10)
 
     def inverse(self, point):
-        one, b = self._split(point, 10)
-        return self._join(self.group.inverse(one), -b, 10)
+        """What undoes it."""
+        return _in_order(self.in_groups.inverse(_in_groups(point, 10)), 10)
 
     def exp(self, tangent):
-        one, b = self._split(tangent, 9)
-        return self._join(self.group.exp(one), b, 10)
+        """Where a constant rate of all leads."""
+        return _in_order(self.in_groups.exp(_in_groups(tangent, 9)), 10)
 
     def log(self, point):
-        one, b = self._split(point, 10)
-        return self._join(self.group.log(one), b, 9)
-
-    def _matrix(self, block):
-        six = torch.eye(6, dtype=block.dtype, device=block.device).expand(*block.shape[:-2], 6, 6)
-        full = _blocks([block[..., :, :], six])
-        n = block.shape[-1]
-        order = [*range(9), *range(n, n + 6), *range(9, n)]
-        return full[..., order, :][..., order]
+        """What leads there."""
+        return _in_order(self.in_groups.log(_in_groups(point, 10)), 9)
 
     def right_jacobian(self, tangent):
-        return self._matrix(self.group.right_jacobian(-self._split(tangent, 9)[0]))
+        """That of a step in the world's axes."""
+        return _matrix_in_order(self.in_groups.right_jacobian(_in_groups(tangent, 9)))
 
     def adjoint(self, point):
-        return self._matrix(self.group.adjoint(self.group.inverse(self._split(point, 10)[0])))
-
-    def to_world(self, point):
-        return self._matrix(self.group.adjoint(self._split(point, 10)[0]))
+        """Takes errors in the world's axes to the sensor's."""
+        return _matrix_in_order(self.in_groups.adjoint(_in_groups(point, 10)))
 
     def neutral(self, like=None):
-        return legged_space(self.feet).neutral(like)
+        """No rotation, zeros."""
+        return _in_order(self.in_groups.neutral(like), 10)
 
     def normalise(self, point):
-        return legged_space(self.feet).normalise(point)
+        """With a quaternion of length one."""
+        return _in_order(self.in_groups.normalise(_in_groups(point, 10)), 10)
 
     def near(self, points, weights=None):
-        return legged_space(self.feet).near(points, weights)
+        """Part by part."""
+        return _in_order(self.in_groups.near(_in_groups(points, 10), weights), 10)
 
 
-class WorldNoise(SubModel):
-    def __init__(self, noise, space):
-        super().__init__(noise, [("forecast", "mean"), *noise.in_keys], [("forecast", "noise")])
-        self.space = space
-        self.noise = noise
-
-    def compute(self, mean, *more):
-        var = self.noise.compute(*more)
-        a = self.space.to_world(mean)
-        return a @ (var.unsqueeze(-1) * a.mT)
+def _in_groups(value: Tensor, begin: int) -> Tensor:
+    """Points or tangents with the biases, which begin there, at the end."""
+    return torch.cat([value[..., :begin], value[..., begin + 6 :], value[..., begin : begin + 6]], -1)
 
 
-def legged_space(feet: int) -> Product:
-    """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
+def _in_order(value: Tensor, begin: int) -> Tensor:
+    """The inverse of :func:`_in_groups`."""
+    return torch.cat([value[..., :begin], value[..., -6:], value[..., begin:-6]], -1)
 
-    A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
-    the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m. A tangent has 15 + 3 F.
-    """
-    return Product(SE23(), Euclidean(3), Euclidean(3), Euclidean(3 * feet))
+
+def _matrix_in_order(value: Tensor) -> Tensor:
+    return _in_order(_in_order(value, 9).mT, 9).mT
 
 
 class LeggedMotion(Motion):
@@ -152,7 +131,7 @@ class LeggedMotion(Motion):
         contact_key: NestedKey = "contact",
     ):
         actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
-        super().__init__(legged_space(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
+        super().__init__(LeggedSpace(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
 
     def move(self, state, imu, feet, contact, *, dt):
@@ -166,7 +145,7 @@ class LeggedMotion(Motion):
 
 
 class LeggedMotionNoise(SubModel):
-    """Variances ``[*B, 15 + 3 F]`` that a step of :class:`LeggedMotion` adds, by which feet stand.
+    """What a step of :class:`LeggedMotion` adds, by which feet stand.
 
     A foot that stands slips a little; one in the air is where its joints say but for their error.
 
@@ -174,6 +153,8 @@ class LeggedMotionNoise(SubModel):
         feet: F.
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         noises: of sensors and feet.
+        ensemble: whether the belief is an ensemble: it gets variances ``[*B, 15 + 3 F]`` of steps on :attr:`space`, in
+            the sensor's axes. A mean and a covariance get a covariance of tangents of :class:`LeggedSpace`.
         contact_key: which feet stand, ``[*B, F]`` bool.
         slip_key: how a standing foot walks at random, in m^2/s, ``[*B, F]``; ``None`` for that of ``noises``.
     """
@@ -189,12 +170,15 @@ class LeggedMotionNoise(SubModel):
         dt: float | NestedKey,
         noises: LeggedNoises,
         *,
+        ensemble: bool = False,
         contact_key: NestedKey = "contact",
         slip_key: NestedKey | None = None,
     ):
-        self.dt, self.learned = dt, slip_key is not None
+        self.dt, self.learned, self.ensemble = dt, slip_key is not None, ensemble
+        self.space = Product(SE23(), Euclidean(6 + 3 * feet))
+        mean = [] if ensemble else [("forecast", "mean")]
         more = [*([] if slip_key is None else [slip_key]), *keys_of_dt(dt)]
-        super().__init__(nn.Identity(), [contact_key, *more], [("forecast", "noise")])
+        super().__init__(nn.Identity(), [*mean, contact_key, *more], [("forecast", "noise")])
         n = noises
         densities = [n.gyro, n.accelerometer, n.accelerometer / 3**0.5, n.gyro_walk, n.accelerometer_walk]
         self.register_buffer("base", torch.tensor(densities).square().repeat_interleave(3))
@@ -202,9 +186,16 @@ class LeggedMotionNoise(SubModel):
         self.register_buffer("slip", torch.tensor(n.slip**2))
         self.register_buffer("air", torch.tensor(n.kinematics**2))
 
-    def compute(self, contact, *more):
-        """The variances."""
+    def compute(self, *entries):
+        """Variances, or the covariance."""
+        mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
         slip = more[0] if self.learned else self.slip
         dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
-        return torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
+        var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
+        if mean is None:
+            return var
+        # Of a foot all three axes have one variance, so the sensor's serve as well as the world's.
+        space = LeggedSpace(contact.shape[-1])
+        to_world = space.adjoint(space.inverse(mean))
+        return to_world @ (var.unsqueeze(-1) * to_world.mT)

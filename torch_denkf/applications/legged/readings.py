@@ -65,7 +65,7 @@ class FeetInBody(SubModel):
     r"""Where the feet are in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
 
     Args:
-        space: of the states, :func:`legged_space`.
+        space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m.
     """
@@ -92,7 +92,7 @@ class FeetRates(SubModel):
     It is told by the joints' rates, and says the base's velocity at once.
 
     Args:
-        space: of the states, :func:`legged_space`.
+        space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         imu_key: entry ``[*B, 6]``, of which the gyro is read, in rad/s.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m/s.

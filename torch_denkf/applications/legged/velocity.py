@@ -18,7 +18,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
     r"""The velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
 
     Args:
-        state: of the sensor ``[*, 16 + 3 F]``, see :func:`~torch_denkf.applications.legged.motion.legged_space`.
+        state: of the sensor ``[*, 16 + 3 F]``, see :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         gyro: what it reads, in rad/s, ``[*, 3]``.
         sensor: the sensor's pose S, r on the base ``[7]``.
 
@@ -30,7 +30,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
     return rotate(sensor[:4], seen) - torch.linalg.cross(turn, sensor[4:].expand_as(turn))
 
 
-def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Tensor, space=None) -> tuple[Tensor, Tensor]:
+def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Tensor) -> tuple[Tensor, Tensor]:
     """Mean ``[*, 3]`` and variances ``[*, 3]`` of :func:`base_velocity`, to first order.
 
     Args:
@@ -40,15 +40,9 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
         sensor: ``[7]``.
     """
     axes = rotation_matrix(sensor[:4])
-    seen = rotate(SO3().inverse(mean[..., :4]), mean[..., 4:7])
-    lever = (-skew(sensor[4:]) @ axes).expand(*mean.shape[:-1], 3, 3)
-    if space is not None:
-        world = axes @ rotation_matrix(mean[..., :4]).mT
-        part = torch.cat([world, lever], -1)
-        rows = [3, 4, 5, 9, 10, 11]
-        return base_velocity(mean, gyro, sensor), (part @ cov[..., rows, :][..., rows] * part).sum(-1)
-    part = torch.cat([axes @ skew(seen), axes.expand_as(lever), lever], -1)  # by orientation, velocity, gyro's bias
-    rows = [*range(6), 9, 10, 11]
+    seen = axes @ rotation_matrix(mean[..., :4]).mT  # the velocity turns with the orientation, so none comes by that
+    part = torch.cat([seen, (-skew(sensor[4:]) @ axes).expand_as(seen)], -1)  # by velocity, gyro's bias
+    rows = [3, 4, 5, 9, 10, 11]
     var = (part @ cov[..., rows, :][..., rows] * part).sum(-1)
     return base_velocity(mean, gyro, sensor), var
 
@@ -69,10 +63,9 @@ class BaseVelocity(SubModel):
     sensor: Tensor
     jitter: Tensor
 
-    def __init__(self, sensor: Tensor, gyro_std: float, *, ensemble: bool, imu_key="imu", space=None):
+    def __init__(self, sensor: Tensor, gyro_std: float, *, ensemble: bool, imu_key="imu"):
         belief = [("belief", "ensemble")] if ensemble else [("belief", "mean"), ("belief", "cov")]
         super().__init__(nn.Identity(), [imu_key, *belief], _KEYS)
-        self.space = space
         self.register_buffer("sensor", sensor.clone(), persistent=False)
         self.register_buffer("jitter", gyro_std**2 * skew(sensor[4:]).square().sum(-1), persistent=False)
 
@@ -80,7 +73,7 @@ class BaseVelocity(SubModel):
         """Velocity and variances."""
         gyro = imu[..., :3].to(belief.dtype)
         if cov is not None:
-            velocity, var = base_velocity_of_moments(belief, cov, gyro, self.sensor, self.space)
+            velocity, var = base_velocity_of_moments(belief, cov, gyro, self.sensor)
         else:
             members = base_velocity(belief, gyro.unsqueeze(-2), self.sensor)
             velocity, var = ensemble_mean(members), ensemble_var(members)
