@@ -80,7 +80,7 @@ def test_seeds_repeat_and_errors_are_there():
 
 
 def test_the_space_is_that_of_its_feet():
-    assert (LeggedSpace(4).point_dim, legged_space(4).tangent_dim) == (28, 27)
+    assert (LeggedSpace(4).point_dim, LeggedSpace(4).tangent_dim) == (28, 27)
     assert SE3().point_dim == 7
 
 

@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.learned import SLIP, LearnedContacts, Variances
+from torch_denkf.applications.legged.learned import MOVES, SLIP, LearnedContacts, Variances
 from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
 from torch_denkf.applications.legged.noises import LeggedNoises
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
@@ -95,8 +95,10 @@ def legged_filter(
     readings = LegReadings(
         kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
-    motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key)
-    slip_key = None if contacts is None else SLIP
+    slip_key, moves_key = (None, None) if contacts is None else (SLIP, MOVES)
+    motion = LeggedMotion(
+        count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key
+    )
     process = LeggedMotionNoise(
         count, dt, n, ensemble=kind == "DEnKF", contact_key=contact_key, slip_key=slip_key
     )
@@ -120,7 +122,7 @@ def legged_filter(
         noise: Any = [n.rate] * 3 * count if contacts is None else contacts
         if kind == "DEnKF" and contacts is not None:
             noise = Variances(contacts)
-        rates = FeetRates(space, imu_key=imu_key)
+        rates = FeetRates(space, imu_key=imu_key, moves_key=moves_key)
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
     per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0

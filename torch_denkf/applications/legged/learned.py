@@ -13,11 +13,11 @@ from torchrl.envs.transforms import CatFrames
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.modules import CholeskyNoise, SubModel
+from torch_denkf.modules import CholeskyNoise, StochasticMLP, SubModel
 
 __all__ = ["LearnedContacts", "last_rows", "with_last_rows"]
 
-SLIP = ("legs", "slip")
+SLIP, MOVES = ("legs", "slip"), ("legs", "moves")
 _KEYS = ("imu", "joints", "joint_rates", "contact")
 
 
@@ -68,19 +68,25 @@ class LearnedContacts(SubModel):
         check_number("slip", slip, above=0)
         self.rows, size = rows, 16 * rows
         network = CholeskyNoise(3, r=rate, constant=False, num_cells=num_cells, in_features=size)
-        super().__init__(network, [("last", key) for key in _KEYS], [("sensor", "noise"), SLIP])
+        super().__init__(network, [("last", key) for key in _KEYS], [("sensor", "noise"), SLIP, MOVES])
+        self.mean = StochasticMLP(size, 3, num_cells, layer="none", output_gain=0.0)
         self.kinematics = LegKinematics(model, feet, imu, joints=joints)
         self.observation_dim = 3 * len(self.kinematics.feet)
         self.log_time = nn.Parameter(torch.tensor(2 * math.log(slip / rate)))
 
     def compute(self, imu, joints, rates, contact):
-        """The covariance, and how feet walk."""
-        features = self.features(imu, joints, rates, contact)
-        cov = self.module.compute(features, batch_size=features.shape[:-1])  # [*B, F, 3, 3]
+        """The covariance, how feet walk, and how they move."""
+        mean, cov = self.moments(self.features(imu, joints, rates, contact))
         slip = self.log_time.exp() * cov.diagonal(dim1=-2, dim2=-1).mean(-1)
         feet = torch.eye(cov.shape[-3], dtype=cov.dtype, device=cov.device)
         blocks = torch.einsum("fg,...fij->...figj", feet, cov)
-        return blocks.flatten(-4, -3).flatten(-2), slip
+        return blocks.flatten(-4, -3).flatten(-2), slip, mean.flatten(-2)
+
+    def moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Of each foot's velocity the mean ``[*B, F, 3]`` and the covariance ``[*B, F, 3, 3]``, by its features."""
+        noise = self.module
+        mean = self.mean((features - noise.loc) / noise.scale)
+        return mean, noise.compute(features, batch_size=features.shape[:-1])
 
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
@@ -114,8 +120,8 @@ class Variances(SubModel):
 
     def compute(self, *last):
         """The variances ``[*B, 3 F]``, and how feet walk."""
-        cov, slip = self.module.compute(*last)
-        return cov.diagonal(dim1=-2, dim2=-1), slip
+        cov, *others = self.module.compute(*last)
+        return cov.diagonal(dim1=-2, dim2=-1), *others
 
 
 def last_rows(rows: int) -> CatFrames:
@@ -124,7 +130,7 @@ def last_rows(rows: int) -> CatFrames:
     return CatFrames(rows, in_keys=list(_KEYS), out_keys=[("last", key) for key in _KEYS], **options)
 
 
-def with_last_rows(log: TensorDictBase, rows: int) -> TensorDictBase:
+def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
     """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
 
     The first row stands for those before it.
@@ -134,5 +140,5 @@ def with_last_rows(log: TensorDictBase, rows: int) -> TensorDictBase:
         rows: K.
     """
     time = log.shape[-1]
-    at = (torch.arange(time).unsqueeze(-1) + torch.arange(1 - rows, 1)).clamp(min=0)
+    at = (torch.arange(time).unsqueeze(-1) + every * torch.arange(1 - rows, 1)).clamp(min=0)
     return log.copy().update({("last", key): log[key][..., at, :].flatten(-2) for key in _KEYS})

@@ -118,6 +118,7 @@ class LeggedMotion(Motion):
         imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
         feet_key: places of the feet by the joints ``[*B, 3 F]`` in m, in the sensor's axes.
         contact_key: which of them stand, ``[*B, F]`` bool.
+        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
     """
 
     def __init__(
@@ -129,18 +130,24 @@ class LeggedMotion(Motion):
         imu_key: NestedKey = "imu",
         feet_key: NestedKey = ("legs", "feet"),
         contact_key: NestedKey = "contact",
+        moves_key: NestedKey | None = None,
     ):
         actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
+        if moves_key is not None:
+            actions[moves_key] = 3 * feet
         super().__init__(LeggedSpace(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
 
-    def move(self, state, imu, feet, contact, *, dt):
+    def move(self, state, imu, feet, contact, *moves, dt):
         """The states one step later."""
         base = self.inertial.move(state[..., :16], imu, dt=dt)
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
         stands = contact.unsqueeze(-1) > 0
-        moved = torch.where(stands, state[..., 16:].unflatten(-1, (-1, 3)), by_joints)
+        standing = state[..., 16:].unflatten(-1, (-1, 3))
+        if moves:
+            standing = standing + dt * rotate(turn, moves[0].unflatten(-1, (-1, 3)))
+        moved = torch.where(stands, standing, by_joints)
         return torch.cat([base, moved.flatten(-2)], -1)
 
 

@@ -94,6 +94,7 @@ class FeetRates(SubModel):
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         imu_key: entry ``[*B, 6]``, of which the gyro is read, in rad/s.
+        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m/s.
     """
@@ -103,18 +104,20 @@ class FeetRates(SubModel):
         space: Space,
         *,
         imu_key: NestedKey = "imu",
+        moves_key: NestedKey | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        super().__init__(nn.Identity(), [in_key, imu_key], [out_key])
+        super().__init__(nn.Identity(), [in_key, imu_key, *([] if moves_key is None else [moves_key])], [out_key])
         self.observed_space = space
 
-    def compute(self, state, imu):
+    def compute(self, state, imu, moves=None):
         """The predicted readings."""
         self.observed_space.check(point=state)
         turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
         velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
-        return (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
+        rates = (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
+        return rates if moves is None else rates + moves.to(rates.dtype).unsqueeze(-2)
 
 
 def _feet(state: Tensor) -> Tensor:
