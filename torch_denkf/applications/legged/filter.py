@@ -69,7 +69,7 @@ def legged_filter(
         threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
             believe all correlations.
         noises: of the sensors and feet.
-        contacts: says how much each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
+        contacts: says how each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
             ``rates_key``. An ensemble takes its variances, and no correlation of a foot's axes.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.

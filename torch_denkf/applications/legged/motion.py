@@ -163,7 +163,8 @@ class LeggedMotionNoise(SubModel):
         ensemble: whether the belief is an ensemble: it gets variances ``[*B, 15 + 3 F]`` of steps on :attr:`space`, in
             the sensor's axes. A mean and a covariance get a covariance of tangents of :class:`LeggedSpace`.
         contact_key: which feet stand, ``[*B, F]`` bool.
-        slip_key: how a standing foot walks at random, in m^2/s, ``[*B, F]``; ``None`` for that of ``noises``.
+        slip_key: variance of a standing foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None`` for
+            the slip of ``noises``.
     """
 
     base: Tensor
@@ -196,8 +197,8 @@ class LeggedMotionNoise(SubModel):
     def compute(self, *entries):
         """Variances, or the covariance."""
         mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
-        slip = more[0] if self.learned else self.slip
         dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
+        slip = more[0] * dt if self.learned else self.slip
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
         var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
         if mean is None:
