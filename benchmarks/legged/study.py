@@ -46,7 +46,6 @@ VALIDATION_RUNS = 8
 KINDS = {
     "EKF": {"kind": "EKF"},
     "UKF": {"kind": "UKF"},
-    "DEnKF, 32 members": {"kind": "DEnKF", "ensemble_size": 32},
     "DEnKF, 64 members": {"kind": "DEnKF", "ensemble_size": 64},
 }
 
@@ -62,7 +61,7 @@ class Study:
         "icub",
     )  # rows of the other are read from legged.csv
     runs: int = 8  # of the test, on each ground
-    seconds: float = 10.0  # of such a run
+    seconds: float = 8.0  # of such a run
     training_runs: int = 120  # of 6 s each
     updates: int = 3000  # of the learned contacts
     lstm_updates: int = 500

@@ -96,12 +96,8 @@ def legged_filter(
         kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
     slip_key, moves_key = (None, None) if contacts is None else (SLIP, MOVES)
-    motion = LeggedMotion(
-        count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key
-    )
-    process = LeggedMotionNoise(
-        count, dt, n, ensemble=kind == "DEnKF", contact_key=contact_key, slip_key=slip_key
-    )
+    motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key)
+    process = LeggedMotionNoise(count, dt, n, ensemble=kind == "DEnKF", contact_key=contact_key, slip_key=slip_key)
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])

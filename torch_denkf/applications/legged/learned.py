@@ -157,7 +157,7 @@ def last_rows(rows: int, every: int = 1) -> Compose:
     """
     keys, picked = [("last", key) for key in _KEYS], partial(_picked, rows=rows, every=every)
     kept = CatFrames((rows - 1) * every + 1, in_keys=list(_KEYS), out_keys=keys, dim=-1, padding="same")
-    return Compose(kept, UnaryTransform(keys, keys, picked)) if every > 1 else Compose(kept)
+    return Compose(kept, UnaryTransform(keys, keys, fn=picked)) if every > 1 else Compose(kept)
 
 
 def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
