@@ -184,9 +184,10 @@ def page(rows: list[dict], study: Study) -> str:
     lines += [
         "",
         f"Simulated: {study.runs} runs of {study.seconds:g} s on each ground, scored from 1 s on; every run has biases "
-        f"of its own. Contacts and LSTM are trained on {study.training_runs} other simulated runs of 6 s, whose friction "
-        "is 0.15 to 1.5, whose floor gives way in 0.01 to 0.06 s, and whose pushes are up to 250 N. Noises are chosen on further runs, by the likelihood of the true velocity: on the training's grounds for all "
-        "simulated rows. iCub has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly "
+        f"of its own. Contacts and LSTM are trained on {study.training_runs} other runs of 6 s, whose friction is 0.15 "
+        "to 1.5, whose floor gives way in 0.01 to 0.06 s, and whose pushes are up to 250 N. Noises are chosen on "
+        "further runs, by the likelihood of the true velocity: on the training's grounds for all simulated rows. iCub "
+        "has those of the simulated quadruped on firm ground, whose rows were stamped as unevenly "
         "as iCub's. "
         "Milliseconds are those of the "
         f"processor for a step of all {study.runs * len(GROUNDS)} simulated runs, or of iCub's, without compilation, "

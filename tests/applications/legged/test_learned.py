@@ -36,7 +36,7 @@ def log():
     return rows.select(*KEYS, "true").unsqueeze(0)
 
 
-def contacts_of(model, rows=5, **options):
+def contacts_of(model, rows=10, **options):
     return LearnedContacts(model, **QUADRUPED, rows=rows, rate=RATE, lasts=LASTS, **options)
 
 
@@ -59,7 +59,7 @@ def standing(model, runs):
 
 def test_before_training_all_feet_are_alike(model, log):
     contacts = contacts_of(model)
-    out = contacts(with_last_rows(log, 5))
+    out = contacts(with_last_rows(log, 10))
     assert_close(out["sensor", "noise"], LASTS * RATE**2 * torch.eye(12).expand(1, 40, 12, 12))
     assert_close(out["legs", "slip"], torch.full((1, 40, 4), LASTS * RATE**2))
     assert not out["legs", "moves"].any()
@@ -69,8 +69,8 @@ def test_each_foot_has_a_covariance_of_its_own(model, log):
     contacts = contacts_of(model)
     for weight in contacts.parameters():
         torch.nn.init.normal_(weight, std=0.1)
-    contacts.standardise(with_last_rows(log, 5))
-    noise = contacts(with_last_rows(log, 5))["sensor", "noise"]
+    contacts.standardise(with_last_rows(log, 10))
+    noise = contacts(with_last_rows(log, 10))["sensor", "noise"]
     blocks = noise.unflatten(-1, (4, 3)).unflatten(-3, (4, 3))  # [..., foot, axis, foot, axis]
     for one in range(4):
         for other in range(4):
@@ -134,7 +134,7 @@ def test_a_foot_walks_as_its_noise_says():
 def test_untrained_they_are_the_noises(kind, model, log):
     """Constant covariances are those of LeggedNoises(slip=, rate=); a foot walks for each step anew."""
     rate, slip = LASTS**0.5 * RATE, (0.01 * LASTS) ** 0.5 * RATE
-    rows, options = with_last_rows(log, 5), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
+    rows, options = with_last_rows(log, 10), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
     velocities = []
     for noises, contacts in ((LeggedNoises(rate=rate, slip=slip), None), (LeggedNoises(), contacts_of(model))):
         filter = legged_filter(model, **QUADRUPED, noises=noises, contacts=contacts, **options)
@@ -211,10 +211,24 @@ def test_a_filter_moves_a_foot_that_slides(model):
     assert found[1] > 0.1
 
 
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
+def test_the_time_step_may_be_an_entry(kind, model, log):
+    contacts, velocities = contacts_of(model), []
+    torch.nn.init.normal_(list(contacts.mean.parameters())[-1])
+    rows = with_last_rows(log, 10)
+    rows["dt"] = torch.full((*rows.shape, 1), 0.01)
+    for dt in (0.01, "dt"):
+        filter = legged_filter(model, **QUADRUPED, dt=dt, kind=kind, ensemble_size=16, contacts=contacts)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            velocities.append(filter.sequence(rows.clone())["belief", "velocity"])
+    assert_close(*velocities, rtol=0, atol=1e-4)
+
+
 def test_they_learn_through_the_filter(model, log):
     contacts = contacts_of(model)
     filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
-    out = filter.sequence(with_last_rows(log[:, :6], 5))
+    out = filter.sequence(with_last_rows(log[:, :6], 10))
     error, var = out["belief", "velocity"] - log["true", "velocity"][:, :6], out["belief", "velocity_var"]
     (error.square() / var + var.log()).mean().backward()
     gradients = {name: each.grad for name, each in contacts.named_parameters()}

@@ -8,7 +8,7 @@ from functools import partial
 import mujoco
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import MultivariateNormal
 from torchrl.envs.transforms import CatFrames, Compose, UnaryTransform
 

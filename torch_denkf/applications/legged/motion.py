@@ -25,9 +25,9 @@ class LeggedSpace(Space):
     A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
     the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
 
-    A tangent has 15 + 3 F numbers in the same order, of which the first three turn the world about its origin: velocity,
-    position and feet turn with the sensor. So what the joints say of the feet does not change, and a filter that starts
-    with a wrong idea of where up is takes in no false news of it.
+    A tangent has 15 + 3 F numbers in the same order. The first three turn the world about its origin: velocity,
+    position and feet turn with the sensor. What the joints say of the feet does not change by that. So a filter that
+    starts with a wrong idea of where up is does not take feet for news of it.
 
     Args:
         feet: F.
@@ -144,10 +144,10 @@ class LeggedMotion(Motion):
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
         stands = contact.unsqueeze(-1) > 0
-        standing = state[..., 16:].unflatten(-1, (-1, 3))
+        standing = state[..., 16:]
         if moves:
-            standing = standing + dt * rotate(turn, moves[0].unflatten(-1, (-1, 3)))
-        moved = torch.where(stands, standing, by_joints)
+            standing = standing + dt * rotate(turn, moves[0].unflatten(-1, (-1, 3))).flatten(-2)
+        moved = torch.where(stands, standing.unflatten(-1, (-1, 3)), by_joints)
         return torch.cat([base, moved.flatten(-2)], -1)
 
 
@@ -163,8 +163,8 @@ class LeggedMotionNoise(SubModel):
         ensemble: whether the belief is an ensemble: it gets variances ``[*B, 15 + 3 F]`` of steps on :attr:`space`, in
             the sensor's axes. A mean and a covariance get a covariance of tangents of :class:`LeggedSpace`.
         contact_key: which feet stand, ``[*B, F]`` bool.
-        slip_key: variance of a standing foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None`` for
-            the slip of ``noises``.
+        slip_key: variance of a standing foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None``
+            for the slip of ``noises``.
     """
 
     base: Tensor
