@@ -13,7 +13,7 @@ from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legge
 __all__ = ["LSTM", "VELOCITY", "learned_contacts", "trained_lstm"]
 
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
-LASTS = (10.0, 20.0, 40.0)  # rows for which errors of the learned contacts may last
+LASTS = (2.0, 5.0, 10.0, 20.0)  # rows for which errors of the learned contacts may last
 _SETTLING = 10  # rows of a window that are not scored: the memory begins empty
 
 

@@ -1,7 +1,7 @@
 r"""Spaces that states and readings live in: numbers, angles, rotations, motions, and products of them.
 
 A *point* is how a state is stored. A *tangent* is a small step from a point, in as many numbers as the space has
-directions; errors and covariances are in them. One convention holds everywhere:
+directions; errors and covariances are in them. One convention holds everywhere but in :class:`Opposite`:
 
 .. math:: x \oplus d = x \, \exp(d), \qquad x \ominus y = \log(y^{-1} x),
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -135,7 +136,8 @@ class LeggedMotion(Motion):
         actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
         if moves_key is not None:
             actions[moves_key] = 3 * feet
-        super().__init__(LeggedSpace(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
+        space: Any = LeggedSpace(feet)  # no product, and none of its parts is asked for
+        super().__init__(space, dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
 
     def move(self, state, imu, feet, contact, *moves, dt):
