@@ -1,4 +1,4 @@
-"""Learned contacts, trained through a filter, and a recurrent network in the filter's place."""
+"""Learned contacts, trained by how feet move, and a recurrent network in the filter's place."""
 
 from __future__ import annotations
 
@@ -8,64 +8,51 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from benchmarks.legged.task import ROWS, Robot, scores
-from torch_denkf import Filter
 from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legged_filter
 
 __all__ = ["LSTM", "VELOCITY", "learned_contacts", "trained_lstm"]
 
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
-_MOMENTS = [("belief", "mean"), ("belief", "cov")]
-_SETTLING = 10  # rows of a window that are not scored: its belief comes from another filter
-_AGAIN = 35  # updates after which windows get new beliefs to start from
+LASTS = (2.0, 5.0, 10.0, 20.0)  # rows for which errors of the learned contacts may last
+_SETTLING = 10  # rows of a window that are not scored: the memory begins empty
 
 
 def learned_contacts(
-    robot: Robot, validation: Robot, noises: LeggedNoises, updates: int, window: int
+    robot: Robot, validation: Robot, noises: LeggedNoises, updates: int, batch: int = 512
 ) -> LearnedContacts:
-    """Trains contacts through the extended filter, by the likelihood of the base's true velocity.
-
-    An update takes a window of each run. It begins with the belief that the filter had there when it last filtered all
-    runs. Those of validation are filtered with them, and what the network was when it did best there is kept.
+    """Trains contacts by the likelihood of how standing feet move, and chooses for how long their errors last.
 
     Args:
         robot: with the logs of the training.
-        validation: with other logs of the same length.
-        noises: of the filter; the network begins with what they say of feet.
+        validation: with other logs, on which the extended filter's likelihood of the true velocity is looked at.
+        noises: of the filter.
         updates: of the network.
-        window: rows.
+        batch: rows of an update.
     """
-    contacts = LearnedContacts(robot.model, **robot.names, rows=ROWS, rate=noises.rate, slip=noises.slip)
-    contacts.standardise(robot.log)
-    filter = legged_filter(robot.model, **robot.names, dt=robot.dt, kind="EKF", noises=noises, contacts=contacts)
+    contacts = LearnedContacts(robot.model, **robot.names, rows=ROWS, rate=noises.rate)
+    rows = robot.log.select("last", "true").flatten()
+    contacts.standardise(rows[torch.randint(len(rows), (10_000,))])
     optimiser = torch.optim.Adam(contacts.parameters(), 3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    best, kept, count = float("inf"), contacts.state_dict(), len(robot.log)
-    both = torch.cat([robot.log, validation.log])
-    for update in range(updates + 1):
-        if update % _AGAIN == 0 or update == updates:
-            belief = _beliefs(filter, both)
-            found = scores(validation, *(belief[key[1]][count:] for key in (VELOCITY, VAR)))
-            print(f"learned contacts, update {update}: validation {found}", flush=True)
-            if found["nll"] < best:
-                best, kept = found["nll"], {key: value.clone() for key, value in contacts.state_dict().items()}
-        if update == updates:
-            break
-        firsts = torch.randint(1, robot.log.shape[1] - window + 1, (count,)).tolist()
-        part = torch.stack([robot.log[run, first : first + window] for run, first in enumerate(firsts)])
-        part["previous", "belief"] = torch.stack(
-            [belief[run, first - 1 : first - 1 + window] for run, first in enumerate(firsts)]
-        ).select(*(key[1] for key in _MOMENTS))
-        out = filter.sequence(part, keep=[VELOCITY, VAR])
-        loss = _nll(out[VELOCITY], out[VAR], part["true", "velocity"])[:, min(_SETTLING, window // 2) :].mean()
+    for update in range(updates):
+        loss = contacts.loss(rows[torch.randint(len(rows), (batch,))])
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(contacts.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-        if update % 10 == 0:
+        if update % 500 == 0:
             print(f"learned contacts, update {update}: {loss.item():.3f}", flush=True)
-    contacts.load_state_dict(kept)
-    return contacts.requires_grad_(False)
+    contacts.requires_grad_(False)
+    filter = legged_filter(robot.model, **robot.names, dt=robot.dt, kind="EKF", noises=noises, contacts=contacts)
+    found = {}
+    for lasts in LASTS:
+        contacts.lasts.fill_(lasts)
+        out = filter.sequence(validation.log.clone(), keep=[VELOCITY, VAR])
+        found[lasts] = scores(validation, out[VELOCITY], out[VAR])
+        print(f"errors last {lasts:g} rows: validation {found[lasts]}", flush=True)
+    contacts.lasts.fill_(min(found, key=lambda lasts: found[lasts]["nll"]))
+    return contacts
 
 
 class LSTM(nn.Module):
@@ -96,15 +83,18 @@ class LSTM(nn.Module):
         return mean, F.softplus(spread) + 1e-5
 
 
-def trained_lstm(robot: Robot, validation: Robot, contacts: LearnedContacts, updates: int, window: int = 200) -> LSTM:
+def trained_lstm(
+    robot: Robot, validation: Robot, contacts: LearnedContacts, updates: int, window: int = 200, batch: int = 24
+) -> LSTM:
     """Trains it on the same logs, by the same likelihood; what it was when it did best in validation is kept.
 
     Args:
         robot: with the logs of the training.
         validation: with other logs.
         contacts: whose features it reads.
-        updates: each by one window of all runs, in which the memory begins empty.
+        updates: each by one window of some runs, in which the memory begins empty.
         window: rows.
+        batch: runs of an update.
     """
     network, window = LSTM(contacts), min(window, robot.log.shape[1])
     features, true = network.read(robot.log), robot.log["true", "velocity"]
@@ -115,8 +105,8 @@ def trained_lstm(robot: Robot, validation: Robot, contacts: LearnedContacts, upd
     best, kept = float("inf"), network.state_dict()
     for update in range(updates):
         first = int(torch.randint(0, features.shape[1] - window + 1, ()))
-        part = slice(first, first + window)
-        loss = _nll(*network(features[:, part]), true[:, part])[:, min(_SETTLING, window // 2) :].mean()
+        part = torch.randperm(len(features))[:batch], slice(first, first + window)
+        loss = _nll(*network(features[part]), true[part])[:, min(_SETTLING, window // 2) :].mean()
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -134,8 +124,3 @@ def trained_lstm(robot: Robot, validation: Robot, contacts: LearnedContacts, upd
 
 def _nll(velocity: Tensor, var: Tensor, true: Tensor) -> Tensor:
     return 0.5 * ((velocity - true).square() / var + var.log())
-
-
-@torch.no_grad()
-def _beliefs(filter: Filter, log: TensorDict) -> TensorDict:
-    return filter.sequence(log.clone(), keep=[*_MOMENTS, VELOCITY, VAR])["belief"]

@@ -1,7 +1,7 @@
 r"""Spaces that states and readings live in: numbers, angles, rotations, motions, and products of them.
 
 A *point* is how a state is stored. A *tangent* is a small step from a point, in as many numbers as the space has
-directions; errors and covariances are in them. One convention holds everywhere:
+directions; errors and covariances are in them. One convention holds everywhere but in :class:`Opposite`:
 
 .. math:: x \oplus d = x \, \exp(d), \qquad x \ominus y = \log(y^{-1} x),
 
@@ -347,24 +347,37 @@ class _RotationAndVectors(Space):
 
     vectors: int
 
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """4 + 3 K."""
+        return 4 + 3 * self.vectors
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """3 + 3 K."""
+        return 3 + 3 * self.vectors
+
     def compose(self, first, second):
         """The second, seen from the first one's axes."""
-        turned = [rotate(first[..., :4], part) for part in self._vectors(second, 4)]
-        moved = [one + other for one, other in zip(self._vectors(first, 4), turned, strict=True)]
-        return torch.cat([_unit(quaternion_product(first[..., :4], second[..., :4])), *moved], -1)
+        turn = _unit(quaternion_product(first[..., :4], second[..., :4]))
+        if not self.vectors:
+            return turn
+        moved = self._vectors(first, 4) + rotate(first[..., None, :4], self._vectors(second, 4))
+        return torch.cat([turn, moved.flatten(-2)], -1)
 
     def inverse(self, point):
         """What undoes it."""
         back = _conjugate(point[..., :4])
-        return torch.cat([back, *(-rotate(back, part) for part in self._vectors(point, 4))], -1)
+        if not self.vectors:
+            return back
+        return torch.cat([back, -rotate(back.unsqueeze(-2), self._vectors(point, 4)).flatten(-2)], -1)
 
     def exp(self, tangent):
         """Where a constant rate of all leads."""
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
         quaternion = torch.cat([_series(square, _cos_half), 0.5 * _series(square, _sinc_half) * angles], -1)
-        half, third = _series(square, _half_versine), _series(square, _one_minus_sinc)
-        return torch.cat([quaternion, *(_bend(angles, part, half, third) for part in self._vectors(tangent, 3))], -1)
+        return self._bent(quaternion, angles, tangent, _series(square, _half_versine), _series(square, _one_minus_sinc))
 
     def log(self, point):
         """The shorter rotation, and what leads to the vectors meanwhile."""
@@ -377,40 +390,47 @@ class _RotationAndVectors(Space):
         ratio = size / w.clamp_min(0.5).square()  # atan(t) / t in t^2, where it is small
         near = (2 / w.clamp_min(0.5)) * (1 - ratio / 3 + ratio.square() / 5 - ratio.pow(3) / 7 + ratio.pow(4) / 9)
         angles = torch.where(small, near, 2 * torch.atan2(length, w) / length) * axis
-        square = angles.square().sum(-1, keepdim=True)
-        third = _series(square, _inverse_third)
-        half = torch.full_like(third, -0.5)
-        return torch.cat([angles, *(_bend(angles, part, half, third) for part in self._vectors(point, 4))], -1)
+        third = _series(angles.square().sum(-1, keepdim=True), _inverse_third)
+        return self._bent(angles, angles, point, torch.full_like(third, -0.5), third)
+
+    def _bent(self, turn: Tensor, angles: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
+        """A rotation, and what :func:`_bend` makes of the vectors of a point or tangent."""
+        if not self.vectors:
+            return turn
+        vectors = self._vectors(value, value.shape[-1] - 3 * self.vectors)
+        bent = _bend(angles.unsqueeze(-2), vectors, half.unsqueeze(-1), third.unsqueeze(-1))
+        return torch.cat([turn, bent.flatten(-2)], -1)
 
     def right_jacobian(self, tangent):
         """Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
         back = -tangent
-        angles, vectors = back[..., :3], self._vectors(back, 3)
-        square = angles.square().sum(-1, keepdim=True).unsqueeze(-1)
-        turn = skew(angles)
+        square = back[..., :3].square().sum(-1)[..., None, None]
+        turn = skew(back[..., :3])
         turn2 = turn @ turn
-        block = _eye(angles, 3) + _series(square, _half_versine) * turn + _series(square, _one_minus_sinc) * turn2
-        rows = [[block, *[torch.zeros_like(block)] * self.vectors]]
-        for place, vector in enumerate(vectors):
-            move = skew(vector)
-            both = turn @ move
-            around = both @ turn
-            low = 0.5 * move
-            low = low + _series(square, _one_minus_sinc) * (both + move @ turn + around)
-            low = low + _series(square, _fourth) * (turn @ both + move @ turn2 - 3 * around)
-            low = low + _series(square, _fifth) * (around @ turn + turn @ around)
-            rows.append([low, *(block if at == place else torch.zeros_like(block) for at in range(self.vectors))])
-        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+        third = _series(square, _one_minus_sinc)
+        block = _eye(back[..., :3], 3) + _series(square, _half_versine) * turn + third * turn2
+        if not self.vectors:
+            return block
+        move = skew(self._vectors(back, 3))
+        turn, turn2, square, third = (value.unsqueeze(-3) for value in (turn, turn2, square, third))
+        both = turn @ move
+        around = both @ turn
+        low = 0.5 * move + third * (both + move @ turn + around)
+        low = low + _series(square, _fourth) * (turn @ both + move @ turn2 - 3 * around)
+        low = low + _series(square, _fifth) * (around @ turn + turn @ around)
+        return self._matrix(block, low)
 
     def adjoint(self, point):
         """Solà et al., eq. 175."""
         turn = rotation_matrix(point[..., :4])
-        rows = [[turn, *[torch.zeros_like(turn)] * self.vectors]]
-        for place, vector in enumerate(self._vectors(point, 4)):
-            rows.append(
-                [skew(vector) @ turn, *(turn if at == place else torch.zeros_like(turn) for at in range(self.vectors))]
-            )
-        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+        return self._matrix(turn, skew(self._vectors(point, 4)) @ turn.unsqueeze(-3)) if self.vectors else turn
+
+    def _matrix(self, block: Tensor, low: Tensor) -> Tensor:
+        """Of blocks ``[*, 3, 3]`` on the diagonal, and others ``[*, K, 3, 3]`` below the first."""
+        first = torch.cat([block, low.flatten(-3, -2)], -2)
+        others = _eye(block[..., 0], self.vectors)[..., None, :, None] * block[..., None, :, None, :]
+        others = others.flatten(-2).flatten(-3, -2)
+        return torch.cat([first, torch.cat([torch.zeros_like(others[..., :3, :]), others], -2)], -1)
 
     def neutral(self, like=None):
         """No rotation, zeros."""
@@ -426,8 +446,8 @@ class _RotationAndVectors(Space):
         quaternions = torch.where(opposite, -points[..., :4], points[..., :4])
         return super()._between(torch.cat([quaternions, points[..., 4:]], -1), weights)
 
-    def _vectors(self, value: Tensor, begin: int) -> Sequence[Tensor]:
-        return value[..., begin:].split(3, -1) if self.vectors else ()
+    def _vectors(self, value: Tensor, begin: int) -> Tensor:
+        return value[..., begin:].unflatten(-1, (self.vectors, 3))
 
 
 @dataclass(frozen=True)
@@ -439,7 +459,7 @@ class SO3(_RotationAndVectors):
         tensor([0.7071, 0.7071, 0.0000, 0.0000])
     """
 
-    point_dim, tangent_dim, vectors = 4, 3, 0
+    vectors = 0
 
 
 @dataclass(frozen=True)
@@ -452,7 +472,7 @@ class SE3(_RotationAndVectors):
         tensor([4., 0., 0.])
     """
 
-    point_dim, tangent_dim, vectors = 7, 6, 1
+    vectors = 1
 
 
 @dataclass(frozen=True)
@@ -464,7 +484,90 @@ class SE23(_RotationAndVectors):
         (10, 9)
     """
 
-    point_dim, tangent_dim, vectors = 10, 9, 2
+    vectors = 2
+
+
+@dataclass(frozen=True)
+class Turned(_RotationAndVectors):
+    """A rotation and K vectors that it turns, such as velocity, position and landmarks: SE_K(3).
+
+    Args:
+        vectors: K.
+
+    Example:
+        >>> Turned(4).point_dim, Turned(4).tangent_dim
+        (16, 15)
+    """
+
+    vectors: int
+
+
+@dataclass(frozen=True)
+class Opposite(Space):
+    r"""A space whose steps are applied on the left: :math:`x \oplus d = \exp(d) \, x`, in the world's axes.
+
+    An extended Kalman filter on it is a right-invariant one. It is the same group with its products the other way
+    round.
+
+    Args:
+        part: the space.
+
+    Source:
+        Barrau & Bonnabel 2017, IEEE T-AC 62.
+
+    Example:
+        >>> turned = torch.tensor([0.0, 0.0, 0.0, 1.0, 5.0, 0.0, 0.0])  # half a turn around z
+        >>> Opposite(SE3()).plus(turned, torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))[4:]
+        tensor([6., 0., 0.])
+    """
+
+    part: Space
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """P."""
+        return self.part.point_dim
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """D."""
+        return self.part.tangent_dim
+
+    def compose(self, first, second):
+        """The second, then the first."""
+        return self.part.compose(second, first)
+
+    def inverse(self, point):
+        """That of the space."""
+        return self.part.inverse(point)
+
+    def exp(self, tangent):
+        """That of the space."""
+        return self.part.exp(tangent)
+
+    def log(self, point):
+        """That of the space."""
+        return self.part.log(point)
+
+    def right_jacobian(self, tangent):
+        """The left one of the space."""
+        return self.part.right_jacobian(-tangent)
+
+    def adjoint(self, point):
+        """The inverse of the space's: it takes errors in the world's axes to the body's."""
+        return self.part.adjoint(self.part.inverse(point))
+
+    def neutral(self, like=None):
+        """That of the space."""
+        return self.part.neutral(like)
+
+    def normalise(self, point):
+        """That of the space."""
+        return self.part.normalise(point)
+
+    def near(self, points, weights=None):
+        """That of the space."""
+        return self.part.near(points, weights)
 
 
 @dataclass(frozen=True)
@@ -644,7 +747,8 @@ def places_of(space: Space) -> list[Place]:
         if isinstance(part, Product):
             todo = [*part.parts, *todo]
             continue
-        angles = 3 if isinstance(part, _RotationAndVectors) else int(isinstance(part, (Circle, SE2)))
+        group = part.part if isinstance(part, Opposite) else part
+        angles = 3 if isinstance(group, _RotationAndVectors) else int(isinstance(group, (Circle, SE2)))
         ends = point + part.point_dim, tangent + part.tangent_dim
         places.append(Place(part, slice(point, ends[0]), slice(tangent, ends[1]), slice(tangent, tangent + angles)))
         point, tangent = ends

@@ -7,7 +7,7 @@ from torchrl.envs.utils import check_env_specs
 from torch_denkf.applications.legged import QUADRUPED, LeggedErrors, quadruped_env, trot
 from torch_denkf.applications.legged.environment import LeggedEnv
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.motion import legged_space
+from torch_denkf.applications.legged.motion import LeggedSpace
 from torch_denkf.functional.inertial import move_inertially
 from torch_denkf.functional.manifolds import SE3, SO3, rotate
 
@@ -80,7 +80,7 @@ def test_seeds_repeat_and_errors_are_there():
 
 
 def test_the_space_is_that_of_its_feet():
-    assert (legged_space(4).point_dim, legged_space(4).tangent_dim) == (28, 27)
+    assert (LeggedSpace(4).point_dim, LeggedSpace(4).tangent_dim) == (28, 27)
     assert SE3().point_dim == 7
 
 

@@ -19,8 +19,9 @@ from torch_denkf.applications.legged import (
     with_last_rows,
 )
 from torch_denkf.applications.legged.motion import LeggedMotionNoise
+from torch_denkf.functional.manifolds import rotation_matrix
 
-RATE, SLIP = 0.2, 0.03
+RATE, LASTS = 0.2, 4.0
 KEYS = ("imu", "joints", "joint_rates", "contact")
 
 
@@ -35,8 +36,8 @@ def log():
     return rows.select(*KEYS, "true").unsqueeze(0)
 
 
-def contacts_of(model, rows=5, **options):
-    return LearnedContacts(model, **QUADRUPED, rows=rows, rate=RATE, slip=SLIP, **options)
+def contacts_of(model, rows=10, **options):
+    return LearnedContacts(model, **QUADRUPED, rows=rows, rate=RATE, lasts=LASTS, **options)
 
 
 def standing(model, runs):
@@ -58,18 +59,18 @@ def standing(model, runs):
 
 def test_before_training_all_feet_are_alike(model, log):
     contacts = contacts_of(model)
-    out = contacts(with_last_rows(log, 5))
-    noise, slip = out["sensor", "noise"], out["legs", "slip"]
-    assert_close(noise, RATE**2 * torch.eye(12).expand(1, 40, 12, 12))
-    assert_close(slip, torch.full((1, 40, 4), SLIP**2))
+    out = contacts(with_last_rows(log, 10))
+    assert_close(out["sensor", "noise"], LASTS * RATE**2 * torch.eye(12).expand(1, 40, 12, 12))
+    assert_close(out["legs", "slip"], torch.full((1, 40, 4), LASTS * RATE**2))
+    assert not out["legs", "moves"].any()
 
 
 def test_each_foot_has_a_covariance_of_its_own(model, log):
     contacts = contacts_of(model)
     for weight in contacts.parameters():
         torch.nn.init.normal_(weight, std=0.1)
-    contacts.standardise(with_last_rows(log, 5))
-    noise = contacts(with_last_rows(log, 5))["sensor", "noise"]
+    contacts.standardise(with_last_rows(log, 10))
+    noise = contacts(with_last_rows(log, 10))["sensor", "noise"]
     blocks = noise.unflatten(-1, (4, 3)).unflatten(-3, (4, 3))  # [..., foot, axis, foot, axis]
     for one in range(4):
         for other in range(4):
@@ -103,35 +104,39 @@ def test_the_newest_row_comes_last_and_the_first_stands_for_those_before(log):
     assert torch.equal(last[:, 1, 0], log["imu"][:, 0])
 
 
-def test_an_environment_keeps_the_rows_of_a_log():
-    env = TransformedEnv(quadruped_env(seed=4), last_rows(3))
+@pytest.mark.parametrize("every", [1, 2])
+def test_an_environment_keeps_the_rows_of_a_log(every):
+    env = TransformedEnv(quadruped_env(seed=4), last_rows(3, every))
     row = env.reset()
     rows = [row]
     for step in range(6):
         row = env.step(row.set("action", torch.full((12,), 0.1 * step)))["next"]
         rows.append(row)
     found = torch.stack([row.select(*KEYS, "last") for row in rows]).unsqueeze(0)
-    expected = with_last_rows(found.select(*KEYS), 3)
+    expected = with_last_rows(found.select(*KEYS), 3, every)
+    assert env.observation_spec["last", "imu"].shape == (18,)
+    assert torch.equal(expected["last", "imu"][0, 6, :6], found["imu"][0, 6 - 2 * every])
     for key in KEYS:
         assert torch.equal(found["last", key], expected["last", key]), key
 
 
 def test_a_foot_walks_as_its_noise_says():
-    noise = LeggedMotionNoise(2, 0.01, LeggedNoises(kinematics=0.5), slip_key="slip")
+    noise = LeggedMotionNoise(2, 0.01, LeggedNoises(kinematics=0.5), ensemble=True, slip_key="slip")
     slip = torch.tensor([[4.0, 9.0]])
     out = noise(TensorDict({"contact": torch.tensor([[True, False]]), "slip": slip}, [1]))["forecast", "noise"]
-    assert_close(out[0, 15:], torch.tensor([0.04] * 3 + [0.25] * 3))
-    timed = LeggedMotionNoise(2, "dt", LeggedNoises(kinematics=0.5), slip_key="slip")
+    assert_close(out[0, 15:], torch.tensor([0.0004] * 3 + [0.25] * 3))
+    timed = LeggedMotionNoise(2, "dt", LeggedNoises(kinematics=0.5), ensemble=True, slip_key="slip")
     more = {"contact": torch.tensor([[True, True]]), "slip": slip, "dt": torch.tensor([[0.5]])}
-    assert_close(timed(TensorDict(more, [1]))["forecast", "noise"][0, 15:], torch.tensor([2.0] * 3 + [4.5] * 3))
+    assert_close(timed(TensorDict(more, [1]))["forecast", "noise"][0, 15:], torch.tensor([1.0] * 3 + [2.25] * 3))
 
 
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "DEnKF"])
 def test_untrained_they_are_the_noises(kind, model, log):
-    """Constant covariances are those of LeggedNoises(slip=, rate=)."""
-    rows, options = with_last_rows(log, 5), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
+    """Constant covariances are those of LeggedNoises(slip=, rate=); a foot walks for each step anew."""
+    rate, slip = LASTS**0.5 * RATE, (0.01 * LASTS) ** 0.5 * RATE
+    rows, options = with_last_rows(log, 10), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
     velocities = []
-    for noises, contacts in ((LeggedNoises(rate=RATE, slip=SLIP), None), (LeggedNoises(), contacts_of(model))):
+    for noises, contacts in ((LeggedNoises(rate=rate, slip=slip), None), (LeggedNoises(), contacts_of(model))):
         filter = legged_filter(model, **QUADRUPED, noises=noises, contacts=contacts, **options)
         torch.manual_seed(0)
         with torch.no_grad():
@@ -139,50 +144,99 @@ def test_untrained_they_are_the_noises(kind, model, log):
     assert_close(*velocities, rtol=0, atol=2e-3)
 
 
-def test_they_find_the_foot_that_slides(model):
-    """Trained by the likelihood of the velocity that the feet tell together, weighted by their covariances."""
+def test_the_loss_is_that_of_the_feet_that_stand(model, log):
+    """Before training it is the likelihood under N(0, rate^2) of how each standing foot moves in the world."""
+    contacts, rows = contacts_of(model, rows=1), with_last_rows(log, 1)
+    kinematics, true = contacts.kinematics, log["true", "velocity"]
+    joints, rates, gyro = log["joints"], log["joint_rates"], log["imu"][..., :3]
+    to_base = rotation_matrix(kinematics.base[:4])
+    feet, in_body = kinematics(joints), kinematics.velocities(joints, rates)
+    # In the base's axes: the base's velocity, and that about its origin; then what the joints add.
+    turn = (gyro @ to_base.mT).unsqueeze(-2).expand_as(feet)
+    places = feet @ to_base.mT + kinematics.base[4:]
+    moves = true.unsqueeze(-2) + torch.linalg.cross(turn, places) + in_body @ to_base.mT
+    square = moves[log["contact"]].square().sum(-1)
+    expected = (0.5 * square / RATE**2 + 3 * math.log(RATE * (2 * math.pi) ** 0.5)).mean()
+    assert_close(contacts.loss(rows), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_they_find_the_foot_that_slides_and_how(model):
     torch.manual_seed(0)
     contacts = contacts_of(model, rows=1, num_cells=(32,))
     log = standing(model, 256)[0][:, 1]
     contacts.standardise(log)
-    each = contacts.features(*(log["last", key] for key in KEYS))[..., 4:7].unsqueeze(-1)
     optimiser = torch.optim.Adam(contacts.parameters(), 0.01)
-    for _ in range(150):
-        cov = contacts(log)["sensor", "noise"].unflatten(-1, (4, 3)).unflatten(-3, (4, 3))
-        weight = torch.linalg.inv(cov.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))  # [runs, 4, 3, 3]
-        together = torch.linalg.inv(weight.sum(-3))
-        error = together @ (weight @ each).sum(-3)  # the base stands still
-        square = (error.mT @ weight.sum(-3) @ error).squeeze()
-        loss = 0.5 * (square + together.logdet()).mean()
+    for _ in range(200):
+        loss = contacts.loss(log)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     test, moves = standing(model, 64)
-    noises = LeggedNoises(velocity=0.5, tilt=0.01, rate=RATE, slip=SLIP)
+    noises = LeggedNoises(velocity=0.5, tilt=0.01, rate=RATE)
     filters = [
         legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", noises=noises, contacts=each)
         for each in (contacts, None)
     ]
+    row = test[:, 1]
     with torch.no_grad():
-        slip = contacts(test.clone())["legs", "slip"][:, 1]
+        found = contacts(row.clone())["legs", "moves"].unflatten(-1, (4, 3))
         velocity = [filter.sequence(test.clone())["belief", "velocity"][:, 1] for filter in filters]
-    assert (slip.argmax(-1) == moves.int().argmax(-1)).float().mean() > 0.9
-    assert slip[moves].median() > 3 * slip[~moves].median()
+    assert (found.norm(dim=-1).argmax(-1) == moves.int().argmax(-1)).float().mean() > 0.9
+    true = contacts.kinematics.velocities(row["joints"], row["joint_rates"])  # the base rests
+    assert (found - true)[moves].square().sum(-1).mean() < 0.2 * true[moves].square().sum(-1).mean()
     learned, plain = (each.square().sum(-1).mean().sqrt() for each in velocity)
     assert learned < 0.5 * plain
+
+
+def test_a_filter_moves_a_foot_that_slides(model):
+    """All feet slide alike: threshold contacts take that for the base's motion, known slides do not."""
+    rest = standing(model, 1)[0][:, :1].expand(1, 30).clone()
+    rest["joint_rates"] = torch.zeros_like(rest["joint_rates"])
+    rest["imu"][..., 3:] *= 9.81 / rest["imu"][0, 0, 3:].norm()
+    speed, kinematics = torch.tensor([0.2, -0.1, 0.05]), contacts_of(model, rows=1).kinematics
+    jacobian = kinematics.jacobian(rest["joints"][0, 0])
+    rates = torch.linalg.lstsq(jacobian.mT, speed.expand(4, 3).unsqueeze(-1)).solution.squeeze(-1)
+    for row in range(30):
+        rest["joints"][0, row, kinematics.column] += 0.01 * row * rates
+        rest["joint_rates"][0, row, kinematics.column] = rates
+    log, contacts = with_last_rows(rest, 1), contacts_of(model, rows=1)
+    contacts.mean = torch.nn.Linear(16, 3).requires_grad_(False)
+    contacts.mean.weight.zero_()
+    contacts.mean.bias.copy_(speed)
+    found = []
+    for each in (contacts, None):
+        filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=each)
+        with torch.no_grad():
+            found.append(filter.sequence(log.clone())["belief", "velocity"][0, -1].norm())
+    assert found[0] < 0.03
+    assert found[1] > 0.1
+
+
+@pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
+def test_the_time_step_may_be_an_entry(kind, model, log):
+    contacts, velocities = contacts_of(model), []
+    torch.nn.init.normal_(list(contacts.mean.parameters())[-1])
+    rows = with_last_rows(log, 10)
+    rows["dt"] = torch.full((*rows.shape, 1), 0.01)
+    for dt in (0.01, "dt"):
+        filter = legged_filter(model, **QUADRUPED, dt=dt, kind=kind, ensemble_size=16, contacts=contacts)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            velocities.append(filter.sequence(rows.clone())["belief", "velocity"])
+    assert_close(*velocities, rtol=0, atol=1e-4)
 
 
 def test_they_learn_through_the_filter(model, log):
     contacts = contacts_of(model)
     filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
-    out = filter.sequence(with_last_rows(log[:, :6], 5))
+    out = filter.sequence(with_last_rows(log[:, :6], 10))
     error, var = out["belief", "velocity"] - log["true", "velocity"][:, :6], out["belief", "velocity_var"]
     (error.square() / var + var.log()).mean().backward()
     gradients = {name: each.grad for name, each in contacts.named_parameters()}
     last = max(name for name in gradients if name.endswith("weight"))
     assert all(each.isfinite().all() for each in gradients.values())
     assert gradients[last].any()
-    assert gradients["log_time"] != 0
+    assert gradients[next(name for name in gradients if name.startswith("mean"))] is not None
 
 
 def test_without_rates_they_are_refused(model):
@@ -190,7 +244,6 @@ def test_without_rates_they_are_refused(model):
         legged_filter(model, **QUADRUPED, dt=0.01, rates_key=None, contacts=contacts_of(model))
 
 
-def test_slip_must_be_positive(model):
-    with pytest.raises(ValueError, match="slip"):
-        LearnedContacts(model, **QUADRUPED, slip=0.0)
-    assert math.isfinite(contacts_of(model).log_time.item())
+def test_errors_last_for_a_row_at_least(model):
+    with pytest.raises(ValueError, match="lasts"):
+        LearnedContacts(model, **QUADRUPED, lasts=0.5)

@@ -12,8 +12,8 @@ import torch
 from tensordict import NestedKey
 
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.applications.legged.learned import SLIP, LearnedContacts, Variances
-from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, legged_space
+from torch_denkf.applications.legged.learned import MOVES, SLIP, LearnedContacts, Variances
+from torch_denkf.applications.legged.motion import LeggedMotion, LeggedMotionNoise, LeggedSpace
 from torch_denkf.applications.legged.noises import LeggedNoises
 from torch_denkf.applications.legged.readings import FeetInBody, FeetRates, LegReadings
 from torch_denkf.applications.legged.velocity import BaseVelocity, StartEnsemble, StartMoments
@@ -51,7 +51,7 @@ def legged_filter(
     ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
     ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's
     orientation, velocity and position in the world, its biases, and the feet, see
-    :func:`~torch_denkf.applications.legged.motion.legged_space`. The world's origin is where the base starts, its
+    :class:`~torch_denkf.applications.legged.motion.LeggedSpace`. The world's origin is where the base starts, its
     heading is zero there. The robot must stand still at the start.
 
     The sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: what it reads at a
@@ -69,7 +69,7 @@ def legged_filter(
         threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
             believe all correlations.
         noises: of the sensors and feet.
-        contacts: says how much each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
+        contacts: says how each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
             ``rates_key``. An ensemble takes its variances, and no correlation of a foot's axes.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
@@ -83,20 +83,21 @@ def legged_filter(
         ValueError: on an unknown ``kind``, or ``contacts`` without ``rates_key``.
 
     Source:
-        Bloesch et al. 2012, RSS VIII (feet in the state). Errors are turns and steps in the sensor's axes; the
-        right-invariant filter of Hartley et al. 2020, IJRR 39, has them in the world's.
+        Bloesch et al. 2012, RSS VIII (feet in the state); Hartley et al. 2020, IJRR 39 (errors in the world's axes:
+        ``kind="EKF"`` is their right-invariant filter, with the feet's rates as further readings).
     """
     if kind not in ("DEnKF", "EKF", "UKF"):
         raise ValueError(f'kind is "DEnKF", "EKF" or "UKF"; got {kind!r}.')
     if contacts is not None and rates_key is None:
         raise ValueError("LearnedContacts is about the rates of the joints: give rates_key.")
     n, kinematics = LeggedNoises() if noises is None else noises, LegKinematics(model, feet, imu, joints=joints)
-    count, space = len(kinematics.feet), legged_space(len(kinematics.feet))
+    count, space = len(kinematics.feet), LeggedSpace(len(kinematics.feet))
     readings = LegReadings(
         kinematics, imu_key=imu_key, joints_key=joints_key, rates_key=rates_key, contact_key=contact_key
     )
-    motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key)
-    process = LeggedMotionNoise(count, dt, n, contact_key=contact_key, slip_key=None if contacts is None else SLIP)
+    slip_key, moves_key = (None, None) if contacts is None else (SLIP, MOVES)
+    motion = LeggedMotion(count, dt, gravity=gravity, imu_key=imu_key, contact_key=contact_key, moves_key=moves_key)
+    process = LeggedMotionNoise(count, dt, n, ensemble=kind == "DEnKF", contact_key=contact_key, slip_key=slip_key)
     tangent = [n.tilt] * 3 + [n.velocity] * 3 + [0.0] * 3 + [n.gyro_bias] * 3 + [n.accelerometer_bias] * 3
     around: dict[str, Any] = {"state_key": ("legs", "start"), "space": space}
     std = torch.tensor([*tangent, *[_FAR] * 3 * count])
@@ -105,7 +106,7 @@ def legged_filter(
         initial = StartEnsemble(std, n.velocity, ensemble_size=ensemble_size, **around)
         more: dict[str, Any] = {} if threshold is None else {"localisation": "significance", "threshold": threshold}
         analysis = partial(EnsembleAnalysis, "etkf", **more)
-        transition = NoisyTransition(motion, process, space=space)
+        transition = NoisyTransition(motion, process, space=process.space)
     else:
         initial = StartMoments(std, n.velocity, **around)
         transition = {"EKF": EKFTransition, "UKF": UKFTransition}[kind](motion, process, space=space)
@@ -117,7 +118,7 @@ def legged_filter(
         noise: Any = [n.rate] * 3 * count if contacts is None else contacts
         if kind == "DEnKF" and contacts is not None:
             noise = Variances(contacts)
-        rates = FeetRates(space, imu_key=imu_key)
+        rates = FeetRates(space, imu_key=imu_key, moves_key=moves_key)
         sensors["rates"] = FusedSensor(rates, noise, observation_key=("legs", "rates"), **mask)
     fused = FusedFilter(transition, sensors, initial=initial, analysis=analysis)
     per_reading = n.gyro / dt**0.5 if isinstance(dt, (int, float)) else n.gyro * 10.0

@@ -2,55 +2,61 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from functools import partial
 
 import mujoco
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
-from torchrl.envs.transforms import CatFrames
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+from torchrl.envs.transforms import CatFrames, Compose, UnaryTransform
 
 from torch_denkf._checks import check_count, check_number
 from torch_denkf.applications.legged.kinematics import LegKinematics
-from torch_denkf.modules import CholeskyNoise, SubModel
+from torch_denkf.functional.manifolds import SO3, rotate
+from torch_denkf.modules import CholeskyNoise, StochasticMLP, SubModel
 
 __all__ = ["LearnedContacts", "last_rows", "with_last_rows"]
 
-SLIP = ("legs", "slip")
+SLIP, MOVES = ("legs", "slip"), ("legs", "moves")
 _KEYS = ("imu", "joints", "joint_rates", "contact")
 
 
 class LearnedContacts(SubModel):
-    r"""Says of each standing foot how it moves: the covariance of its velocity, which should be zero.
+    r"""Says of each standing foot how it moves: mean and covariance of its velocity, which should be zero.
 
     A foot that has just touched the floor slides or bounces for some rows, and on ice it slides longer. Its rate then
     says little about the base. One small network reads each foot: whether it stood in the last rows, where it was, how
-    fast the base is by this foot and by the mean of all that stand, and what the inertial sensor reads. It gives a
-    Cholesky factor :math:`L`. The rate of the foot counts with the noise :math:`L L^\top`, and the foot walks at
-    random with the mean of that matrix' diagonal times a learned time.
+    fast the base is by this foot and by the mean of all that stand, and what the inertial sensor reads. It gives the
+    mean and a Cholesky factor of the covariance. The filter moves the foot with the mean, and expects of it that rate.
 
-    It is trained through the filter, by how likely the base's true velocity is. Give it to
-    :func:`~torch_denkf.applications.legged.legged_filter` as ``contacts``. An environment gets the last rows from
-    :func:`last_rows`, a log from :func:`with_last_rows`.
+    It is trained by :meth:`loss`, which needs the true velocity of the base, and no filter. What the network has wrong
+    lasts: rows that follow each other err alike. So the filter counts the covariance ``lasts`` times.
+
+    Give it to :func:`~torch_denkf.applications.legged.legged_filter` as ``contacts``. An environment gets the last rows
+    from :func:`last_rows`, a log from :func:`with_last_rows`.
 
     Args:
         model: of the robot, from MJCF or URDF.
         feet: names of sites or bodies, F.
         imu: name of the site or body at which the sensor sits.
         joints: names of the joints in the order of the readings, as for the filter.
-        rows: K, that it reads: this one and those before it.
+        rows: K, that it reads: this one and some before it.
         rate: standard deviation of a foot's velocity before training, in m/s.
-        slip: how a standing foot walks at random before training, in m/sqrt(s).
+        lasts: for how many rows errors last; choose it by validation.
         num_cells: hidden layers.
 
     Reads ``("last", "imu")`` ``[*B, 6 K]``, ``("last", "joints")`` and ``("last", "joint_rates")`` ``[*B, J K]`` and
     ``("last", "contact")`` ``[*B, F K]``, the oldest row first. Writes ``("sensor", "noise")`` ``[*B, 3 F, 3 F]`` in
-    m^2/s^2, in the sensor's axes, and ``("legs", "slip")`` ``[*B, F]`` in m^2/s.
+    m^2/s^2, ``("legs", "slip")`` ``[*B, F]``, the mean of its diagonal for each foot, and ``("legs", "moves")``
+    ``[*B, 3 F]`` in m/s. All are in the sensor's axes.
 
     Source:
-        CoCo-InEKF, RSS 2026, has a network give the covariance of each foot's velocity, trained by squared error.
+        CoCo-InEKF, RSS 2026, has a network give the covariance of each foot's velocity, trained through the filter.
     """
+
+    lasts: Tensor
 
     def __init__(
         self,
@@ -59,28 +65,52 @@ class LearnedContacts(SubModel):
         feet: Sequence[str],
         imu: str,
         joints: Sequence[str] | None = None,
-        rows: int = 5,
+        rows: int = 10,
         rate: float = 0.3,
-        slip: float = 1e-2,
-        num_cells: Sequence[int] = (32, 32),
+        lasts: float = 20.0,
+        num_cells: Sequence[int] = (64, 64),
     ):
         check_count("rows", rows)
-        check_number("slip", slip, above=0)
+        check_number("lasts", lasts, least=1)
         self.rows, size = rows, 16 * rows
         network = CholeskyNoise(3, r=rate, constant=False, num_cells=num_cells, in_features=size)
-        super().__init__(network, [("last", key) for key in _KEYS], [("sensor", "noise"), SLIP])
+        super().__init__(network, [("last", key) for key in _KEYS], [("sensor", "noise"), SLIP, MOVES])
+        self.mean = StochasticMLP(size, 3, num_cells, layer="none", output_gain=0.0)
         self.kinematics = LegKinematics(model, feet, imu, joints=joints)
         self.observation_dim = 3 * len(self.kinematics.feet)
-        self.log_time = nn.Parameter(torch.tensor(2 * math.log(slip / rate)))
+        self.register_buffer("lasts", torch.tensor(float(lasts)))
 
     def compute(self, imu, joints, rates, contact):
-        """The covariance, and how feet walk."""
-        features = self.features(imu, joints, rates, contact)
-        cov = self.module.compute(features, batch_size=features.shape[:-1])  # [*B, F, 3, 3]
-        slip = self.log_time.exp() * cov.diagonal(dim1=-2, dim2=-1).mean(-1)
+        """The covariance, the variance with which feet walk, and how they move."""
+        mean, cov = self._moments(self.features(imu, joints, rates, contact))
+        cov = self.lasts * cov
         feet = torch.eye(cov.shape[-3], dtype=cov.dtype, device=cov.device)
         blocks = torch.einsum("fg,...fij->...figj", feet, cov)
-        return blocks.flatten(-4, -3).flatten(-2), slip
+        slip = cov.diagonal(dim1=-2, dim2=-1).mean(-1)
+        return blocks.flatten(-4, -3).flatten(-2), slip, mean.flatten(-2)
+
+    def _moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Of each foot's velocity the mean ``[*B, F, 3]`` and the covariance ``[*B, F, 3, 3]``."""
+        noise = self.module
+        mean = self.mean((features - noise.loc) / noise.scale)
+        return mean, noise.compute(features, batch_size=features.shape[:-1])
+
+    def loss(self, log: TensorDictBase) -> Tensor:
+        """How unlikely the true velocities of the standing feet are, a scalar: their mean negative log-likelihood.
+
+        Args:
+            log: ``[*B]``, rows in any order, with the last rows and ``("true", "velocity")`` of the base ``[*B, 3]`` in
+                its own axes, in m/s.
+        """
+        features, sensor = self.features(*(log["last", key] for key in _KEYS)), self.kinematics.base
+        own = features[..., -16:]  # of the newest row
+        to_sensor = SO3().inverse(sensor[:4])
+        velocity = rotate(to_sensor, log["true", "velocity"].to(own.dtype)).unsqueeze(-2)
+        lever = rotate(to_sensor, sensor[4:]).expand_as(own[..., 10:13])
+        moves = velocity + torch.linalg.cross(own[..., 10:13], lever) - own[..., 4:7]
+        stands = own[..., 0] > 0
+        mean, cov = self._moments(features[stands])
+        return -MultivariateNormal(mean, cov, validate_args=False).log_prob(moves[stands]).mean()
 
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
@@ -114,17 +144,27 @@ class Variances(SubModel):
 
     def compute(self, *last):
         """The variances ``[*B, 3 F]``, and how feet walk."""
-        cov, slip = self.module.compute(*last)
-        return cov.diagonal(dim1=-2, dim2=-1), slip
+        cov, *others = self.module.compute(*last)
+        return cov.diagonal(dim1=-2, dim2=-1), *others
 
 
-def last_rows(rows: int) -> CatFrames:
-    """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads."""
-    options = {"dim": -1, "padding": "same"}
-    return CatFrames(rows, in_keys=list(_KEYS), out_keys=[("last", key) for key in _KEYS], **options)
+def last_rows(rows: int, every: int = 1) -> Compose:
+    """A transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
+
+    Args:
+        rows: K.
+        every: how many rows lie between two of them, and one more.
+    """
+    keys, picked = [("last", key) for key in _KEYS], partial(_picked, rows=rows, every=every)
+    kept = CatFrames((rows - 1) * every + 1, in_keys=list(_KEYS), out_keys=keys, dim=-1, padding="same")
+    return Compose(kept, UnaryTransform(keys, keys, fn=picked)) if every > 1 else Compose(kept)
 
 
-def with_last_rows(log: TensorDictBase, rows: int) -> TensorDictBase:
+def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
+    return frames.unflatten(-1, ((rows - 1) * every + 1, -1))[..., ::every, :].flatten(-2)
+
+
+def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
     """A log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
 
     The first row stands for those before it.
@@ -132,7 +172,8 @@ def with_last_rows(log: TensorDictBase, rows: int) -> TensorDictBase:
     Args:
         log: with ``"imu"``, ``"joints"``, ``"joint_rates"`` and ``"contact"``.
         rows: K.
+        every: how many rows lie between two of them, and one more.
     """
     time = log.shape[-1]
-    at = (torch.arange(time).unsqueeze(-1) + torch.arange(1 - rows, 1)).clamp(min=0)
+    at = (torch.arange(time).unsqueeze(-1) + every * torch.arange(1 - rows, 1)).clamp(min=0)
     return log.copy().update({("last", key): log[key][..., at, :].flatten(-2) for key in _KEYS})

@@ -2,27 +2,107 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torch_denkf.applications.legged.noises import LeggedNoises
-from torch_denkf.functional.manifolds import SE23, Euclidean, Product, rotate
+from torch_denkf.functional.manifolds import SE23, Euclidean, Opposite, Product, Space, Turned, rotate
 from torch_denkf.modules import SubModel
 from torch_denkf.motions import InertialMotion
 from torch_denkf.motions.motion import Motion
 from torch_denkf.motions.time_step import keys_of_dt
 
-__all__ = ["LeggedMotion", "LeggedMotionNoise", "legged_space"]
+__all__ = ["LeggedMotion", "LeggedMotionNoise", "LeggedSpace"]
 
 
-def legged_space(feet: int) -> Product:
+@dataclass(frozen=True)
+class LeggedSpace(Space):
     """Where the states live: the inertial sensor's pose with its velocity, its biases, and the feet in the world.
 
     A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
-    the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m. A tangent has 15 + 3 F.
+    the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
+
+    A tangent has 15 + 3 F numbers in the same order. The first three turn the world about its origin: velocity,
+    position and feet turn with the sensor. What the joints say of the feet does not change by that. So a filter that
+    starts with a wrong idea of where up is does not take feet for news of it.
+
+    Args:
+        feet: F.
+
+    Source:
+        Hartley, Ghaffari, Eustice & Grizzle 2020, IJRR 39.
     """
-    return Product(SE23(), Euclidean(3), Euclidean(3), Euclidean(3 * feet))
+
+    feet: int
+
+    @property
+    def point_dim(self) -> int:  # type: ignore[override]
+        """16 + 3 F."""
+        return 16 + 3 * self.feet
+
+    @property
+    def tangent_dim(self) -> int:  # type: ignore[override]
+        """15 + 3 F."""
+        return 15 + 3 * self.feet
+
+    @property
+    def in_groups(self) -> Product:
+        """The same with the biases at the end."""
+        return Product(Opposite(Turned(2 + self.feet)), Euclidean(6))
+
+    def compose(self, first, second):
+        """The second, then the first; biases add up."""
+        return _in_order(self.in_groups.compose(_in_groups(first, 10), _in_groups(second, 10)), 10)
+
+    def inverse(self, point):
+        """What undoes it."""
+        return _in_order(self.in_groups.inverse(_in_groups(point, 10)), 10)
+
+    def exp(self, tangent):
+        """Where a constant rate of all leads."""
+        return _in_order(self.in_groups.exp(_in_groups(tangent, 9)), 10)
+
+    def log(self, point):
+        """What leads there."""
+        return _in_order(self.in_groups.log(_in_groups(point, 10)), 9)
+
+    def right_jacobian(self, tangent):
+        """That of a step in the world's axes."""
+        return _matrix_in_order(self.in_groups.right_jacobian(_in_groups(tangent, 9)))
+
+    def adjoint(self, point):
+        """Takes errors in the world's axes to the sensor's."""
+        return _matrix_in_order(self.in_groups.adjoint(_in_groups(point, 10)))
+
+    def neutral(self, like=None):
+        """No rotation, zeros."""
+        return _in_order(self.in_groups.neutral(like), 10)
+
+    def normalise(self, point):
+        """With a quaternion of length one."""
+        return _in_order(self.in_groups.normalise(_in_groups(point, 10)), 10)
+
+    def near(self, points, weights=None):
+        """Part by part."""
+        return _in_order(self.in_groups.near(_in_groups(points, 10), weights), 10)
+
+
+def _in_groups(value: Tensor, begin: int) -> Tensor:
+    """Points or tangents with the biases, which begin there, at the end."""
+    return torch.cat([value[..., :begin], value[..., begin + 6 :], value[..., begin : begin + 6]], -1)
+
+
+def _in_order(value: Tensor, begin: int) -> Tensor:
+    """The inverse of :func:`_in_groups`."""
+    return torch.cat([value[..., :begin], value[..., -6:], value[..., begin:-6]], -1)
+
+
+def _matrix_in_order(value: Tensor) -> Tensor:
+    return _in_order(_in_order(value, 9).mT, 9).mT
 
 
 class LeggedMotion(Motion):
@@ -39,6 +119,7 @@ class LeggedMotion(Motion):
         imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
         feet_key: places of the feet by the joints ``[*B, 3 F]`` in m, in the sensor's axes.
         contact_key: which of them stand, ``[*B, F]`` bool.
+        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
     """
 
     def __init__(
@@ -50,23 +131,30 @@ class LeggedMotion(Motion):
         imu_key: NestedKey = "imu",
         feet_key: NestedKey = ("legs", "feet"),
         contact_key: NestedKey = "contact",
+        moves_key: NestedKey | None = None,
     ):
         actions = {imu_key: 6, feet_key: 3 * feet, contact_key: feet}
-        super().__init__(legged_space(feet), dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
+        if moves_key is not None:
+            actions[moves_key] = 3 * feet
+        space: Any = LeggedSpace(feet)  # no product, and none of its parts is asked for
+        super().__init__(space, dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
 
-    def move(self, state, imu, feet, contact, *, dt):
+    def move(self, state, imu, feet, contact, *moves, dt):
         """The states one step later."""
         base = self.inertial.move(state[..., :16], imu, dt=dt)
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
         stands = contact.unsqueeze(-1) > 0
-        moved = torch.where(stands, state[..., 16:].unflatten(-1, (-1, 3)), by_joints)
+        standing = state[..., 16:]
+        if moves:
+            standing = standing + dt * rotate(turn, moves[0].unflatten(-1, (-1, 3))).flatten(-2)
+        moved = torch.where(stands, standing.unflatten(-1, (-1, 3)), by_joints)
         return torch.cat([base, moved.flatten(-2)], -1)
 
 
 class LeggedMotionNoise(SubModel):
-    """Variances ``[*B, 15 + 3 F]`` that a step of :class:`LeggedMotion` adds, by which feet stand.
+    """What a step of :class:`LeggedMotion` adds, by which feet stand.
 
     A foot that stands slips a little; one in the air is where its joints say but for their error.
 
@@ -74,8 +162,11 @@ class LeggedMotionNoise(SubModel):
         feet: F.
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         noises: of sensors and feet.
+        ensemble: whether the belief is an ensemble: it gets variances ``[*B, 15 + 3 F]`` of steps on :attr:`space`, in
+            the sensor's axes. A mean and a covariance get a covariance of tangents of :class:`LeggedSpace`.
         contact_key: which feet stand, ``[*B, F]`` bool.
-        slip_key: how a standing foot walks at random, in m^2/s, ``[*B, F]``; ``None`` for that of ``noises``.
+        slip_key: variance of a standing foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None``
+            for the slip of ``noises``.
     """
 
     base: Tensor
@@ -89,12 +180,15 @@ class LeggedMotionNoise(SubModel):
         dt: float | NestedKey,
         noises: LeggedNoises,
         *,
+        ensemble: bool = False,
         contact_key: NestedKey = "contact",
         slip_key: NestedKey | None = None,
     ):
-        self.dt, self.learned = dt, slip_key is not None
+        self.dt, self.learned, self.ensemble = dt, slip_key is not None, ensemble
+        self.space = Product(SE23(), Euclidean(6 + 3 * feet))
+        mean = [] if ensemble else [("forecast", "mean")]
         more = [*([] if slip_key is None else [slip_key]), *keys_of_dt(dt)]
-        super().__init__(nn.Identity(), [contact_key, *more], [("forecast", "noise")])
+        super().__init__(nn.Identity(), [*mean, contact_key, *more], [("forecast", "noise")])
         n = noises
         densities = [n.gyro, n.accelerometer, n.accelerometer / 3**0.5, n.gyro_walk, n.accelerometer_walk]
         self.register_buffer("base", torch.tensor(densities).square().repeat_interleave(3))
@@ -102,9 +196,16 @@ class LeggedMotionNoise(SubModel):
         self.register_buffer("slip", torch.tensor(n.slip**2))
         self.register_buffer("air", torch.tensor(n.kinematics**2))
 
-    def compute(self, contact, *more):
-        """The variances."""
-        slip = more[0] if self.learned else self.slip
+    def compute(self, *entries):
+        """Variances, or the covariance."""
+        mean, (contact, *more) = (None, entries) if self.ensemble else (entries[0], entries[1:])
         dt = self.slip.new_tensor(self.dt) if len(more) == self.learned else more[-1].to(self.slip.dtype)
+        slip = more[0] * dt if self.learned else self.slip
         base = (self.base * dt**self.powers).expand(*contact.shape[:-1], 15)
-        return torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
+        var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
+        if mean is None:
+            return var
+        # Of a foot all three axes have one variance, so the sensor's serve as well as the world's.
+        space = LeggedSpace(contact.shape[-1])
+        to_world = space.adjoint(space.inverse(mean))
+        return to_world @ (var.unsqueeze(-1) * to_world.mT)

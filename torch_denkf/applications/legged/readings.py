@@ -65,7 +65,7 @@ class FeetInBody(SubModel):
     r"""Where the feet are in the inertial sensor's axes, :math:`R^\top (f_i - p)`, of forecast states.
 
     Args:
-        space: of the states, :func:`legged_space`.
+        space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m.
     """
@@ -92,8 +92,9 @@ class FeetRates(SubModel):
     It is told by the joints' rates, and says the base's velocity at once.
 
     Args:
-        space: of the states, :func:`legged_space`.
+        space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         imu_key: entry ``[*B, 6]``, of which the gyro is read, in rad/s.
+        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m/s.
     """
@@ -103,18 +104,20 @@ class FeetRates(SubModel):
         space: Space,
         *,
         imu_key: NestedKey = "imu",
+        moves_key: NestedKey | None = None,
         in_key: NestedKey = ("forecast", "ensemble"),
         out_key: NestedKey = ("forecast", "observation"),
     ):
-        super().__init__(nn.Identity(), [in_key, imu_key], [out_key])
+        super().__init__(nn.Identity(), [in_key, imu_key, *([] if moves_key is None else [moves_key])], [out_key])
         self.observed_space = space
 
-    def compute(self, state, imu):
+    def compute(self, state, imu, moves=None):
         """The predicted readings."""
         self.observed_space.check(point=state)
         turn = (imu[..., :3].to(state.dtype).unsqueeze(-2) - state[..., 10:13]).unsqueeze(-2)
         velocity = rotate(SO3().inverse(state[..., :4]), state[..., 4:7]).unsqueeze(-2)
-        return (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
+        rates = (-velocity - torch.linalg.cross(*torch.broadcast_tensors(turn, _feet(state)))).flatten(-2)
+        return rates if moves is None else rates + moves.to(rates.dtype).unsqueeze(-2)
 
 
 def _feet(state: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
     r"""The velocity of the base's origin in the base's axes, :math:`S R^\top v - S (\omega - b) \times r`.
 
     Args:
-        state: of the sensor ``[*, 16 + 3 F]``, see :func:`~torch_denkf.applications.legged.motion.legged_space`.
+        state: of the sensor ``[*, 16 + 3 F]``, see :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         gyro: what it reads, in rad/s, ``[*, 3]``.
         sensor: the sensor's pose S, r on the base ``[7]``.
 
@@ -40,10 +40,9 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
         sensor: ``[7]``.
     """
     axes = rotation_matrix(sensor[:4])
-    seen = rotate(SO3().inverse(mean[..., :4]), mean[..., 4:7])
-    lever = (-skew(sensor[4:]) @ axes).expand(*mean.shape[:-1], 3, 3)
-    part = torch.cat([axes @ skew(seen), axes.expand_as(lever), lever], -1)  # by orientation, velocity, gyro's bias
-    rows = [*range(6), 9, 10, 11]
+    seen = axes @ rotation_matrix(mean[..., :4]).mT  # the velocity turns with the orientation, so none comes by that
+    part = torch.cat([seen, (-skew(sensor[4:]) @ axes).expand_as(seen)], -1)  # by velocity, gyro's bias
+    rows = [3, 4, 5, 9, 10, 11]
     var = (part @ cov[..., rows, :][..., rows] * part).sum(-1)
     return base_velocity(mean, gyro, sensor), var
 
