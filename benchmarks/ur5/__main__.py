@@ -11,12 +11,13 @@ from benchmarks.common.arguments import command, parse
 from benchmarks.common.tables import report
 from benchmarks.ur5.frontier import draw
 from benchmarks.ur5.limits import run
+from benchmarks.ur5.members import run as members
 from benchmarks.ur5.pictures import draw_all
 from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget
 
-AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run}  # of a table's folder
+AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run, "members": members}  # of a table's folder
 
 
 def smoke(study: Study) -> Study:
