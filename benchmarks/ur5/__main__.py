@@ -17,7 +17,12 @@ from benchmarks.ur5.study import Study, rows_of, run_all
 from benchmarks.ur5.tables import COLUMNS, markdown
 from benchmarks.ur5.training import Budget
 
-AFTERWARDS = {"pictures": lambda study: draw_all(study.out), "frontier": draw, "limits": run, "members": members}  # of a table's folder
+AFTERWARDS = {
+    "pictures": lambda study: draw_all(study.out),
+    "frontier": draw,
+    "limits": run,
+    "members": members,
+}  # of a table's folder
 
 
 def smoke(study: Study) -> Study:

@@ -67,7 +67,7 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
     for scheme in SCHEMES if name == "denkf" else (None,):
         names = {"filter": f"DEnKF, {scheme}" if scheme else name, "sensor": base.kind, "seed": base.seed}
         make, sizes = partial(_recipe, base, name, scheme), base.study.sizes if scheme else (MEMBERS,)
-        own = {**saved, "inflation": inflation(base, make(MEMBERS), sensor, saved)} if scheme in SCHEMES[1:] else saved
+        own = {**saved, "inflation": _inflation(base, make(MEMBERS), sensor, saved)} if scheme in SCHEMES[1:] else saved
         chunk = 0 if base.study.smoke else 1
         for row in size_rows(
             make, sensor, base.codes("test"), sizes, own, names, base.codes("validation"), chunk=chunk
@@ -76,10 +76,10 @@ def _rows(base: Base, name: str) -> Iterator[dict]:
             yield {column: row[column] for column in COLUMNS.names}
 
 
-def inflation(base: Base, recipe: UR5Recipe, sensor: ImageSensor, saved: dict) -> float:
+def _inflation(base: Base, recipe: UR5Recipe, sensor: ImageSensor, saved: dict) -> float:
     """What a recipe's update wants, of the validation demos' coverage."""
     model = read_filter(recipe, recipe.build(), saved)
-    readings = with_missing(read_all(sensor, base.codes("validation"), recipe.ensemble_size))
+    readings = with_missing(read_all(sensor, base.codes("validation"), MEMBERS))
     return choose_for_coverage(
         INFLATIONS,
         lambda factor: recipe.set_inflation(model, factor),

@@ -1,7 +1,7 @@
 """How many members the DEnKF needs, without localisation, with factors on covariances, and with significance.
 
 Filters are trained once each, with few members, and tested with other numbers of members and other localisations.
-The validation demos choose the threshold of each, and then the factor on the noise.
+The validation demos choose the threshold; the factor on the noise stays that of the training.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.tables import Columns, head, line, pick, write_page
 from benchmarks.common.training import read_filter
 from benchmarks.ur5.evaluation import size_rows
-from benchmarks.ur5.frontier import inflation
 from benchmarks.ur5.readings import read_all, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.study import Base, Study
@@ -23,10 +22,9 @@ from torch_denkf.training.checkpoint import read_checkpoint
 
 KINDS = ("none", "factors", "significance", "both")
 THRESHOLDS = (1.0, 1.5, 2.0, 3.0)
-LARGEST = 128  # members with which the factor on the noise is chosen; more of them take this one's
 COLUMNS = Columns(
     (
-        *("sensor", "trained", "localisation", "members", "threshold", "inflation"),
+        *("sensor", "trained", "localisation", "members", "threshold"),
         *("validation_crps", "joint_mae_deg", "ee_mae_cm", "coverage90", "ms_per_step", "demos"),
     ),
     text=("sensor", "trained", "localisation"),
@@ -71,10 +69,9 @@ def _rows(base: Base, trained: str, size: int) -> Iterator[dict]:
             continue
         threshold = min(crps, key=crps.__getitem__)
         make = partial(_recipe, base, kind, threshold)
-        own = {**saved, "inflation": inflation(base, make(min(size, LARGEST)), recipe.sensor, saved)}
         names = {"sensor": base.kind, "trained": f"{trained}, {study.members}", "localisation": kind, "members": size}
-        (row,) = size_rows(make, recipe.sensor, base.codes("test"), [size], own, names, validation)
-        row |= {"threshold": threshold or 0.0, "inflation": own["inflation"]}
+        (row,) = size_rows(make, recipe.sensor, base.codes("test"), [size], saved, names, validation)
+        row["threshold"] = threshold or 0.0
         print(row, crps, flush=True)
         yield {column: row[column] for column in COLUMNS.names}
 
