@@ -13,14 +13,16 @@ from pathlib import Path
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.tables import Columns, head, line, pick, write_page
 from benchmarks.common.training import read_filter
-from benchmarks.ur5.evaluation import size_rows
+from benchmarks.ur5.evaluation import sensor_rows, size_rows
 from benchmarks.ur5.readings import read_all, with_missing
 from benchmarks.ur5.recipes import UR5Recipe
+from benchmarks.ur5.sensors import MEMBERS
 from benchmarks.ur5.study import Base, Study
 from benchmarks.ur5.training import filter_error
 from torch_denkf.training.checkpoint import read_checkpoint
 
 KINDS = ("none", "factors", "significance", "both")
+ALONE = "its sensor alone"
 THRESHOLDS = (1.0, 1.5, 2.0, 3.0)
 COLUMNS = Columns(
     (
@@ -37,6 +39,7 @@ def run(study: Study) -> list[Path]:
     """Trains and tests; leaves members.csv and members.md in ``--out``."""
     for kind in study.sensors:
         base = Base(study, kind, "sim", study.seeds[0])
+        once(study.out / "members" / f"sensor-{base.name}.json", lambda base=base: _sensor(base))
         for trained in study.localisations:
             for size in study.sizes:
                 file = study.out / "members" / f"{trained}-{study.members}-{base.name}-{size}.json"
@@ -48,7 +51,14 @@ def run(study: Study) -> list[Path]:
     return files
 
 
-def _recipe(base: Base, kind: str, threshold: float | None, size: int) -> UR5Recipe:
+def _sensor(base: Base) -> list[dict]:
+    readings = {"clean": read_all(base.sensor, base.codes("test"), MEMBERS)}
+    names = {"sensor": base.kind, "trained": ALONE, "localisation": "none", "members": MEMBERS}
+    return [{key: row[key] for key in COLUMNS.names if key in row} for row in sensor_rows(base.preset, readings, names)]
+
+
+def recipe_of(base: Base, kind: str, threshold: float | None, size: int) -> UR5Recipe:
+    """The DEnKF with one of the localisations."""
     recipe = base.recipe("denkf", size)
     recipe.factors, recipe.threshold = kind in ("factors", "both"), threshold
     return recipe
@@ -56,19 +66,17 @@ def _recipe(base: Base, kind: str, threshold: float | None, size: int) -> UR5Rec
 
 def _rows(base: Base, trained: str, size: int) -> Iterator[dict]:
     study, name = base.study, f"denkf-{trained}-{base.study.members}"
-    first = _recipe(base, trained, study.threshold if trained in KINDS[2:] else None, study.members)
+    first = recipe_of(base, trained, study.threshold if trained in KINDS[2:] else None, study.members)
     recipe, _, out = base.train(name, first)
     saved, validation = read_checkpoint(out / "filter.pt"), base.codes("validation")
     readings = with_missing(read_all(recipe.sensor, validation, size))
     for kind in KINDS:
         crps = {}
-        for threshold in _thresholds(kind, size):
-            other = _recipe(base, kind, threshold, size)
+        for threshold in thresholds_of(kind, size):
+            other = recipe_of(base, kind, threshold, size)
             crps[threshold] = filter_error(other, read_filter(other, other.build(), saved), readings)["crps"]
-        if not crps:
-            continue
         threshold = min(crps, key=crps.__getitem__)
-        make = partial(_recipe, base, kind, threshold)
+        make = partial(recipe_of, base, kind, threshold)
         names = {"sensor": base.kind, "trained": f"{trained}, {study.members}", "localisation": kind, "members": size}
         (row,) = size_rows(make, recipe.sensor, base.codes("test"), [size], saved, names, validation)
         row["threshold"] = threshold or 0.0
@@ -76,7 +84,8 @@ def _rows(base: Base, trained: str, size: int) -> Iterator[dict]:
         yield {column: row[column] for column in COLUMNS.names}
 
 
-def _thresholds(kind: str, size: int) -> Sequence[float | None]:
+def thresholds_of(kind: str, size: int) -> Sequence[float | None]:
+    """Those that so many members can show."""
     return [value for value in THRESHOLDS if value**2 < size - 1] if kind in KINDS[2:] else [None]
 
 
@@ -85,11 +94,13 @@ def page(rows: Sequence[dict]) -> str:
     lines = [
         "# How many members?",
         "",
-        "Cells: joints deg / end effector cm / share of the true joints in the 90 % intervals (threshold); clean test demos.",
+        "Clean test demos. Cells: joints deg / end effector cm / share of the true joints in the 90 % intervals, and",
+        "the threshold, if any.",
     ]
-    for sensor, trained in dict.fromkeys((row["sensor"], row["trained"]) for row in rows):
-        own = pick(rows, sensor=sensor, trained=trained)
-        lines += ["", f"**{sensor}**, trained with {trained} members", "", *head("members", *KINDS)]
+    for sensor, trained in dict.fromkeys((row["sensor"], row["trained"]) for row in rows if row["trained"] != ALONE):
+        own, alone = (pick(rows, sensor=sensor, trained=name) for name in (trained, ALONE))
+        title = f"**{sensor}**, trained with {trained} members; {ALONE}: {_cell(alone)}"
+        lines += ["", title, "", *head("members", *KINDS)]
         for size in sorted({row["members"] for row in own}):
             lines.append(line(size, *(_cell(pick(own, members=size, localisation=kind)) for kind in KINDS)))
     return "\n".join(lines) + "\n"
@@ -99,5 +110,5 @@ def _cell(rows: Sequence[dict]) -> str:
     if not rows:
         return ""
     (row,) = rows
-    threshold = f" ({row['threshold']:g})" if row["threshold"] else ""
+    threshold = f" ({row['threshold']:g})" if row.get("threshold") else ""
     return f"{row['joint_mae_deg']:.2f} / {row['ee_mae_cm']:.2f} / {row['coverage90']:.0%}{threshold}"

@@ -41,7 +41,8 @@ class Study(Collections):
 
     collect: demos into --root. table: collect what is missing, train, test. pictures: videos and plots of what a table
     left in --out. frontier: error against milliseconds a step of the filters that a table left there. limits: how far
-    simple filters get on its sensors' readings. What was broken off goes on where it stopped. See the README beside.
+    simple filters get on its sensors' readings. members: DEnKFs that are trained with few members, by localisation.
+    What was broken off goes on where it stopped. See the README beside.
     """
 
     command: Positional[Literal["collect", "table", "pictures", "frontier", "limits", "members"]] = "table"

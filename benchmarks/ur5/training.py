@@ -19,7 +19,6 @@ from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import unit_of
 from torch_denkf.filters import Filter
 from torch_denkf.functional import crps_ensemble
-from torch_denkf.modules import ImageSensor
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import parameters_without
 
